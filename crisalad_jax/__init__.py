@@ -1,0 +1,1 @@
+"""CriSALAD visual place recognition in pure JAX."""

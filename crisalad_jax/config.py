@@ -1,0 +1,319 @@
+"""Frozen configurations: what a model is, how it trains, the presets, and their validation.
+
+Every field is hashable, so a configuration is a static argument of jit and names a compiled program.
+The values of the presets are the paper's (Xu et al., Appl. Sci. 2025, 15, 5287, section 4.2) unless
+a comment says otherwise.
+"""
+
+import dataclasses
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, TypeVar
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.sinkhorn import SinkhornConfig
+
+PATCH_SIZE = 14
+
+_T = TypeVar("_T")
+
+
+def choose(what: str, name: str, choices: Mapping[str, _T]) -> _T:
+    """Look `name` up in `choices`.
+
+    Raises:
+        InputError: no such name; the message lists the valid ones.
+    """
+    if name not in choices:
+        raise InputError(f"{what}: found {name!r}, expected one of {', '.join(sorted(choices))}")
+    return choices[name]
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise InputError(message)
+
+
+def _require_positive(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        _require(value > 0, f"{type(config).__name__}.{name}: found {value}, expected more than 0")
+
+
+def _require_fraction(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        _require(
+            0 <= value < 1,
+            f"{type(config).__name__}.{name}: found {value}, expected at least 0 and less than 1",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class AdapterConfig:
+    """The depthwise-separable adapter beside the MLP of every block (paper section 3.2)."""
+
+    bottleneck: float = 0.5
+    """Width of the adapter over the width of the backbone."""
+    kernel_size: int = 3
+    alpha: float = 0.2
+    """Weight of the adapter's output (paper Eq. 2)."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "bottleneck", "kernel_size")
+        _require(
+            self.kernel_size % 2 == 1,
+            f"AdapterConfig.kernel_size: found {self.kernel_size}, expected an odd number",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ViTConfig:
+    """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
+
+    dim: int = 768
+    depth: int = 12
+    heads: int = 12
+    mlp_ratio: float = 4.0
+    ffn: Literal["mlp", "swiglu"] = "mlp"
+    registers: int = 0
+    position_grid: int = 37
+    """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
+    position_start: Literal["random", "sincos"] = "random"
+    """How position embeddings start where no weights are loaded."""
+    layer_scale_start: float = 1.0
+    adapter: AdapterConfig | None = AdapterConfig()
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "dim", "depth", "heads", "mlp_ratio", "position_grid")
+        _require(
+            self.dim % self.heads == 0,
+            f"ViTConfig.dim: found {self.dim}, expected a multiple of the {self.heads} heads",
+        )
+        _require(
+            self.position_start != "sincos" or self.dim % 4 == 0,
+            f"ViTConfig.dim: found {self.dim}, expected a multiple of 4 for a sin-cos start",
+        )
+        choose("ViTConfig.ffn", self.ffn, {"mlp": 0, "swiglu": 0})
+        choose("ViTConfig.position_start", self.position_start, {"random": 0, "sincos": 0})
+
+    @property
+    def hidden(self) -> int:
+        """Hidden width of the feed-forward network (DINOv2 rounds SwiGLU's 2/3 up to a multiple of 8)."""
+        hidden = int(self.dim * self.mlp_ratio)
+        return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
+
+    @property
+    def adapter_dim(self) -> int:
+        """Width of the adapter's bottleneck."""
+        if self.adapter is None:
+            raise InputError("ViTConfig.adapter: found None, expected an adapter")
+        return int(self.dim * self.adapter.bottleneck)
+
+
+@dataclasses.dataclass(frozen=True)
+class SaladConfig:
+    """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
+
+    clusters: int = 64
+    cluster_dim: int = 128
+    token_dim: int = 256
+    """Width of the global token."""
+    hidden: int = 512
+    dropout: float = 0.3
+    sinkhorn: SinkhornConfig = SinkhornConfig()
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "clusters", "cluster_dim", "token_dim", "hidden")
+        _require_fraction(self, "dropout")
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossImageConfig:
+    """The transformer encoder whose attention runs across the images of a batch (paper section 3.4)."""
+
+    layers: int = 2
+    heads: int = 16
+    feedforward: int = 2048
+    dropout: float = 0.1
+    global_token: bool = True
+    """Whether the global token enters too, cut into tokens of the clusters' width."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "layers", "heads", "feedforward")
+        _require_fraction(self, "dropout")
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """CriSALAD: backbone, aggregation, cross-image encoder (None leaves it out)."""
+
+    image_size: tuple[int, int] = (224, 224)
+    """Height and width that images are resized to, multiples of 14."""
+    normalisation: Literal["imagenet", "local-contrast"] = "imagenet"
+    """What is done to 8-bit pixels: ImageNet mean and deviation, or the local mean and deviation."""
+    backbone: ViTConfig = ViTConfig()
+    salad: SaladConfig = SaladConfig()
+    encoder: CrossImageConfig | None = CrossImageConfig()
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of the matrix products; normalisations, softmax and transport stay in float32."""
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit each other."""
+        choose("ModelConfig.normalisation", self.normalisation, {"imagenet": 0, "local-contrast": 0})
+        choose("ModelConfig.compute_dtype", self.compute_dtype, {"float32": 0, "bfloat16": 0})
+        check_image_size(self.image_size, self.salad.clusters)
+        if self.encoder is not None:
+            width = self.salad.cluster_dim
+            _require(
+                width % self.encoder.heads == 0,
+                f"SaladConfig.cluster_dim: found {width}, expected a multiple of the cross-image "
+                f"encoder's {self.encoder.heads} heads",
+            )
+            _require(
+                not self.encoder.global_token or self.salad.token_dim % width == 0,
+                f"SaladConfig.token_dim: found {self.salad.token_dim}, expected a multiple of "
+                f"cluster_dim {width} so that the global token can enter the cross-image encoder "
+                "(or CrossImageConfig.global_token False)",
+            )
+
+    @property
+    def descriptor_dim(self) -> int:
+        """Numbers in one descriptor."""
+        return self.salad.token_dim + self.salad.clusters * self.salad.cluster_dim
+
+
+def check_image_size(image_size: tuple[int, int], clusters: int) -> None:
+    """Check that images of this height and width make whole patches, and more of them than clusters.
+
+    Raises:
+        InputError: a side is no multiple of 14, or there are too few patches.
+    """
+    height, width = image_size
+    _require(
+        height > 0 and width > 0 and height % PATCH_SIZE == 0 and width % PATCH_SIZE == 0,
+        f"image size: found {height} x {width}, expected sides that are multiples of {PATCH_SIZE} "
+        f"(nearest: {_nearest_side(height)} x {_nearest_side(width)})",
+    )
+    patches = (height // PATCH_SIZE) * (width // PATCH_SIZE)
+    side = next(s for s in range(1, clusters + 2) if s * s > clusters) * PATCH_SIZE
+    _require(
+        patches > clusters,
+        f"image size: found {height} x {width}, which is {patches} patches for {clusters} clusters; "
+        f"expected more patches than clusters (the smallest square that works: {side} x {side})",
+    )
+
+
+def _nearest_side(side: int) -> int:
+    return max(PATCH_SIZE, round(side / PATCH_SIZE) * PATCH_SIZE)
+
+
+@dataclasses.dataclass(frozen=True)
+class MultiSimilarityConfig:
+    """Multi-similarity loss and miner (Wang et al., CVPR 2019), the constants of GSV-Cities."""
+
+    alpha: float = 1.0
+    beta: float = 50.0
+    base: float = 0.0
+    """Similarity around which pairs are weighed. From a cold start 0.5 learns where 0 does not."""
+    epsilon: float = 0.1
+    """Margin of the miner."""
+    library_quirk: bool = False
+    """Return 0, as pytorch-metric-learning does, where at most one positive and at most one negative
+    pair are mined in the whole batch."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "alpha", "beta")
+        _require(
+            self.epsilon >= 0,
+            f"MultiSimilarityConfig.epsilon: found {self.epsilon}, expected at least 0",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class RandAugmentConfig:
+    """RandAugment with torchvision's 14 operations (Cubuk et al. 2020; field defaults of GSV-Cities)."""
+
+    operations: int = 3
+    magnitude: int = 9
+    """Which of 31 bins of strength."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require(
+            self.operations >= 0,
+            f"RandAugmentConfig.operations: found {self.operations}, expected at least 0",
+        )
+        _require(
+            0 <= self.magnitude < 31,
+            f"RandAugmentConfig.magnitude: found {self.magnitude}, expected 0 to 30",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class LightAugmentConfig:
+    """One small warp and mild changes of light, for training from scratch on fixed cameras."""
+
+    crop: float = 0.1
+    """Largest share of the side that a crop removes."""
+    shift: float = 0.05
+    """Largest shift, as a share of the side."""
+    rotation: float = 2.0
+    """Largest rotation in degrees."""
+    flip: float = 0.0
+    """Probability of a mirror image. All images of one place in a batch are mirrored alike."""
+    blur: float = 1.0
+    """Largest standard deviation of a Gaussian blur, in pixels."""
+    colour: float = 0.2
+    """Largest relative change of brightness, of contrast and of saturation."""
+    grey: float = 0.2
+    """Probability of dropping the colour."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_fraction(self, "crop", "shift", "colour")
+        for name in ("rotation", "blur"):
+            value = getattr(self, name)
+            _require(
+                value >= 0, f"LightAugmentConfig.{name}: found {value}, expected at least 0"
+            )
+        for name in ("flip", "grey"):
+            value = getattr(self, name)
+            _require(
+                0 <= value <= 1,
+                f"LightAugmentConfig.{name}: found {value}, expected a probability from 0 to 1",
+            )
+
+
+AugmentConfig = RandAugmentConfig | LightAugmentConfig
+
+
+def _preset(dim: int, depth: int, heads: int, **backbone: Any) -> ModelConfig:
+    return ModelConfig(backbone=ViTConfig(dim=dim, depth=depth, heads=heads, **backbone))
+
+
+# The widths of DINOv2's four sizes; b14 is the paper's model. tiny is for training from nothing.
+PRESETS: Mapping[str, ModelConfig] = {
+    "tiny": ModelConfig(
+        image_size=(98, 98),
+        normalisation="local-contrast",
+        backbone=ViTConfig(
+            dim=128,
+            depth=4,
+            heads=4,
+            position_grid=7,
+            position_start="sincos",
+        ),
+        salad=SaladConfig(clusters=16, cluster_dim=32, token_dim=64, hidden=128, dropout=0.0),
+        encoder=CrossImageConfig(heads=4, feedforward=128, dropout=0.0),
+    ),
+    "s14": _preset(384, 12, 6),
+    "b14": _preset(768, 12, 12),
+    "l14": _preset(1024, 24, 16),
+    "g14": _preset(1536, 40, 24, ffn="swiglu"),
+}

@@ -1,0 +1,1 @@
+"""Pictures and data sets: numpy and OpenCV only, never jax."""

@@ -1,0 +1,115 @@
+"""CriSALAD: the composition of backbone, aggregation and cross-image encoder (paper Figure 1)."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
+
+from crisalad_jax.config import ModelConfig, check_image_size
+from crisalad_jax.errors import InputError
+from crisalad_jax.nn.cross_image import (
+    CrossImageEncoder,
+    as_sequence,
+    cross_image_encoder,
+    from_sequence,
+    init_cross_image,
+)
+from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.nn.salad import Salad, SaladTokens, init_salad, join, salad
+from crisalad_jax.nn.vit import ViT, init_vit, vit
+from crisalad_jax.pytree import params
+
+
+@params
+class Crisalad:
+    """All parameters of a model."""
+
+    backbone: ViT
+    aggregator: Salad
+    encoder: CrossImageEncoder | None
+
+
+def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
+    """Random parameters in float32. A user with DINOv2 weights puts those in `backbone`."""
+    backbone, aggregator, encoder = jax.random.split(key, 3)
+    return Crisalad(
+        backbone=init_vit(backbone, config.backbone),
+        aggregator=init_salad(aggregator, config.backbone.dim, config.salad),
+        encoder=None
+        if config.encoder is None
+        else init_cross_image(encoder, config.salad.cluster_dim, config.encoder),
+    )
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def describe(
+    params: Crisalad,
+    images: UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"],
+    config: ModelConfig,
+    *,
+    mask: Bool[Array, "image image"] | None = None,
+    key: PRNGKeyArray | None = None,
+) -> Float[Array, "image descriptor"]:
+    """Unit descriptors of a batch of RGB images.
+
+    With a cross-image encoder a descriptor depends on the images that `mask` lets it look at:
+    `mask[i, j]` says that image i may look at image j, and None lets all look at all. See
+    `alone` and `among`.
+
+    Args:
+        params: from `init_crisalad` or a weight file.
+        images: 8-bit pixels, which are normalised here as `config.normalisation` says, or floats
+            that already are. The sides are multiples of 14; they need not be `config.image_size`.
+        config: the model, static.
+        mask: who looks at whom.
+        key: draws the dropout; None means inference.
+
+    Raises:
+        InputError: while tracing, for images of the wrong rank, channels or sides, or with too few
+            patches for the clusters.
+    """
+    if images.ndim != 4 or images.shape[-1] != 3:
+        raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
+    check_image_size(images.shape[1:3], config.salad.clusters)
+    salad_key, encoder_key = (None, None) if key is None else jax.random.split(key)
+    one = functools.partial(_tokens, params, config=config)
+    if salad_key is None:
+        tokens = jax.vmap(functools.partial(one, key=None))(images)
+    else:
+        tokens = jax.vmap(lambda image, k: one(image, key=k))(
+            images, jax.random.split(salad_key, len(images))
+        )
+    if params.encoder is not None and config.encoder is not None:
+        to_sequence = functools.partial(as_sequence, salad=config.salad, config=config.encoder)
+        from_tokens = functools.partial(from_sequence, salad=config.salad, config=config.encoder)
+        # In the compute type, except for norms and softmax, which know to widen.
+        sequence = jax.vmap(to_sequence)(tokens).astype(config.compute_dtype)
+        sequence = cross_image_encoder(
+            params.encoder, sequence, config.encoder, mask=mask, key=encoder_key
+        ).astype(tokens.clusters.dtype)
+        tokens = jax.vmap(from_tokens)(sequence, tokens)
+    return jax.vmap(join)(tokens)
+
+
+def _tokens(
+    params: Crisalad,
+    image: UInt8[Array, "height width 3"] | Float[Array, "height width 3"],
+    config: ModelConfig,
+    *,
+    key: PRNGKeyArray | None,
+) -> SaladTokens:
+    if image.dtype == jnp.uint8:
+        image = normalise(image, config.normalisation)
+    features = vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
+    return salad(params.aggregator, features, config.salad, key=key)
+
+
+def alone(count: int) -> Bool[Array, "image image"]:
+    """The mask under which every image looks at itself only: a descriptor owes nothing to a batch."""
+    return jnp.eye(count, dtype=bool)
+
+
+def among(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
+    """The mask under which valid images look at each other, and padding only at itself."""
+    return valid[None, :] & valid[:, None] | jnp.eye(len(valid), dtype=bool)

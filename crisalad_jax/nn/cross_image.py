@@ -1,0 +1,136 @@
+"""The cross-image encoder (paper section 3.4): transformer layers that look across a batch's images.
+
+Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact GELU.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from crisalad_jax.config import CrossImageConfig, SaladConfig
+from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.layers import (
+    LayerNorm,
+    Linear,
+    dropout,
+    gelu,
+    init_layer_norm,
+    init_linear,
+    layer_norm,
+    linear,
+    split_key,
+)
+from crisalad_jax.nn.salad import SaladTokens
+from crisalad_jax.pytree import params
+
+NORM_EPSILON = 1e-5
+
+
+@params
+class EncoderLayer:
+    """Attention and feed-forward network, a layer norm after each."""
+
+    attn: Attention
+    linear1: Linear
+    linear2: Linear
+    norm1: LayerNorm
+    norm2: LayerNorm
+
+
+@params
+class CrossImageEncoder:
+    """The layers, in order."""
+
+    layers: tuple[EncoderLayer, ...]
+
+
+def init_cross_image(key: PRNGKeyArray, dim: int, config: CrossImageConfig) -> CrossImageEncoder:
+    """Start as torch does: Glorot-uniform attention with zero biases, default linears."""
+    keys = jax.random.split(key, config.layers)
+    return CrossImageEncoder(tuple(_init_layer(k, dim, config.feedforward) for k in keys))
+
+
+def _init_layer(key: PRNGKeyArray, dim: int, feedforward: int) -> EncoderLayer:
+    qkv_key, proj_key, first, second = jax.random.split(key, 4)
+    bound = math.sqrt(6 / (dim + 3 * dim))
+    qkv = Linear(
+        jax.random.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound),
+        jnp.zeros(3 * dim),
+    )
+    proj = Linear(init_linear(proj_key, dim, dim).weight, jnp.zeros(dim))
+    return EncoderLayer(
+        attn=Attention(qkv, proj),
+        linear1=init_linear(first, dim, feedforward),
+        linear2=init_linear(second, feedforward, dim),
+        norm1=init_layer_norm(dim),
+        norm2=init_layer_norm(dim),
+    )
+
+
+def cross_image_encoder(
+    params: CrossImageEncoder,
+    tokens: Float[Array, "image token dim"],
+    config: CrossImageConfig,
+    *,
+    mask: Bool[Array, "image image"] | None = None,
+    key: PRNGKeyArray | None,
+) -> Float[Array, "image token dim"]:
+    """Each token looks at the same token of the other images.
+
+    `mask[i, j]` says that image i may look at image j; None lets all look at all. `key` draws the
+    dropout; None means inference.
+    """
+    for layer, layer_key in zip(params.layers, split_key(key, config.layers), strict=True):
+        tokens = _encoder_layer(layer, tokens, config, mask=mask, key=layer_key)
+    return tokens
+
+
+def _encoder_layer(
+    params: EncoderLayer,
+    tokens: Float[Array, "image token dim"],
+    config: CrossImageConfig,
+    *,
+    mask: Bool[Array, "image image"] | None,
+    key: PRNGKeyArray | None,
+) -> Float[Array, "image token dim"]:
+    weights_key, attended_key, hidden_key, update_key = split_key(key, 4)
+    rate = config.dropout
+    across = functools.partial(
+        attention, params.attn, heads=config.heads, mask=mask, dropout_rate=rate
+    )
+    if weights_key is None:
+        attended = jax.vmap(lambda x: across(x, key=None), in_axes=1, out_axes=1)(tokens)
+    else:
+        keys = jax.random.split(weights_key, tokens.shape[1])
+        attended = jax.vmap(lambda x, k: across(x, key=k), in_axes=(1, 0), out_axes=1)(tokens, keys)
+    tokens = tokens + dropout(attended, rate, key=attended_key)
+    tokens = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
+    hidden = dropout(gelu(linear(params.linear1, tokens)), rate, key=hidden_key)
+    update = dropout(linear(params.linear2, hidden), rate, key=update_key)
+    return layer_norm(params.norm2, tokens + update, epsilon=NORM_EPSILON)
+
+
+def as_sequence(
+    tokens: SaladTokens, salad: SaladConfig, config: CrossImageConfig
+) -> Float[Array, "token dim"]:
+    """Cluster tokens, behind the global token cut to their width if it takes part."""
+    if not config.global_token:
+        return tokens.clusters
+    pieces = tokens.global_token.reshape(-1, salad.cluster_dim)
+    return jnp.concatenate([pieces, tokens.clusters])
+
+
+def from_sequence(
+    sequence: Float[Array, "token dim"],
+    before: SaladTokens,
+    salad: SaladConfig,
+    config: CrossImageConfig,
+) -> SaladTokens:
+    """Undo `as_sequence`; a global token that took no part is the one from `before`."""
+    if not config.global_token:
+        return SaladTokens(before.global_token, sequence)
+    pieces = salad.token_dim // salad.cluster_dim
+    return SaladTokens(sequence[:pieces].ravel(), sequence[pieces:])

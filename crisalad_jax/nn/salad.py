@@ -1,0 +1,111 @@
+"""SALAD: optimal-transport aggregation of patch features (Izquierdo and Civera, CVPR 2024)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config import SaladConfig
+from crisalad_jax.nn.layers import (
+    Linear,
+    dropout,
+    init_linear,
+    l2_normalise,
+    linear,
+    split_key,
+)
+from crisalad_jax.nn.vit import Features
+from crisalad_jax.pytree import params
+from crisalad_jax.sinkhorn import SinkhornResult, assign
+
+
+@params
+class TwoLayer:
+    """A network of one hidden layer: linear, ReLU, linear."""
+
+    fc1: Linear
+    fc2: Linear
+
+
+@params
+class Salad:
+    """The three networks over features, and the dustbin's score.
+
+    The published constant dustbin score changes nothing: the transport absorbs it, its gradient is 0.
+    """
+
+    token_features: TwoLayer
+    cluster_features: TwoLayer
+    score: TwoLayer
+    dust_bin: Float[Array, ""]
+
+
+class SaladTokens(NamedTuple):
+    """One image's tokens, each of unit length, before they are joined into a descriptor."""
+
+    global_token: Float[Array, " token_dim"]
+    clusters: Float[Array, "cluster cluster_dim"]
+
+
+def init_salad(key: PRNGKeyArray, dim: int, config: SaladConfig) -> Salad:
+    """Start as the public implementation: torch's default linears, dustbin score 1."""
+    token_key, cluster_key, score_key = jax.random.split(key, 3)
+    return Salad(
+        token_features=_init_two_layer(token_key, dim, config.hidden, config.token_dim),
+        cluster_features=_init_two_layer(cluster_key, dim, config.hidden, config.cluster_dim),
+        score=_init_two_layer(score_key, dim, config.hidden, config.clusters),
+        dust_bin=jnp.ones(()),
+    )
+
+
+def _init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
+    first, second = jax.random.split(key)
+    return TwoLayer(init_linear(first, d_in, hidden), init_linear(second, hidden, d_out))
+
+
+def _two_layer(
+    params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: PRNGKeyArray | None
+) -> Float[Array, "*batch d_out"]:
+    hidden = dropout(linear(params.fc1, x), rate, key=key)
+    return linear(params.fc2, jax.nn.relu(hidden))
+
+
+def transport(
+    params: Salad, patches: Float[Array, "patch dim"], config: SaladConfig, *, key: PRNGKeyArray | None
+) -> SinkhornResult:
+    """Assignment of patches to clusters, dustbin last (paper Eqs. 3 to 5), in float32.
+
+    Raises:
+        InputError: no more patches than clusters.
+    """
+    scores = _two_layer(params.score, patches, config.dropout, key)
+    wide = jnp.promote_types(scores.dtype, jnp.float32)
+    return assign(scores.astype(wide), params.dust_bin, config.sinkhorn)
+
+
+def salad(
+    params: Salad, features: Features, config: SaladConfig, *, key: PRNGKeyArray | None
+) -> SaladTokens:
+    """Global token and cluster tokens of one image (paper Eq. 6), each L2-normalised, in float32.
+
+    `key` draws the dropout of the cluster and score networks; None means inference.
+
+    Raises:
+        InputError: no more patches than clusters.
+    """
+    cluster_key, score_key = split_key(key, 2)
+    global_token = _two_layer(params.token_features, features.class_token, 0.0, None)
+    local = _two_layer(params.cluster_features, features.patches, config.dropout, cluster_key)
+    plan = jnp.exp(transport(params, features.patches, config, key=score_key).log_plan[:, :-1])
+    clusters = jnp.einsum("nm,nd->md", plan, local.astype(plan.dtype))
+    return SaladTokens(l2_normalise(global_token.astype(plan.dtype)), l2_normalise(clusters))
+
+
+def join(tokens: SaladTokens) -> Float[Array, " descriptor"]:
+    """One unit descriptor: the global token, then the clusters dimension by dimension.
+
+    The clusters' numbers stand in the public implementation's order: all clusters' first dimension,
+    then all clusters' second.
+    """
+    return l2_normalise(jnp.concatenate([tokens.global_token, tokens.clusters.T.ravel()]))

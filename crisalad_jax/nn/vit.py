@@ -1,0 +1,249 @@
+"""DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024).
+
+Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it meets.
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config import PATCH_SIZE, ViTConfig
+from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
+from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.layers import LayerNorm, Linear, gelu, init_layer_norm, layer_norm, linear
+from crisalad_jax.pytree import params
+
+NORM_EPSILON = 1e-6
+
+
+@params
+class Mlp:
+    """Feed-forward network: fc1, GELU, fc2."""
+
+    fc1: Linear
+    fc2: Linear
+
+
+@params
+class SwiGlu:
+    """Feed-forward network of ViT-g: w12 makes gate and value side by side, w3 projects."""
+
+    w12: Linear
+    w3: Linear
+
+
+@params
+class Block:
+    """One transformer block; `ls1` and `ls2` are LayerScale's gains."""
+
+    norm1: LayerNorm
+    attn: Attention
+    ls1: Float[Array, " dim"]
+    norm2: LayerNorm
+    mlp: Mlp | SwiGlu
+    ls2: Float[Array, " dim"]
+    adapter: Adapter | None
+
+
+@params
+class ViT:
+    """The backbone. In `blocks` every leaf has a leading depth axis.
+
+    `blocks` is a tuple of such stacks, run one after the other: one stack as a rule, two while only
+    the last blocks train, so that the frozen ones stay out of the gradient.
+    """
+
+    patch_embed: Linear
+    """The weight's rows are a patch's pixels in (row, column, channel) order."""
+    cls_token: Float[Array, " dim"]
+    register_tokens: Float[Array, "register dim"]
+    pos_embed_cls: Float[Array, " dim"]
+    pos_embed: Float[Array, "grid grid dim"]
+    blocks: tuple[Block, ...]
+    norm: LayerNorm
+
+
+class Features(NamedTuple):
+    """What a backbone says of one image, after its last layer norm."""
+
+    class_token: Float[Array, " dim"]
+    patches: Float[Array, "patch dim"]
+
+
+def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
+    """Start as DINOv2 does before training: linears normal of deviation 0.02, biases 0."""
+    patch_key, class_key, register_key, position_key, block_key = jax.random.split(key, 5)
+    dim, side = config.dim, config.position_grid
+    if config.position_start == "sincos":
+        positions = jnp.asarray(_sincos_positions(side, dim), jnp.float32)
+    else:
+        positions = 0.02 * jax.random.normal(position_key, (side, side, dim))
+    return ViT(
+        patch_embed=_init_linear(patch_key, 3 * PATCH_SIZE**2, dim),
+        cls_token=1e-6 * jax.random.normal(class_key, (dim,)),
+        register_tokens=1e-6 * jax.random.normal(register_key, (config.registers, dim)),
+        pos_embed_cls=jnp.zeros(dim),
+        pos_embed=positions,
+        blocks=(
+            jax.vmap(functools.partial(_init_block, config=config))(
+                jax.random.split(block_key, config.depth)
+            ),
+        ),
+        norm=init_layer_norm(dim),
+    )
+
+
+def _init_linear(key: PRNGKeyArray, d_in: int, d_out: int) -> Linear:
+    weight = 0.02 * jax.random.truncated_normal(key, -2.0, 2.0, (d_in, d_out))
+    return Linear(weight, jnp.zeros(d_out))
+
+
+def _init_block(key: PRNGKeyArray, config: ViTConfig) -> Block:
+    qkv, proj, first, second, adapter_key = jax.random.split(key, 5)
+    dim, hidden = config.dim, config.hidden
+    if config.ffn == "swiglu":
+        mlp = SwiGlu(_init_linear(first, dim, 2 * hidden), _init_linear(second, hidden, dim))
+    else:
+        mlp = Mlp(_init_linear(first, dim, hidden), _init_linear(second, hidden, dim))
+    return Block(
+        norm1=init_layer_norm(dim),
+        attn=Attention(_init_linear(qkv, dim, 3 * dim), _init_linear(proj, dim, dim)),
+        ls1=jnp.full(dim, config.layer_scale_start),
+        norm2=init_layer_norm(dim),
+        mlp=mlp,
+        ls2=jnp.full(dim, config.layer_scale_start),
+        adapter=None if config.adapter is None else init_adapter(adapter_key, config),
+    )
+
+
+def _sincos_positions(side: int, dim: int) -> np.ndarray:
+    """Fixed 2-D sine-cosine codes (MoCo v3's), half the width for rows and half for columns."""
+    frequencies = 1e4 ** -(np.arange(dim // 4) / (dim // 4))
+    angles = np.arange(side)[:, None] * frequencies
+    code = np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
+    rows = np.broadcast_to(code[:, None], (side, side, dim // 2))
+    columns = np.broadcast_to(code[None], (side, side, dim // 2))
+    return np.concatenate([rows, columns], axis=-1)
+
+
+def vit(params: ViT, image: Float[Array, "height width 3"], config: ViTConfig) -> Features:
+    """Features of one normalised image whose sides are multiples of 14."""
+    tokens = run_blocks(params, embed(params, image, config), grid_of(image), config)
+    tokens = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
+    return Features(tokens[0], tokens[1 + config.registers :])
+
+
+def grid_of(image: Float[Array, "height width 3"]) -> tuple[int, int]:
+    """Rows and columns of patches."""
+    return image.shape[0] // PATCH_SIZE, image.shape[1] // PATCH_SIZE
+
+
+def embed(
+    params: ViT, image: Float[Array, "height width 3"], config: ViTConfig
+) -> Float[Array, "token dim"]:
+    """Class token, registers and patches with their positions; registers have none."""
+    rows, columns = grid_of(image)
+    pixels = image.reshape(rows, PATCH_SIZE, columns, PATCH_SIZE, 3).transpose(0, 2, 1, 3, 4)
+    patches = linear(params.patch_embed, pixels.reshape(rows * columns, -1))
+    positions = interpolate_positions(params.pos_embed, (rows, columns), config)
+    class_token = (params.cls_token + params.pos_embed_cls)[None]
+    return jnp.concatenate(
+        [
+            class_token.astype(image.dtype),
+            params.register_tokens.astype(image.dtype),
+            patches + positions.reshape(rows * columns, -1).astype(image.dtype),
+        ]
+    )
+
+
+def run_blocks(
+    params: ViT, tokens: Float[Array, "token dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "token dim"]:
+    """All blocks in turn, by one compiled body."""
+
+    def body(
+        carry: Float[Array, "token dim"], one: Block
+    ) -> tuple[Float[Array, "token dim"], None]:
+        return block(one, carry, grid, config), None
+
+    for stack in params.blocks:
+        tokens, _ = jax.lax.scan(body, tokens, stack)
+    return tokens
+
+
+def block(
+    params: Block, tokens: Float[Array, "token dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "token dim"]:
+    """One block (paper Eq. 2), with LayerScale over MLP and adapter alike, as in CricaVPR."""
+    normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
+    attended = attention(params.attn, normed, config.heads, key=None)
+    tokens = tokens + params.ls1.astype(tokens.dtype) * attended
+    normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
+    update = feed_forward(params.mlp, normed)
+    if params.adapter is not None and config.adapter is not None:
+        update = update + config.adapter.alpha * adapter(params.adapter, normed, grid)
+    return tokens + params.ls2.astype(tokens.dtype) * update
+
+
+def feed_forward(
+    params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]
+) -> Float[Array, "*batch dim"]:
+    """GELU network, or SwiGLU (Shazeer 2020) where the parameters are its."""
+    if isinstance(params, Mlp):
+        return linear(params.fc2, gelu(linear(params.fc1, x)))
+    gate, value = jnp.split(linear(params.w12, x), 2, axis=-1)
+    return linear(params.w3, jax.nn.silu(gate) * value)
+
+
+def interpolate_positions(
+    positions: Float[Array, "grid grid dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "rows columns dim"]:
+    """Resize the stored grid of position embeddings as the public models do.
+
+    Bicubic interpolation is linear and separable: two small matrix products, whose constants are
+    made while tracing, so one set of weights serves every image size. Models without registers use
+    torch's bicubic (a = -0.75) with the scale (size + 0.1) / grid; those with registers its
+    antialiased one (a = -0.5) at the exact scale.
+    """
+    side = positions.shape[0]
+    if grid == (side, side):
+        return positions
+    weights = _antialias_weights if config.registers else _bicubic_weights
+    rows, columns = (jnp.asarray(weights(side, size), positions.dtype) for size in grid)
+    precision = jax.lax.Precision.HIGHEST
+    return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision=precision)
+
+
+def _cubic(x: np.ndarray, a: float) -> np.ndarray:
+    """Keys' cubic convolution kernel."""
+    x = np.abs(x)
+    near = (a + 2) * x**3 - (a + 3) * x**2 + 1
+    far = a * (x**3 - 5 * x**2 + 8 * x - 4)
+    return np.where(x <= 1, near, np.where(x < 2, far, 0.0))
+
+
+@functools.cache
+def _bicubic_weights(source: int, target: int) -> np.ndarray:
+    """(target, source) weights of torch's bicubic upsampling, borders replicated."""
+    scale = source / (target + 0.1)
+    centres = (np.arange(target) + 0.5) * scale - 0.5
+    weights = np.zeros((target, source))
+    for row, centre in enumerate(centres):
+        taps = math.floor(centre) + np.arange(-1, 3)
+        np.add.at(weights[row], np.clip(taps, 0, source - 1), _cubic(centre - taps, -0.75))
+    return weights
+
+
+@functools.cache
+def _antialias_weights(source: int, target: int) -> np.ndarray:
+    """(target, source) weights of torch's antialiased bicubic: a kernel as wide as the shrinking."""
+    scale = source / target
+    stretch = max(scale, 1.0)
+    centres = (np.arange(target) + 0.5) * scale
+    weights = _cubic((np.arange(source) + 0.5 - centres[:, None]) / stretch, -0.5)
+    return weights / weights.sum(axis=1, keepdims=True)
