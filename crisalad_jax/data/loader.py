@@ -1,0 +1,239 @@
+"""Batches of decoded images: read ahead by threads (grain), in an order no thread decides."""
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import cv2
+import grain
+import numpy as np
+from jaxtyping import Bool, Int32, Int64, UInt8
+
+from crisalad_jax.config import AugmentConfig, LightAugmentConfig
+from crisalad_jax.data.augment import augment as augment_image
+from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.places import Order, Places, epoch_batches
+from crisalad_jax.errors import InputError
+
+OnBadImage = Literal["skip", "stop"]
+BATCHES_AHEAD = 2
+
+_Image = UInt8[np.ndarray, "h w 3"]
+
+
+class ImageBatch(NamedTuple):
+    """Images of one size; `valid` is False for padding and for images that cannot be read."""
+
+    images: UInt8[np.ndarray, "batch h w 3"]
+    """Zeros where not valid."""
+    labels: Int32[np.ndarray, " batch"]
+    """Place index; position in the list of paths where there are no places; -1 for padding."""
+    valid: Bool[np.ndarray, " batch"]
+    indices: Int64[np.ndarray, " batch"]
+    """Image index, also of an unreadable image; -1 for padding."""
+
+
+class ImageCache:
+    """Keeps decoded and resized images in memory up to a budget; safe to share between threads.
+
+    For sets that fit, which are then decoded once for all epochs. Nothing is dropped for newer
+    images once the budget is spent, and a file that changes on disk is not read again.
+    """
+
+    def __init__(self, budget_bytes: int = 2**30) -> None:
+        """Start empty, with room for `budget_bytes` of pixels."""
+        self._room = budget_bytes
+        self._images: dict[tuple[str, tuple[int, int]], _Image] = {}
+        self._lock = threading.Lock()
+
+    def read(self, path: str | os.PathLike[str], image_size: tuple[int, int]) -> _Image:
+        """Read an image at (height, width), from memory if it is there; the array is read-only.
+
+        Raises:
+            InputError: the image cannot be read.
+        """
+        key = (os.fspath(path), image_size)
+        image = self._images.get(key)
+        if image is None:
+            image = _read(path, image_size)
+            image.setflags(write=False)
+            with self._lock:
+                if key not in self._images and image.nbytes <= self._room:
+                    self._images[key] = image
+                    self._room -= image.nbytes
+        return image
+
+
+def _read(path: str | os.PathLike[str], image_size: tuple[int, int]) -> _Image:
+    return resize_image(read_image(path), image_size)
+
+
+def training_batches(
+    places: Places,
+    *,
+    image_size: tuple[int, int],
+    places_per_batch: int,
+    images_per_place: int,
+    order: Order,
+    augment: AugmentConfig | None,
+    seed: int,
+    epoch: int,
+    start_step: int = 0,
+    on_bad_image: OnBadImage = "stop",
+    threads: int = 2,
+    cache: ImageCache | None = None,
+) -> Iterator[ImageBatch]:
+    """Batches of one epoch, places_per_batch x images_per_place images each, place after place.
+
+    The same (seed, epoch, step) gives the same bits, whatever `threads` and `start_step`. Images
+    are resized to `image_size` (height, width), then augmented. An image that cannot be read stops
+    the epoch or, under "skip", leaves a slot that is not valid.
+
+    Args:
+        places: what to draw from; see `epoch_batches` for the order.
+        start_step: the first batch to give, to go on with an epoch that was interrupted.
+        threads: how many decode ahead; 0 decodes in the caller's thread.
+        cache: keeps decoded images from epoch to epoch.
+
+    Raises:
+        InputError: at once for arguments out of range, as in `epoch_batches`; while iterating under
+            "stop" for an image that cannot be read.
+    """
+    chosen = epoch_batches(
+        places,
+        places_per_batch=places_per_batch,
+        images_per_place=images_per_place,
+        order=order,
+        seed=seed,
+        epoch=epoch,
+    )
+    if not 0 <= start_step <= len(chosen):
+        raise InputError(f"start_step: found {start_step}, expected 0 to {len(chosen)}")
+    batch_size = places_per_batch * images_per_place
+    indices = chosen.reshape(-1)
+    read = _read if cache is None else cache.read
+
+    def load(position: int) -> _Image:
+        image = read(places.path(indices[position]), image_size)
+        if augment is None:
+            return image
+        step, slot = divmod(position, batch_size)
+        if isinstance(augment, LightAugmentConfig) and augment.flip > 0:
+            # The spawn key keeps this draw, one for each place, apart from those for each image.
+            entropy = (seed, epoch, step, slot // images_per_place)
+            sequence = np.random.SeedSequence(entropy, spawn_key=(1,))
+            if np.random.default_rng(sequence).random() < augment.flip:
+                image = cv2.flip(image, 1)
+        return augment_image(image, augment, np.random.default_rng((seed, epoch, step, slot)))
+
+    return _batches(
+        load,
+        labels=places.image_place[indices],
+        indices=indices,
+        image_size=image_size,
+        batch_size=batch_size,
+        first=start_step * batch_size,
+        on_bad_image=on_bad_image,
+        threads=threads,
+    )
+
+
+def image_batches(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    image_size: tuple[int, int],
+    batch_size: int,
+    on_bad_image: OnBadImage = "stop",
+    threads: int = 2,
+    cache: ImageCache | None = None,
+) -> Iterator[ImageBatch]:
+    """Batches of the images in `paths`, in order; the last one is padded to `batch_size`.
+
+    Under "skip" an image that cannot be read is not valid but keeps its index. The other arguments
+    are those of `training_batches`.
+
+    Raises:
+        InputError: at once for arguments out of range; while iterating under "stop" for an image
+            that cannot be read.
+    """
+    if batch_size < 1:
+        raise InputError(f"batch_size: found {batch_size}, expected at least 1")
+    read = _read if cache is None else cache.read
+    indices = np.arange(len(paths))
+    return _batches(
+        lambda position: read(paths[position], image_size),
+        labels=indices,
+        indices=indices,
+        image_size=image_size,
+        batch_size=batch_size,
+        first=0,
+        on_bad_image=on_bad_image,
+        threads=threads,
+    )
+
+
+def _batches(
+    load: Callable[[int], _Image],
+    *,
+    labels: np.ndarray,
+    indices: np.ndarray,
+    image_size: tuple[int, int],
+    batch_size: int,
+    first: int,
+    on_bad_image: OnBadImage,
+    threads: int,
+) -> Iterator[ImageBatch]:
+    """Check the arguments now, rather than when the first batch is asked for; then iterate."""
+    if on_bad_image not in ("skip", "stop"):
+        raise InputError(f"on_bad_image: found {on_bad_image!r}, expected one of skip, stop")
+    if threads < 0:
+        raise InputError(f"threads: found {threads}, expected at least 0")
+    if min(image_size) < 1:
+        raise InputError(
+            f"image_size: found {image_size}, expected a height and width of at least 1"
+        )
+
+    def load_or_skip(position: int) -> tuple[_Image | None]:
+        # In a tuple, because grain drops an element that is None.
+        try:
+            return (load(position),)
+        except InputError:
+            if on_bad_image == "stop":
+                raise
+            return (None,)
+
+    def batches() -> Iterator[ImageBatch]:
+        dataset = grain.MapDataset.range(first, len(indices)).map(load_or_skip)
+        # An element is an image, not a batch, so that the threads share the batch in hand.
+        options = grain.ReadOptions(
+            num_threads=threads, prefetch_buffer_size=BATCHES_AHEAD * batch_size if threads else 0
+        )
+        stream = iter(dataset.to_iter_dataset(options))
+        try:
+            for start in range(first, len(indices), batch_size):
+                part = slice(start, min(start + batch_size, len(indices)))
+                batch = _empty_batch(batch_size, image_size)
+                filled = part.stop - part.start
+                batch.labels[:filled] = labels[part]
+                batch.indices[:filled] = indices[part]
+                for slot in range(filled):
+                    (image,) = next(stream)
+                    if image is not None:
+                        batch.images[slot] = image
+                        batch.valid[slot] = True
+                yield batch
+        finally:
+            # Cancels what is queued, so that an abandoned epoch does not go on decoding.
+            stream.close()
+
+    return batches()
+
+
+def _empty_batch(batch_size: int, image_size: tuple[int, int]) -> ImageBatch:
+    return ImageBatch(
+        images=np.zeros((batch_size, *image_size, 3), np.uint8),
+        labels=np.full(batch_size, -1, np.int32),
+        valid=np.zeros(batch_size, np.bool_),
+        indices=np.full(batch_size, -1, np.int64),
+    )

@@ -1,0 +1,283 @@
+"""Training places in the layout of GSV-Cities (Ali-bey et al. 2022), and their order in an epoch.
+
+Layout: `Dataframes/{city}.csv` with one row per image, and
+`Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
+"""
+
+import csv
+import dataclasses
+import math
+import os
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Int, Int32, Int64
+
+from crisalad_jax.errors import InputError
+
+COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
+IDS_PER_CITY = 10**5
+
+Order = Literal["within-city", "shuffled"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Places:
+    """Images grouped by place: place p owns images `place_start[p]` to `place_start[p + 1]`."""
+
+    root: pathlib.Path
+    cities: tuple[str, ...]
+    files: tuple[str, ...]
+    """Image -> path relative to `root`. Text, because a Path takes ten times the memory."""
+    image_place: Int32[np.ndarray, " images"]
+    """Image -> place, ascending."""
+    place_city: Int32[np.ndarray, " places"]
+    """Place -> position in `cities`, ascending."""
+    place_id: Int64[np.ndarray, " places"]
+    """The id in the CSV modulo 10**5, plus 10**5 times the position of the city: unique."""
+    place_start: Int64[np.ndarray, " places+1"]
+
+    @property
+    def image_counts(self) -> Int64[np.ndarray, " places"]:
+        """Images of each place."""
+        return np.diff(self.place_start)
+
+    def path(self, image: int | np.integer) -> pathlib.Path:
+        """Path of one image."""
+        return self.root / self.files[image]
+
+    def describe_place(self, place: int | np.integer) -> str:
+        """Name a place for a message: its city and its id as in the CSV."""
+        city = self.cities[self.place_city[place]]
+        return f"place {self.place_id[place] % IDS_PER_CITY} of {city}"
+
+
+def read_places(
+    root: str | os.PathLike[str], *, cities: Sequence[str] | None = None, min_images: int = 4
+) -> Places:
+    """Read a folder in the layout of GSV-Cities; every image named must exist.
+
+    Images may end in .jpg or .JPG, and may lie in a folder named by the city id or by the CSV file.
+    A row that repeats an earlier one of its place is dropped: no picture is its own second view.
+
+    Args:
+        root: folder that holds `Dataframes/` and `Images/`.
+        cities: names of CSV files without the suffix; None reads all, in alphabetical order.
+        min_images: places with fewer images are left out.
+
+    Raises:
+        InputError: no `Dataframes` or nothing in it, an unknown or repeated city, a CSV without a
+            column or with a field that is not a number, a missing image, no place large enough.
+    """
+    root = pathlib.Path(root)
+    tables = _find_tables(root, cities)
+    listings: dict[str, frozenset[str]] = {}
+    files: list[str] = []
+    counts: list[int] = []
+    place_city: list[int] = []
+    place_id: list[int] = []
+    largest = 0
+    for position, table in enumerate(tables):
+        for raw_id, images in _read_city(root, table, listings):
+            largest = max(largest, len(images))
+            if len(images) >= min_images:
+                files.extend(images)
+                counts.append(len(images))
+                place_city.append(position)
+                place_id.append(position * IDS_PER_CITY + raw_id % IDS_PER_CITY)
+    if not counts:
+        raise InputError(
+            f"{root}: found no place with at least {min_images} images; the largest has {largest}"
+        )
+    return Places(
+        root=root,
+        cities=tuple(table.stem for table in tables),
+        files=tuple(files),
+        image_place=np.repeat(np.arange(len(counts), dtype=np.int32), counts),
+        place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        place_city=np.array(place_city, np.int32),
+        place_id=np.array(place_id, np.int64),
+    )
+
+
+def _find_tables(root: pathlib.Path, cities: Sequence[str] | None) -> list[pathlib.Path]:
+    folder = root / "Dataframes"
+    if not folder.is_dir():
+        raise InputError(f"{root}: found no folder Dataframes, expected the layout of GSV-Cities")
+    tables = {path.stem: path for path in folder.glob("*.csv")}
+    if not tables:
+        raise InputError(f"{folder}: found no CSV file, expected one for each city")
+    if cities is None:
+        return [tables[name] for name in sorted(tables)]
+    if not cities or len(set(cities)) < len(cities):
+        raise InputError(f"cities: found {list(cities)}, expected at least one, each named once")
+    unknown = [name for name in cities if name not in tables]
+    if unknown:
+        raise InputError(
+            f"cities: found {', '.join(unknown)}, expected some of {', '.join(sorted(tables))}"
+        )
+    return [tables[name] for name in cities]
+
+
+def _read_city(
+    root: pathlib.Path, table: pathlib.Path, listings: dict[str, frozenset[str]]
+) -> list[tuple[int, list[str]]]:
+    """Places of one city in ascending order of their id, with the images of each."""
+    # The inner dict is an ordered set.
+    places: dict[int, dict[str, None]] = {}
+    for line, row in _read_rows(table):
+        fields = dict(zip(COLUMNS, row, strict=True))
+        place, year, month, north = (
+            _integer(table, line, name, fields[name]) for name in COLUMNS[:4]
+        )
+        for name in ("lat", "lon"):
+            _check_number(table, line, name, fields[name])
+        city_id = fields["city_id"]
+        stem = (
+            f"{city_id}_{place % IDS_PER_CITY:07d}_{year:04d}_{month:02d}_{north:03d}"
+            f"_{fields['lat']}_{fields['lon']}_{fields['panoid']}"
+        )
+        image = _find_image(root, (city_id, table.stem), stem, listings)
+        if image is None:
+            raise InputError(
+                f"{table}: line {line}: found no file Images/{city_id}/{stem}.jpg "
+                f"(nor .JPG, nor under Images/{table.stem}/), expected every row to have its image"
+            )
+        places.setdefault(place, {})[image] = None
+    ids = {place % IDS_PER_CITY: place for place in places}
+    if len(ids) < len(places):
+        first = next(place for place in places if ids[place % IDS_PER_CITY] != place)
+        raise InputError(
+            f"{table}: found place_id {first} and {ids[first % IDS_PER_CITY]}, whose files have "
+            f"the same names; expected ids that differ modulo {IDS_PER_CITY}"
+        )
+    return [(place, list(places[place])) for place in sorted(places)]
+
+
+def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, list[str]]]:
+    """Line number and the fields in the order of COLUMNS, of every row that is not blank."""
+    try:
+        # utf-8-sig: a spreadsheet's byte order mark would spoil the first column's name.
+        with table.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            header = next(reader, [])
+            missing = [name for name in COLUMNS if name not in header]
+            if missing:
+                raise InputError(
+                    f"{table}: found columns {', '.join(header) or 'none'}; "
+                    f"missing {', '.join(missing)}"
+                )
+            wanted = [header.index(name) for name in COLUMNS]
+            for row in reader:
+                if not row:
+                    continue
+                if len(row) != len(header):
+                    raise InputError(
+                        f"{table}: line {reader.line_num}: found {len(row)} fields, "
+                        f"expected {len(header)}"
+                    )
+                yield reader.line_num, [row[i] for i in wanted]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{table}: cannot be read as UTF-8 CSV: {error}") from error
+
+
+def _integer(table: pathlib.Path, line: int, name: str, text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise InputError(
+            f"{table}: line {line}: {name}: found {text!r}, expected a whole number from 0"
+        )
+    return value
+
+
+def _check_number(table: pathlib.Path, line: int, name: str, text: str) -> None:
+    try:
+        finite = math.isfinite(float(text))
+    except ValueError:
+        finite = False
+    if not finite:
+        raise InputError(f"{table}: line {line}: {name}: found {text!r}, expected a number")
+
+
+def _find_image(
+    root: pathlib.Path,
+    folders: tuple[str, ...],
+    stem: str,
+    listings: dict[str, frozenset[str]],
+) -> str | None:
+    for folder in folders:
+        if folder not in listings:
+            listings[folder] = _list_names(root / "Images" / folder)
+        for name in (f"{stem}.jpg", f"{stem}.JPG"):
+            if name in listings[folder]:
+                return f"Images/{folder}/{name}"
+    return None
+
+
+def _list_names(folder: pathlib.Path) -> frozenset[str]:
+    try:
+        with os.scandir(folder) as entries:
+            return frozenset(entry.name for entry in entries)
+    except OSError:
+        return frozenset()
+
+
+def epoch_batches(
+    places: Places,
+    *,
+    places_per_batch: int,
+    images_per_place: int,
+    order: Order,
+    seed: int,
+    epoch: int,
+) -> Int[np.ndarray, "steps places images"]:
+    """Images of every batch of an epoch: a pure function of (seed, epoch).
+
+    Every place comes at most once, with `images_per_place` of its images sampled without
+    replacement; the last batch is dropped if incomplete. "within-city" shuffles the places of each
+    city and strings the cities together in random order, so that a batch is nearly always of one
+    city, whose places are hard to tell apart (the public loaders); "shuffled" mixes all.
+
+    Raises:
+        InputError: a place has fewer than `images_per_place` images, there are fewer places than
+            `places_per_batch`, an unknown order, a negative seed or epoch.
+    """
+    for name, value, least in (
+        ("places_per_batch", places_per_batch, 1),
+        ("images_per_place", images_per_place, 1),
+        ("seed", seed, 0),
+        ("epoch", epoch, 0),
+    ):
+        if value < least:
+            raise InputError(f"{name}: found {value}, expected at least {least}")
+    counts = places.image_counts
+    if counts.min() < images_per_place:
+        place = int(counts.argmin())
+        raise InputError(
+            f"{places.root}: {places.describe_place(place)} has {counts[place]} images, expected "
+            f"at least images_per_place {images_per_place}"
+        )
+    if len(counts) < places_per_batch:
+        raise InputError(
+            f"{places.root}: found {len(counts)} places, expected at least places_per_batch "
+            f"{places_per_batch}"
+        )
+    # The spawn key keeps these numbers apart from those that the loader draws from (seed, epoch).
+    generator = np.random.default_rng(np.random.SeedSequence((seed, epoch), spawn_key=(0,)))
+    if order == "within-city":
+        city_rank = generator.permutation(len(places.cities))[places.place_city]
+    elif order == "shuffled":
+        city_rank = np.zeros(len(counts), np.int64)
+    else:
+        raise InputError(f"order: found {order!r}, expected one of shuffled, within-city")
+    place_order = np.lexsort((generator.random(len(counts)), city_rank))
+    steps = len(counts) // places_per_batch
+    chosen = place_order[: steps * places_per_batch].reshape(steps, places_per_batch)
+    # Sorting all images by (place, random key) shuffles each place's images where they stand.
+    shuffled = np.lexsort((generator.random(len(places.files)), places.image_place))
+    return shuffled[places.place_start[chosen][..., None] + np.arange(images_per_place)]

@@ -1,0 +1,311 @@
+"""Batches of images: what is in them, that nothing but the seed decides it, and bad files."""
+
+import csv
+import gc
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from crisalad_jax.config import LightAugmentConfig, RandAugmentConfig
+from crisalad_jax.data import loader
+from crisalad_jax.data.augment import augment
+from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.loader import ImageBatch, ImageCache, image_batches, training_batches
+from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.errors import InputError
+
+SIZE = (28, 42)
+LIGHT = LightAugmentConfig(flip=0.5)
+STILL = LightAugmentConfig(
+    crop=0.0, shift=0.0, rotation=0.0, flip=0.5, blur=0.0, colour=0.0, grey=0.0
+)
+
+
+def draw_image(path: Path, generator: np.random.Generator) -> None:
+    coarse = generator.integers(0, 256, (4, 5, 3), dtype=np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), cv2.resize(coarse, (60, 40)))
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> Places:
+    generator = np.random.default_rng(0)
+    rows = [
+        [str(place), "2020", "1", str(view), "A", "1.0", "2.0", "p"]
+        for place in range(7)
+        for view in range(3)
+    ]
+    for row in rows:
+        name = f"A_{int(row[0]):07d}_2020_01_{int(row[3]):03d}_1.0_2.0_p.jpg"
+        draw_image(tmp_path / "Images" / "A" / name, generator)
+    (tmp_path / "Dataframes").mkdir()
+    with (tmp_path / "Dataframes" / "A.csv").open("w", newline="") as file:
+        header = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
+        csv.writer(file).writerows([header, *rows])
+    return read_places(tmp_path, min_images=3)
+
+
+def train(places: Places, **changes) -> list[ImageBatch]:
+    arguments = {
+        "image_size": SIZE,
+        "places_per_batch": 2,
+        "images_per_place": 3,
+        "order": "within-city",
+        "augment": None,
+        "seed": 1,
+        "epoch": 4,
+    }
+    return list(training_batches(places, **(arguments | changes)))
+
+
+def plain(path: Path) -> np.ndarray:
+    return resize_image(read_image(path), SIZE)
+
+
+def assert_same(found: list[ImageBatch], expected: list[ImageBatch]) -> None:
+    assert len(found) == len(expected) > 0
+    for a, b in zip(found, expected, strict=True):
+        for x, y in zip(a, b, strict=True):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+
+
+def same(a: list[ImageBatch], b: list[ImageBatch]) -> bool:
+    return all(np.array_equal(x.images, y.images) for x, y in zip(a, b, strict=True))
+
+
+def test_training_batches_hold_the_images_that_the_epoch_drew(places):
+    batches = train(places)
+    drawn = epoch_batches(
+        places, places_per_batch=2, images_per_place=3, order="within-city", seed=1, epoch=4
+    )
+    assert len(batches) == len(drawn) == 3
+    for batch, images in zip(batches, drawn.reshape(3, 6), strict=True):
+        assert batch.images.dtype == np.uint8
+        assert batch.labels.dtype == np.int32
+        assert batch.indices.dtype == np.int64
+        np.testing.assert_array_equal(batch.indices, images)
+        np.testing.assert_array_equal(batch.labels, images // 3)  # three images a place
+        assert batch.valid.all()
+        for image, index in zip(batch.images, images, strict=True):
+            np.testing.assert_array_equal(image, plain(places.path(index)))
+
+
+@pytest.mark.parametrize("augment", [None, LIGHT, RandAugmentConfig()])
+def test_threads_restarts_and_caches_do_not_change_a_bit(places, augment):
+    whole = train(places, augment=augment)
+    for threads in (0, 1, 5):
+        assert_same(train(places, augment=augment, threads=threads), whole)
+    assert_same(train(places, augment=augment, start_step=1), whole[1:])
+    assert train(places, augment=augment, start_step=3) == []
+    cache = ImageCache()
+    for _ in range(2):
+        assert_same(train(places, augment=augment, cache=cache), whole)
+
+
+def test_augmentation_draws_from_seed_epoch_step_and_slot(places):
+    config = RandAugmentConfig()
+    for step, batch in enumerate(train(places, augment=config)):
+        for slot, index in enumerate(batch.indices):
+            generator = np.random.default_rng((1, 4, step, slot))
+            expected = augment(plain(places.path(index)), config, generator)
+            np.testing.assert_array_equal(batch.images[slot], expected)
+
+
+def test_seed_and_epoch_change_the_augmentation(places):
+    whole = train(places, augment=LIGHT)
+    assert not same(whole, train(places, augment=LIGHT, seed=2))
+    assert not same(whole, train(places, augment=LIGHT, epoch=5))
+    assert not same(whole, train(places))
+
+
+def test_a_place_is_mirrored_as_a_whole(places):
+    mirrored = []
+    for epoch in range(20):
+        for batch in train(places, augment=STILL, epoch=epoch):
+            for slot, index in enumerate(batch.indices):
+                image = plain(places.path(index))
+                flipped = np.array_equal(batch.images[slot], image[:, ::-1])
+                assert flipped or np.array_equal(batch.images[slot], image)
+                mirrored.append(flipped)
+    by_place = np.array(mirrored).reshape(-1, 3)
+    assert (by_place == by_place[:, :1]).all()
+    # 120 fair coins fall outside 35 to 85 heads once in 200,000 draws.
+    assert 35 <= by_place[:, 0].sum() <= 85
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", None])
+def test_a_bad_training_image(places, content):
+    path = places.path(4)
+    whole = train(places)
+    if content is None:
+        path.unlink()
+    else:
+        path.write_bytes(content)
+
+    with pytest.raises(InputError) as caught:
+        train(places)
+    assert type(caught.value) is InputError
+    assert path.name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+    batches = train(places, on_bad_image="skip")
+    slots = np.concatenate([batch.indices for batch in batches])
+    valid = np.concatenate([batch.valid for batch in batches])
+    images = np.concatenate([batch.images for batch in batches])
+    np.testing.assert_array_equal(valid, slots != 4)
+    assert (~valid).sum() == 1
+    assert not images[~valid].any()
+    np.testing.assert_array_equal(images[valid], np.concatenate([b.images for b in whole])[valid])
+
+
+def test_batches_before_a_bad_image_arrive(places):
+    whole = train(places)
+    places.path(int(whole[1].indices[2])).write_bytes(b"no image")
+    batches = training_batches(
+        places,
+        image_size=SIZE,
+        places_per_batch=2,
+        images_per_place=3,
+        order="within-city",
+        augment=None,
+        seed=1,
+        epoch=4,
+    )
+    assert_same([next(batches)], whole[:1])
+    with pytest.raises(InputError):
+        next(batches)
+
+
+def test_image_batches_keep_the_order_and_pad(places):
+    paths = [places.path(i) for i in (5, 3, 9, 0, 7)]
+    first, second = image_batches(paths, image_size=SIZE, batch_size=3)
+    np.testing.assert_array_equal(first.images, [plain(path) for path in paths[:3]])
+    np.testing.assert_array_equal(second.images[:2], [plain(path) for path in paths[3:]])
+    assert first.indices.tolist() == first.labels.tolist() == [0, 1, 2]
+    assert second.indices.tolist() == second.labels.tolist() == [3, 4, -1]
+    assert first.valid.all()
+    assert second.valid.tolist() == [True, True, False]
+    assert not second.images[2].any()
+    assert list(image_batches([], image_size=SIZE, batch_size=3)) == []
+
+
+def test_a_bad_image_keeps_its_index(places):
+    paths = [places.path(i) for i in range(4)]
+    paths[1].write_bytes(b"no image")
+    with pytest.raises(InputError, match=paths[1].name):
+        list(image_batches(paths, image_size=SIZE, batch_size=4))
+    (batch,) = image_batches(paths, image_size=SIZE, batch_size=6, on_bad_image="skip")
+    assert batch.valid.tolist() == [True, False, True, True, False, False]
+    assert batch.indices.tolist() == [0, 1, 2, 3, -1, -1]
+    assert not batch.images[~batch.valid].any()
+
+
+def test_cache_decodes_once_within_its_budget(places):
+    paths = [places.path(i) for i in range(4)]
+    height, width = SIZE
+    cache = ImageCache(budget_bytes=3 * height * width * 2)  # room for two images
+    first = [cache.read(path, SIZE) for path in paths]
+    for path in paths[:2]:
+        path.unlink()
+    for path, image in zip(paths[:2], first, strict=False):
+        np.testing.assert_array_equal(cache.read(path, SIZE), image)
+    paths[2].unlink()
+    with pytest.raises(InputError):
+        cache.read(paths[2], SIZE)
+    with pytest.raises(InputError):
+        cache.read(paths[0], (14, 14))  # another size is another image
+    with pytest.raises(ValueError, match="read-only"):
+        first[0][0, 0] = 0
+
+
+def test_an_abandoned_iterator_lets_its_threads_go(places):
+    before = set(threading.enumerate())
+    batches = image_batches(
+        [places.path(i % 21) for i in range(400)], image_size=SIZE, batch_size=8, threads=3
+    )
+    next(batches)
+    started = set(threading.enumerate()) - before
+    assert started
+    del batches
+    gc.collect()
+    for thread in started:
+        thread.join(timeout=30)
+        assert not thread.is_alive()
+
+
+def test_an_abandoned_iterator_stops_reading(places, monkeypatch):
+    reads = []
+    go_on = threading.Event()
+
+    def slow_read(path):
+        reads.append(path)
+        if len(reads) > 2:
+            assert go_on.wait(timeout=30)
+        return np.zeros((*SIZE, 3), np.uint8)
+
+    monkeypatch.setattr(loader, "read_image", slow_read)
+    before = set(threading.enumerate())
+    batches = image_batches([f"{i}" for i in range(50)], image_size=SIZE, batch_size=2, threads=1)
+    next(batches)
+    started = set(threading.enumerate()) - before
+    batches.close()
+    go_on.set()
+    for thread in started:
+        thread.join(timeout=30)
+    # The first batch, and the one image that was being read.
+    assert len(reads) <= 3
+
+
+def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
+    program = (
+        "import sys\n"
+        "from crisalad_jax.data.loader import image_batches\n"
+        "batches = image_batches([sys.argv[1]] * 10**6, image_size=(28, 28), batch_size=4)\n"
+        "next(batches)\n"
+        "print('leaving')\n"
+    )
+    # A million images would take minutes; the timeout only keeps a failure from hanging.
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(places.path(0))],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "leaving"), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"start_step": 4}, "start_step: found 4, expected 0 to 3"),
+        ({"start_step": -1}, "start_step: found -1"),
+        ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
+        ({"threads": -1}, "threads: found -1"),
+        ({"image_size": (0, 14)}, "image_size"),
+        ({"images_per_place": 4}, "place 0 of A has 3 images"),
+    ],
+)
+def test_bad_arguments_raise_at_the_call(places, changes, message):
+    arguments = {
+        "image_size": SIZE,
+        "places_per_batch": 2,
+        "images_per_place": 3,
+        "order": "within-city",
+        "augment": None,
+        "seed": 1,
+        "epoch": 4,
+    }
+    with pytest.raises(InputError, match=message):
+        training_batches(places, **(arguments | changes))
+
+
+def test_bad_batch_size_raises_at_the_call(places):
+    with pytest.raises(InputError, match="batch_size: found 0"):
+        image_batches([places.path(0)], image_size=SIZE, batch_size=0)

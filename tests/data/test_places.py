@@ -1,0 +1,295 @@
+"""The GSV-Cities reader on small trees, against the rows they were written from."""
+
+import csv
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.errors import InputError
+
+COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
+REAL = Path(__file__).parents[2].parent / "shared" / "data"
+
+
+def make_rows(city_id: str, place: int, images: int) -> list[list[str]]:
+    # lat and lon as no float would print them, northdeg beyond 360
+    return [
+        [str(place), "2013", "8", str(355 + i), city_id, "48.850", "-2.0e0", f"pano{i}"]
+        for i in range(images)
+    ]
+
+
+def image_name(row: list[str]) -> str:
+    place, year, month, north, city_id, lat, lon, pano = row
+    return (
+        f"{city_id}_{place[-5:].zfill(7)}_{year.zfill(4)}_{month.zfill(2)}_{north.zfill(3)}"
+        f"_{lat}_{lon}_{pano}"
+    )
+
+
+def write_city(
+    root: Path,
+    city: str,
+    rows: list[list[str]],
+    *,
+    folder: str | None = None,
+    suffix: str = ".jpg",
+    columns: list[str] = COLUMNS,
+) -> None:
+    table = root / "Dataframes" / f"{city}.csv"
+    table.parent.mkdir(parents=True, exist_ok=True)
+    with table.open("w", newline="") as file:
+        csv.writer(file).writerows([columns, *rows])
+    _, encoded = cv2.imencode(".jpg", np.full((8, 8, 3), 90, np.uint8))
+    for row in rows:
+        path = root / "Images" / (folder or row[4]) / (image_name(row) + suffix)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encoded.tobytes())
+
+
+@pytest.fixture
+def two_cities(tmp_path: Path) -> Path:
+    # B: rows interleaved, one place of 3 images, the folder named by the CSV, .JPG files
+    write_city(tmp_path, "A", [row for p in (0, 7, 99) for row in make_rows("A", p, 4)])
+    rows = [row for p in (7, 12) for row in make_rows("Bid", p, 5)] + make_rows("Bid", 3, 3)
+    write_city(tmp_path, "B", rows[::2] + rows[1::2], folder="B", suffix=".JPG")
+    return tmp_path
+
+
+def uneven(cities: int, places_per_city: int) -> Places:
+    """Places with 4, 5, 6, 4, ... images, without files."""
+    counts = 4 + np.arange(cities * places_per_city) % 3
+    return Places(
+        root=Path("nowhere"),
+        cities=tuple(f"city{i}" for i in range(cities)),
+        files=tuple(f"{i}.jpg" for i in range(counts.sum())),
+        image_place=np.repeat(np.arange(len(counts), dtype=np.int32), counts),
+        place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        place_city=np.repeat(np.arange(cities, dtype=np.int32), places_per_city),
+        place_id=np.arange(len(counts), dtype=np.int64),
+    )
+
+
+def test_reads_what_was_written(two_cities):
+    places = read_places(two_cities)
+    assert places.cities == ("A", "B")
+    # The ids of B, whose CSV starts again at 0, are 10**5 up; its place 3 has too few images.
+    assert places.place_id.tolist() == [0, 7, 99, 100007, 100012]
+    assert places.place_city.tolist() == [0, 0, 0, 1, 1]
+    assert places.image_counts.tolist() == [4, 4, 4, 5, 5]
+    assert places.place_start.tolist() == [0, 4, 8, 12, 17, 22]
+    for image, place in enumerate(places.image_place):
+        path = places.path(image)
+        assert path.is_file()
+        city_id, place_id = path.name.split("_")[:2]
+        assert city_id == ("A" if place < 3 else "Bid")
+        assert int(place_id) == places.place_id[place] % 10**5
+    assert len(set(places.files)) == 22
+    assert places.files[0] == "Images/A/A_0000000_2013_08_355_48.850_-2.0e0_pano0.jpg"
+    assert {Path(file).suffix for file in places.files[12:]} == {".JPG"}
+
+
+def test_chosen_cities_keep_their_order(two_cities):
+    places = read_places(two_cities, cities=["B", "A"], min_images=3)
+    assert places.cities == ("B", "A")
+    assert places.place_id.tolist() == [3, 7, 12, 100000, 100007, 100099]
+
+
+def test_ids_with_an_offset_name_files_without_it(tmp_path):
+    write_city(tmp_path, "A", make_rows("A", 300042, 4))
+    places = read_places(tmp_path)
+    assert "A_0000042_" in places.files[0]
+    assert places.place_id.tolist() == [42]
+
+
+def test_a_repeated_row_is_one_image(tmp_path):
+    rows = make_rows("A", 1, 4)
+    write_city(tmp_path, "A", [*rows, rows[2]])
+    assert read_places(tmp_path).image_counts.tolist() == [4]
+
+
+def test_byte_order_mark_and_blank_lines(two_cities):
+    table = two_cities / "Dataframes" / "A.csv"
+    table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes() + b"\r\n\r\n")
+    assert read_places(two_cities, cities=["A"]).image_counts.tolist() == [4, 4, 4]
+
+
+def test_no_dataframes(tmp_path):
+    with pytest.raises(InputError, match="no folder Dataframes"):
+        read_places(tmp_path)
+    (tmp_path / "Dataframes").mkdir()
+    with pytest.raises(InputError, match="no CSV file"):
+        read_places(tmp_path)
+
+
+def test_missing_columns_are_listed(two_cities):
+    table = two_cities / "Dataframes" / "A.csv"
+    table.write_text("place_id,year,month,city_id,lat,panoid\n")
+    message = "A.csv: found columns place_id, year, .*panoid; missing northdeg, lon$"
+    with pytest.raises(InputError, match=message):
+        read_places(two_cities)
+    table.write_text("")
+    with pytest.raises(InputError, match="found columns none; missing place_id, "):
+        read_places(two_cities)
+
+
+def test_a_missing_image_is_named_with_its_line(two_cities):
+    (two_cities / "Images/A/A_0000007_2013_08_356_48.850_-2.0e0_pano1.jpg").unlink()
+    with pytest.raises(InputError, match=r"A\.csv: line 7: .*A_0000007_2013_08_356_48.850"):
+        read_places(two_cities)
+
+
+def test_places_too_small(two_cities):
+    with pytest.raises(InputError, match="at least 6 images; the largest has 5"):
+        read_places(two_cities, min_images=6)
+
+
+@pytest.mark.parametrize(
+    ("cities", "message"),
+    [
+        (["A", "Paris"], "found Paris, expected some of A, B"),
+        (["A", "A"], "each named once"),
+        ([], "at least one"),
+    ],
+)
+def test_bad_cities(two_cities, cities, message):
+    with pytest.raises(InputError, match=message):
+        read_places(two_cities, cities=cities)
+
+
+@pytest.mark.parametrize(
+    ("column", "text"),
+    [("place_id", "x1"), ("year", "2013.5"), ("month", ""), ("northdeg", "-3"), ("lat", "n/a")],
+)
+def test_a_field_that_is_no_number(two_cities, column, text):
+    row = make_rows("A", 1, 1)[0]
+    row[COLUMNS.index(column)] = text
+    with (two_cities / "Dataframes" / "A.csv").open("a") as file:
+        file.write(",".join(row) + "\n")
+    with pytest.raises(InputError, match=rf"A\.csv: line 14: {column}: found '{text}'"):
+        read_places(two_cities)
+
+
+def test_a_short_row_and_a_binary_file(two_cities):
+    table = two_cities / "Dataframes" / "A.csv"
+    with table.open("a") as file:
+        file.write("1,2013\n")
+    with pytest.raises(InputError, match="line 14: found 2 fields, expected 8"):
+        read_places(two_cities)
+    table.write_bytes(b"\xff\xd8\xff\xe0 no text")
+    with pytest.raises(InputError, match=r"A\.csv: cannot be read as UTF-8 CSV"):
+        read_places(two_cities)
+
+
+def test_ids_that_share_file_names(tmp_path):
+    write_city(tmp_path, "A", make_rows("A", 5, 4) + make_rows("A", 100005, 4))
+    with pytest.raises(InputError, match="found place_id 5 and 100005"):
+        read_places(tmp_path)
+
+
+@pytest.mark.parametrize("order", ["within-city", "shuffled"])
+def test_epoch_samples_each_place_once(order):
+    places = uneven(cities=3, places_per_city=10)
+    batches = epoch_batches(
+        places, places_per_batch=4, images_per_place=4, order=order, seed=1, epoch=2
+    )
+    assert batches.shape == (7, 4, 4)  # 30 places: the last two are dropped
+    labels = places.image_place[batches]
+    assert (labels == labels[..., :1]).all()
+    assert Counter(labels[..., 0].ravel().tolist()).most_common(1)[0][1] == 1
+    assert len(np.unique(batches)) == batches.size
+
+
+def test_epoch_is_a_function_of_seed_and_epoch():
+    def draw(seed, epoch):
+        return epoch_batches(
+            uneven(2, 12),
+            places_per_batch=4,
+            images_per_place=2,
+            order="within-city",
+            seed=seed,
+            epoch=epoch,
+        )
+
+    np.testing.assert_array_equal(draw(3, 5), draw(3, 5))
+    assert (draw(3, 5) != draw(3, 6)).any()
+    assert (draw(3, 5) != draw(4, 5)).any()
+
+
+def test_every_image_is_sampled_equally_often():
+    places = uneven(1, 6)
+    seen = np.zeros(len(places.files))
+    epochs = 600
+    for epoch in range(epochs):
+        batches = epoch_batches(
+            places, places_per_batch=6, images_per_place=2, order="shuffled", seed=0, epoch=epoch
+        )
+        seen[batches.ravel()] += 1
+    share = 2 / places.image_counts[places.image_place]
+    # 5 standard deviations of a binomial share; the largest of 29 deviations is below 4 with
+    # probability 0.998, and a fixed subset would be off by 0.5.
+    np.testing.assert_array_less(
+        abs(seen / epochs - share), 5 * np.sqrt(share * (1 - share) / epochs)
+    )
+
+
+def test_within_city_batches_are_of_one_city_and_shuffled_ones_are_not():
+    places = uneven(cities=3, places_per_city=12)
+
+    def cities_per_batch(order):
+        batches = epoch_batches(
+            places, places_per_batch=4, images_per_place=4, order=order, seed=0, epoch=0
+        )
+        return [len(set(row)) for row in places.place_city[places.image_place[batches[..., 0]]]]
+
+    assert cities_per_batch("within-city") == [1] * 9  # 12 places a city are 3 whole batches
+    assert max(cities_per_batch("shuffled")) > 1
+
+
+def test_within_city_shuffles_places_and_cities():
+    places = uneven(cities=3, places_per_city=4)
+    first_cities, first_places = set(), set()
+    for epoch in range(40):
+        batches = epoch_batches(
+            places, places_per_batch=4, images_per_place=4, order="within-city", seed=0, epoch=epoch
+        )
+        first = places.image_place[batches[0, 0, 0]]
+        first_places.add(int(first))
+        first_cities.add(int(places.place_city[first]))
+    assert first_cities == {0, 1, 2}
+    assert len(first_places) > 6
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"images_per_place": 5}, "place 0 of city0 has 4 images, expected at least .* 5"),
+        ({"places_per_batch": 7}, "found 6 places, expected at least places_per_batch 7"),
+        ({"places_per_batch": 0}, "places_per_batch: found 0"),
+        ({"seed": -1}, "seed: found -1"),
+        ({"order": "random"}, "order: found 'random', expected one of shuffled, within-city"),
+    ],
+)
+def test_bad_epoch_arguments(changes, message):
+    arguments = {
+        "places_per_batch": 2,
+        "images_per_place": 4,
+        "order": "shuffled",
+        "seed": 0,
+        "epoch": 0,
+    }
+    with pytest.raises(InputError, match=message):
+        epoch_batches(uneven(2, 3), **(arguments | changes))
+
+
+@pytest.mark.skipif(not (REAL / "sped_train").is_dir(), reason="needs the real photographs")
+def test_real_training_set():
+    places = read_places(REAL / "sped_train", min_images=2)
+    assert places.cities == ("SPED",)
+    assert places.image_counts.tolist() == [2] * 400
+    with pytest.raises(InputError, match="at least 4 images; the largest has 2"):
+        read_places(REAL / "sped_train")
