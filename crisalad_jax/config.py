@@ -7,7 +7,7 @@ a comment says otherwise.
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
 from crisalad_jax.errors import InputError
@@ -53,6 +53,7 @@ def _require_fraction(config: object, *names: str) -> None:
 class AdapterConfig:
     """The depthwise-separable adapter beside the MLP of every block (paper section 3.2)."""
 
+    kind: Literal["depthwise", "none"] = "depthwise"
     bottleneck: float = 0.5
     """Width of the adapter over the width of the backbone."""
     kernel_size: int = 3
@@ -61,6 +62,7 @@ class AdapterConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        choose("AdapterConfig.kind", self.kind, {"depthwise": 0, "none": 0})
         _require_positive(self, "bottleneck", "kernel_size")
         _require(
             self.kernel_size % 2 == 1,
@@ -83,7 +85,7 @@ class ViTConfig:
     position_start: Literal["random", "sincos"] = "random"
     """How position embeddings start where no weights are loaded."""
     layer_scale_start: float = 1.0
-    adapter: AdapterConfig | None = AdapterConfig()
+    adapter: AdapterConfig = AdapterConfig()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -108,8 +110,6 @@ class ViTConfig:
     @property
     def adapter_dim(self) -> int:
         """Width of the adapter's bottleneck."""
-        if self.adapter is None:
-            raise InputError("ViTConfig.adapter: found None, expected an adapter")
         return int(self.dim * self.adapter.bottleneck)
 
 
@@ -136,6 +136,7 @@ class CrossImageConfig:
     """The transformer encoder whose attention runs across the images of a batch (paper section 3.4)."""
 
     layers: int = 2
+    """0 leaves the encoder out: an image's descriptor then never depends on other images."""
     heads: int = 16
     feedforward: int = 2048
     dropout: float = 0.1
@@ -144,13 +145,16 @@ class CrossImageConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        _require_positive(self, "layers", "heads", "feedforward")
+        _require_positive(self, "heads", "feedforward")
+        _require(
+            self.layers >= 0, f"CrossImageConfig.layers: found {self.layers}, expected at least 0"
+        )
         _require_fraction(self, "dropout")
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """CriSALAD: backbone, aggregation, cross-image encoder (None leaves it out)."""
+    """CriSALAD: backbone, aggregation, cross-image encoder."""
 
     image_size: tuple[int, int] = (224, 224)
     """Height and width that images are resized to, multiples of 14."""
@@ -158,7 +162,7 @@ class ModelConfig:
     """What is done to 8-bit pixels: ImageNet mean and deviation, or the local mean and deviation."""
     backbone: ViTConfig = ViTConfig()
     salad: SaladConfig = SaladConfig()
-    encoder: CrossImageConfig | None = CrossImageConfig()
+    encoder: CrossImageConfig = CrossImageConfig()
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the matrix products; normalisations, softmax and transport stay in float32."""
 
@@ -167,7 +171,7 @@ class ModelConfig:
         choose("ModelConfig.normalisation", self.normalisation, {"imagenet": 0, "local-contrast": 0})
         choose("ModelConfig.compute_dtype", self.compute_dtype, {"float32": 0, "bfloat16": 0})
         check_image_size(self.image_size, self.salad.clusters)
-        if self.encoder is not None:
+        if self.encoder.layers:
             width = self.salad.cluster_dim
             _require(
                 width % self.encoder.heads == 0,
@@ -293,6 +297,101 @@ class LightAugmentConfig:
 AugmentConfig = RandAugmentConfig | LightAugmentConfig
 
 
+@dataclasses.dataclass(frozen=True)
+class OptimiserConfig:
+    """AdamW with an optional warm-up and a linear decay per step."""
+
+    learning_rate: float = 6e-5
+    final_fraction: float = 0.0
+    """Share of the learning rate that is left at the last step."""
+    warmup_steps: int = 0
+    weight_decay: float = 0.01
+    """Torch's default; the paper names none."""
+    b1: float = 0.9
+    b2: float = 0.999
+    clip_norm: float | None = None
+    """Largest norm of the whole gradient."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "learning_rate")
+        for name in ("final_fraction", "warmup_steps", "weight_decay"):
+            value = getattr(self, name)
+            _require(value >= 0, f"OptimiserConfig.{name}: found {value}, expected at least 0")
+        _require_fraction(self, "b1", "b2")
+        if self.clip_norm is not None:
+            _require_positive(self, "clip_norm")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A whole training run, apart from where its files lie."""
+
+    model: ModelConfig = ModelConfig()
+    loss: MultiSimilarityConfig = MultiSimilarityConfig()
+    optimiser: OptimiserConfig = OptimiserConfig()
+    trains: str = "adapters+head"
+    """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), or all."""
+    augment: Literal["rand-augment", "light", "none"] = "rand-augment"
+    rand_augment: RandAugmentConfig = RandAugmentConfig()
+    light_augment: LightAugmentConfig = LightAugmentConfig()
+    places_per_batch: int = 48
+    images_per_place: int = 4
+    min_images: int = 4
+    """Places with fewer images are left out."""
+    batch_order: Literal["within-city", "shuffled"] = "within-city"
+    """A batch of places of one city (hard negatives; the public loaders' order) or of all cities."""
+    cities: tuple[str, ...] | None = None
+    """Which cities; None takes all."""
+    epochs: int = 8
+    """The paper converged within five, and stopped after three without gain."""
+    validate_every: int = 1
+    """Epochs from one validation to the next."""
+    patience: int | None = 3
+    """Validations without a better Recall@5 after which training stops; None never stops early."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        choose("TrainConfig.augment", self.augment, {"rand-augment": 0, "light": 0, "none": 0})
+        choose("TrainConfig.batch_order", self.batch_order, {"within-city": 0, "shuffled": 0})
+        _require_positive(self, "places_per_batch", "epochs", "validate_every")
+        _require(
+            self.images_per_place >= 2,
+            f"TrainConfig.images_per_place: found {self.images_per_place}, expected at least 2: "
+            "the loss needs pairs of one place",
+        )
+        _require(
+            self.min_images >= self.images_per_place,
+            f"TrainConfig.min_images: found {self.min_images}, expected at least images_per_place "
+            f"({self.images_per_place})",
+        )
+        _require(
+            re.fullmatch(r"adapters\+head|last-\d+-blocks\+head|all", self.trains) is not None,
+            f"TrainConfig.trains: found {self.trains!r}, expected adapters+head, "
+            "last-N-blocks+head or all",
+        )
+        _require(
+            self.trains != "adapters+head" or self.model.backbone.adapter.kind != "none",
+            "TrainConfig.trains: found adapters+head for a model without adapters, expected "
+            "last-N-blocks+head or all",
+        )
+        _require(
+            self.patience is None or self.patience > 0,
+            f"TrainConfig.patience: found {self.patience}, expected more than 0, or None",
+        )
+        _require(self.seed >= 0, f"TrainConfig.seed: found {self.seed}, expected at least 0")
+
+    @property
+    def augmentation(self) -> AugmentConfig | None:
+        """The configuration of the augmentation that `augment` names."""
+        return {
+            "rand-augment": self.rand_augment,
+            "light": self.light_augment,
+            "none": None,
+        }[self.augment]
+
+
 def _preset(dim: int, depth: int, heads: int, **backbone: Any) -> ModelConfig:
     return ModelConfig(backbone=ViTConfig(dim=dim, depth=depth, heads=heads, **backbone))
 
@@ -317,3 +416,35 @@ PRESETS: Mapping[str, ModelConfig] = {
     "l14": _preset(1024, 24, 16),
     "g14": _preset(1536, 40, 24, ffn="swiglu"),
 }
+
+
+def recipe(preset: str) -> TrainConfig:
+    """How a preset is trained: the paper's way, except for `tiny`, which starts from nothing.
+
+    Raises:
+        InputError: no such preset.
+    """
+    model = choose("preset", preset, PRESETS)
+    if preset != "tiny":
+        return TrainConfig(model=model)
+    return TrainConfig(
+        model=model,
+        # base 0.5: from a cold start base 0 drives all similarities to 0 together.
+        loss=MultiSimilarityConfig(base=0.5),
+        optimiser=OptimiserConfig(
+            learning_rate=1e-3,
+            final_fraction=0.02,
+            warmup_steps=30,
+            weight_decay=0.05,
+            b2=0.99,
+            clip_norm=1.0,
+        ),
+        trains="all",
+        augment="light",
+        images_per_place=2,
+        min_images=2,
+        batch_order="shuffled",
+        epochs=100,
+        validate_every=10,
+        patience=None,
+    )

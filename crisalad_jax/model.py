@@ -15,10 +15,13 @@ from crisalad_jax.nn.cross_image import (
     from_sequence,
     init_cross_image,
 )
+from crisalad_jax.nn.layers import split_key
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.salad import Salad, SaladTokens, init_salad, join, salad
 from crisalad_jax.nn.vit import ViT, init_vit, vit
 from crisalad_jax.pytree import params
+
+Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
 
 
 @params
@@ -36,16 +39,16 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     return Crisalad(
         backbone=init_vit(backbone, config.backbone),
         aggregator=init_salad(aggregator, config.backbone.dim, config.salad),
-        encoder=None
-        if config.encoder is None
-        else init_cross_image(encoder, config.salad.cluster_dim, config.encoder),
+        encoder=init_cross_image(encoder, config.salad.cluster_dim, config.encoder)
+        if config.encoder.layers
+        else None,
     )
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def describe(
     params: Crisalad,
-    images: UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"],
+    images: Images,
     config: ModelConfig,
     *,
     mask: Bool[Array, "image image"] | None = None,
@@ -69,40 +72,54 @@ def describe(
         InputError: while tracing, for images of the wrong rank, channels or sides, or with too few
             patches for the clusters.
     """
+    tokens_key, encoder_key = split_key(key, 2)
+    tokens = tokenise(params, images, config, key=tokens_key)
+    return relate(params, tokens, config, mask=mask, key=encoder_key)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def tokenise(
+    params: Crisalad, images: Images, config: ModelConfig, *, key: PRNGKeyArray | None = None
+) -> SaladTokens:
+    """The first half of `describe`: every image's tokens, which owe nothing to other images."""
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
     check_image_size(images.shape[1:3], config.salad.clusters)
-    salad_key, encoder_key = (None, None) if key is None else jax.random.split(key)
-    one = functools.partial(_tokens, params, config=config)
-    if salad_key is None:
-        tokens = jax.vmap(functools.partial(one, key=None))(images)
-    else:
-        tokens = jax.vmap(lambda image, k: one(image, key=k))(
-            images, jax.random.split(salad_key, len(images))
-        )
-    if params.encoder is not None and config.encoder is not None:
-        to_sequence = functools.partial(as_sequence, salad=config.salad, config=config.encoder)
-        from_tokens = functools.partial(from_sequence, salad=config.salad, config=config.encoder)
-        # In the compute type, except for norms and softmax, which know to widen.
-        sequence = jax.vmap(to_sequence)(tokens).astype(config.compute_dtype)
-        sequence = cross_image_encoder(
-            params.encoder, sequence, config.encoder, mask=mask, key=encoder_key
-        ).astype(tokens.clusters.dtype)
-        tokens = jax.vmap(from_tokens)(sequence, tokens)
-    return jax.vmap(join)(tokens)
+
+    def one(
+        image: UInt8[Array, "height width 3"] | Float[Array, "height width 3"],
+        key: PRNGKeyArray | None,
+    ) -> SaladTokens:
+        if image.dtype == jnp.uint8:
+            image = normalise(image, config.normalisation)
+        features = vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
+        return salad(params.aggregator, features, config.salad, key=key)
+
+    if key is None:
+        return jax.vmap(functools.partial(one, key=None))(images)
+    return jax.vmap(one)(images, jax.random.split(key, len(images)))
 
 
-def _tokens(
+@functools.partial(jax.jit, static_argnames="config")
+def relate(
     params: Crisalad,
-    image: UInt8[Array, "height width 3"] | Float[Array, "height width 3"],
+    tokens: SaladTokens,
     config: ModelConfig,
     *,
-    key: PRNGKeyArray | None,
-) -> SaladTokens:
-    if image.dtype == jnp.uint8:
-        image = normalise(image, config.normalisation)
-    features = vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
-    return salad(params.aggregator, features, config.salad, key=key)
+    mask: Bool[Array, "image image"] | None = None,
+    key: PRNGKeyArray | None = None,
+) -> Float[Array, "image descriptor"]:
+    """The second half of `describe`: images look at each other, then become descriptors.
+
+    To see the same images in several groupings, `tokenise` them once.
+    """
+    if params.encoder is not None:
+        enter = functools.partial(as_sequence, salad=config.salad, config=config.encoder)
+        leave = functools.partial(from_sequence, salad=config.salad, config=config.encoder)
+        sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
+        sequence = cross_image_encoder(params.encoder, sequence, config.encoder, mask=mask, key=key)
+        tokens = jax.vmap(leave)(sequence.astype(tokens.clusters.dtype), tokens)
+    return jax.vmap(join)(tokens)
 
 
 def alone(count: int) -> Bool[Array, "image image"]:
@@ -111,5 +128,5 @@ def alone(count: int) -> Bool[Array, "image image"]:
 
 
 def among(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
-    """The mask under which valid images look at each other, and padding only at itself."""
+    """The mask under which valid images look at each other, and the others only at themselves."""
     return valid[None, :] & valid[:, None] | jnp.eye(len(valid), dtype=bool)

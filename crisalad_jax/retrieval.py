@@ -17,9 +17,6 @@ from crisalad_jax.errors import InputError
 
 # Queries compared at a time: with 8,192 database rows a block of similarities is 32 MiB.
 _QUERY_CHUNK = 1024
-# Blocks are padded to a multiple of this, so that a matrix product has no ragged edge: there a
-# kernel may add in another order, and equal rows would get unequal similarities.
-_PAD = 128
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 _UNIT_TOLERANCE = 1e-2
 
@@ -51,7 +48,7 @@ def search(
         chunk: database rows compared at a time.
 
     Raises:
-        InputError: an array that is empty, not a matrix, or holds a row that is not finite or not of
+        InputError: an array that is empty, no matrix, or holds a row that is not finite or not of
             unit length; descriptors of two lengths; k or chunk below 1.
     """
     for name, value in (("k", k), ("chunk", chunk)):
@@ -127,10 +124,11 @@ def recalls(
 
 def _block(
     array: Float[np.ndarray, "n d"], name: str, start: int, size: int
-) -> Float32[np.ndarray, "padded d"]:
-    """Rows `start` to `start + size`, checked, then zero rows up to a multiple of `_PAD`."""
-    rows = np.asarray(array[start : start + size], np.float32)
-    norms = np.linalg.norm(rows, axis=1)
+) -> Float32[np.ndarray, "size d"]:
+    """Rows `start` to `start + size`, checked; zero rows fill up what the array lacks."""
+    with np.errstate(over="ignore"):  # what overflows is reported below
+        rows = np.asarray(array[start : start + size], np.float32)
+        norms = np.linalg.norm(rows, axis=1)
     # "Not within" rather than "beyond", so that NaN and infinity count as wrong.
     wrong = np.flatnonzero(~(np.abs(norms - 1) <= _UNIT_TOLERANCE))
     if wrong.size:
@@ -140,13 +138,13 @@ def _block(
             f"{name}: row {start + row} is {found}, expected finite unit vectors "
             f"({wrong.size} wrong of {len(rows)} rows from {start})"
         )
-    block = np.zeros((-(-size // _PAD) * _PAD, rows.shape[1]), np.float32)
+    block = np.zeros((size, rows.shape[1]), np.float32)
     block[: len(rows)] = rows
     return block
 
 
 def _search_block(
-    block: Float32[Array, "padded d"],
+    block: Float32[Array, "chunk d"],
     valid: int,
     queries: Float[np.ndarray, "q d"],
     k: int,
@@ -166,13 +164,13 @@ def _search_block(
 
 @functools.partial(jax.jit, static_argnames="k")
 def _top(
-    block: Float32[Array, "padded d"],
+    block: Float32[Array, "chunk d"],
     queries: Float32[Array, "q d"],
     valid: int,
     k: int,
 ) -> tuple[Float32[Array, "q k"], Int32[Array, "q k"]]:
     similarities = jnp.matmul(queries, block.T, precision=jax.lax.Precision.HIGHEST)
-    # top_k orders -0.0 below 0.0, which are equal; of equal values it takes the lower index first.
+    # Of equal values top_k takes the lower index first, but it orders -0.0 below 0.0.
     similarities = jnp.where(similarities == 0, 0, similarities)
     padding = jnp.arange(len(block)) >= valid
-    return jax.lax.top_k(jnp.where(padding, -jnp.inf, similarities), k)
+    return jax.lax.top_k(jnp.where(padding[None], -jnp.inf, similarities), k)

@@ -27,13 +27,8 @@ class Adapter:
 
 
 def init_adapter(key: PRNGKeyArray, config: ViTConfig) -> Adapter:
-    """Start with the up-projection at 0, so that an untrained adapter changes nothing.
-
-    Raises:
-        InputError: the config has no adapter.
-    """
+    """Start with the up-projection at 0, so that an untrained adapter changes nothing."""
     width = config.adapter_dim
-    assert config.adapter is not None  # adapter_dim has raised otherwise
     down, depthwise, pointwise, up = jax.random.split(key, 4)
     up_projection = init_linear(up, width, config.dim, bias=False)
     return Adapter(

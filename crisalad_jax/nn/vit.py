@@ -54,8 +54,8 @@ class Block:
 class ViT:
     """The backbone. In `blocks` every leaf has a leading depth axis.
 
-    `blocks` is a tuple of such stacks, run one after the other: one stack as a rule, two while only
-    the last blocks train, so that the frozen ones stay out of the gradient.
+    A tuple of such stacks is run one after the other: so training keeps the frozen blocks out of the
+    gradient where only the last ones train.
     """
 
     patch_embed: Linear
@@ -64,7 +64,7 @@ class ViT:
     register_tokens: Float[Array, "register dim"]
     pos_embed_cls: Float[Array, " dim"]
     pos_embed: Float[Array, "grid grid dim"]
-    blocks: tuple[Block, ...]
+    blocks: Block | tuple[Block, ...]
     norm: LayerNorm
 
 
@@ -89,10 +89,8 @@ def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
         register_tokens=1e-6 * jax.random.normal(register_key, (config.registers, dim)),
         pos_embed_cls=jnp.zeros(dim),
         pos_embed=positions,
-        blocks=(
-            jax.vmap(functools.partial(_init_block, config=config))(
-                jax.random.split(block_key, config.depth)
-            ),
+        blocks=jax.vmap(functools.partial(_init_block, config=config))(
+            jax.random.split(block_key, config.depth)
         ),
         norm=init_layer_norm(dim),
     )
@@ -117,7 +115,7 @@ def _init_block(key: PRNGKeyArray, config: ViTConfig) -> Block:
         norm2=init_layer_norm(dim),
         mlp=mlp,
         ls2=jnp.full(dim, config.layer_scale_start),
-        adapter=None if config.adapter is None else init_adapter(adapter_key, config),
+        adapter=None if config.adapter.kind == "none" else init_adapter(adapter_key, config),
     )
 
 
@@ -171,7 +169,8 @@ def run_blocks(
     ) -> tuple[Float[Array, "token dim"], None]:
         return block(one, carry, grid, config), None
 
-    for stack in params.blocks:
+    stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
+    for stack in stacks:
         tokens, _ = jax.lax.scan(body, tokens, stack)
     return tokens
 
@@ -185,7 +184,7 @@ def block(
     tokens = tokens + params.ls1.astype(tokens.dtype) * attended
     normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
     update = feed_forward(params.mlp, normed)
-    if params.adapter is not None and config.adapter is not None:
+    if params.adapter is not None:
         update = update + config.adapter.alpha * adapter(params.adapter, normed, grid)
     return tokens + params.ls2.astype(tokens.dtype) * update
 

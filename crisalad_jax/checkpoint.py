@@ -1,0 +1,146 @@
+"""Files of weights (safetensors, the configuration inside) and the resumable state of a run (orbax)."""
+
+import functools
+import json
+import os
+import pathlib
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import safetensors
+import safetensors.numpy
+from jaxtyping import PyTree
+
+from crisalad_jax.config import ModelConfig
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import atomic_path
+from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.serial import differences, from_plain, to_plain
+
+FORMAT = "crisalad-jax 1"
+
+
+def save_weights(
+    path: str | os.PathLike[str], params: Crisalad, config: ModelConfig
+) -> None:
+    """Write parameters under their dotted names, and the configuration in the file's metadata.
+
+    Raises:
+        InputError: the folder cannot be made.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
+    metadata = {"format": FORMAT, "config": json.dumps(to_plain(config))}
+    with atomic_path(path) as temporary:
+        safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
+
+
+def load_weights(
+    path: str | os.PathLike[str], expected: ModelConfig | None = None
+) -> tuple[Crisalad, ModelConfig]:
+    """Read what `save_weights` wrote: (params, config).
+
+    Args:
+        path: the file.
+        expected: if given, the configuration that the file must have, except for the image size,
+            which parameters do not depend on.
+
+    Raises:
+        InputError: the file is missing, cut short or no such file; its parameters do not fit its
+            configuration (all that are missing, unknown or misshaped are listed); or its
+            configuration is not `expected` (all fields that differ are listed).
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: found no such file, expected a .safetensors file of weights")
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise InputError(
+                    f"{path}: found format {metadata.get('format')!r} in its metadata, expected "
+                    f"{FORMAT!r}, written by this package"
+                )
+            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, OSError) as error:
+        raise InputError(f"{path}: not a whole safetensors file: {error}") from error
+    config = from_plain(ModelConfig, json.loads(metadata["config"]), source=f"{path} (metadata)")
+    if expected is not None:
+        same_size = expected.__class__(**{**vars(config), "image_size": expected.image_size})
+        wrong = differences(same_size, expected)
+        if wrong:
+            raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
+    return _fill(config, found, path), config
+
+
+def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:
+    template = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+    shapes = {name: leaf.shape for name, leaf in named_leaves(template).items()}
+    problems = [f"{name} missing" for name in shapes.keys() - found.keys()]
+    problems += [f"{name} unknown" for name in found.keys() - shapes.keys()]
+    problems += [
+        f"{name} found {found[name].shape}, expected {shape}"
+        for name, shape in shapes.items()
+        if name in found and found[name].shape != shape
+    ]
+    if problems:
+        raise InputError(f"{path}: weights do not fit: {'; '.join(sorted(problems))}")
+    leaves = [jnp.asarray(found[name]) for name in shapes]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+class Saved(NamedTuple):
+    """One restored state of a run."""
+
+    step: int
+    state: PyTree
+    record: dict[str, Any]
+
+
+class StateStore:
+    """The resumable states of one run: a folder of which each step is written whole or not at all."""
+
+    def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
+        """Open or make the folder; the last `keep` states stay."""
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
+        )
+        self._manager = ocp.CheckpointManager(pathlib.Path(folder).absolute(), options=options)
+
+    def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
+        """Write the arrays of `state` and the JSON values of `record`; an existing step stays."""
+        if step in self._manager.all_steps():
+            return
+        arrays = ocp.args.StandardSave(named_leaves(state))
+        self._manager.save(
+            step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonSave(record))
+        )
+
+    def load(self, template: PyTree) -> Saved | None:
+        """The last state, in the structure of `template`; None if there is none.
+
+        Raises:
+            InputError: the stored arrays do not fit the template.
+        """
+        step = self._manager.latest_step()
+        if step is None:
+            return None
+        wanted = named_leaves(template)
+        arrays = ocp.args.StandardRestore(jax.tree.map(ocp.utils.to_shape_dtype_struct, wanted))
+        try:
+            saved = self._manager.restore(
+                step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonRestore())
+            )
+        except (ValueError, KeyError) as error:
+            raise InputError(
+                f"{self._manager.directory}: the saved state is not of this run: {error}"
+            ) from error
+        leaves = [saved["state"][name] for name in wanted]
+        return Saved(step, jax.tree.unflatten(jax.tree.structure(template), leaves), saved["record"])
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        self._manager.close()

@@ -1,0 +1,247 @@
+"""Random changes of training images: RandAugment with torchvision's operations, and a light set.
+
+RandAugment: Cubuk et al., CVPR Workshops 2020; its strengths are torchvision's, its arithmetic is
+Pillow's.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from crisalad_jax.config import AugmentConfig, LightAugmentConfig, RandAugmentConfig
+
+Image = UInt8[np.ndarray, "h w 3"]
+
+MAGNITUDE_BINS = 31
+
+# ITU-R BT.601 luma; Pillow's convert("L") has it in 16-bit fixed point.
+_LUMA = np.array([0.299, 0.587, 0.114])
+_PILLOW_LUMA = np.array([19595, 38470, 7471], np.uint32)
+_LEVELS = np.arange(256)
+
+
+def augment(image: Image, config: AugmentConfig | None, generator: np.random.Generator) -> Image:
+    """Change `image` as `config` says; None leaves it as it is.
+
+    The input is never written to, but it may be returned.
+    """
+    if config is None:
+        return image
+    if isinstance(config, RandAugmentConfig):
+        return rand_augment(image, config, generator)
+    return light_augment(image, config, generator)
+
+
+def rand_augment(image: Image, config: RandAugmentConfig, generator: np.random.Generator) -> Image:
+    """Apply `config.operations` of OPERATIONS, drawn uniformly with replacement, of random sign.
+
+    Same semantics as torchvision's RandAugment on Pillow images with bilinear interpolation and
+    black fill. For images that already have the size of the model.
+    """
+    names = list(OPERATIONS)
+    for name in (names[i] for i in generator.integers(len(names), size=config.operations)):
+        operation = OPERATIONS[name]
+        strength = operation.strength(config.magnitude / (MAGNITUDE_BINS - 1), *image.shape[:2])
+        if operation.signed and generator.integers(2):
+            strength = -strength
+        image = operation.apply(image, strength)
+    return image
+
+
+def light_augment(
+    image: Image, config: LightAugmentConfig, generator: np.random.Generator
+) -> Image:
+    """One small warp, a blur, and changes of brightness, contrast and saturation, or no colour.
+
+    `config.flip` is left to the caller, who mirrors all images of a place alike. Every call draws
+    the same number of random values, whatever the config.
+    """
+    height, width = image.shape[:2]
+    scale = generator.uniform(1 - config.crop, 1)
+    shift = generator.uniform(-config.shift, config.shift, size=2) * (width, height)
+    angle = math.radians(generator.uniform(-config.rotation, config.rotation))
+    sigma = generator.uniform(0, config.blur)
+    brightness, contrast, saturation = generator.uniform(1 - config.colour, 1 + config.colour, 3)
+    if generator.random() < config.grey:
+        saturation = 0.0
+
+    turn = scale * np.array(
+        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    )
+    centre = np.array([width - 1, height - 1]) / 2
+    matrix = np.column_stack([turn, centre + shift - turn @ centre])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    image = cv2.warpAffine(
+        image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT
+    )
+    if sigma > 0:
+        image = cv2.GaussianBlur(image, (0, 0), sigma)
+    # The three factors are one affine map of the colours: brightness scales, contrast stretches
+    # about the mean luma, saturation stretches about each pixel's luma.
+    colour = saturation * np.eye(3) + (1 - saturation) * _LUMA
+    offset = (1 - contrast) * brightness * (_LUMA @ cv2.mean(image)[:3])
+    matrix = np.column_stack([brightness * contrast * colour, np.full(3, offset)])
+    return cv2.transform(image, matrix)
+
+
+def _identity(image: Image, _: float) -> Image:
+    return image
+
+
+def _affine(image: Image, a: float, b: float, c: float, d: float, e: float, f: float) -> Image:
+    """Pillow's Image.transform(AFFINE, BILINEAR): output (x, y) shows input (ax+by+c, dx+ey+f).
+
+    Coordinates are of pixel centres, at halves. Points outside the image are black.
+    """
+    height, width = image.shape[:2]
+    matrix = np.array([[a, b, c + (a + b - 1) / 2], [d, e, f + (d + e - 1) / 2]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    # Black by a mask: the constant border mode would blend half a pixel of black into the rim.
+    warped = cv2.warpAffine(
+        image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+    warped[_outside(a * x + b * y + c, width) | _outside(d * x + e * y + f, height)] = 0
+    return warped
+
+
+def _outside(position: np.ndarray, side: int) -> Bool[np.ndarray, "..."]:
+    return (position < 0) | (position >= side)
+
+
+def _shear_x(image: Image, slope: float) -> Image:
+    return _affine(image, 1.0, slope, 0.0, 0.0, 1.0, 0.0)
+
+
+def _shear_y(image: Image, slope: float) -> Image:
+    return _affine(image, 1.0, 0.0, 0.0, slope, 1.0, 0.0)
+
+
+def _translate_x(image: Image, pixels: float) -> Image:
+    return _affine(image, 1.0, 0.0, -float(int(pixels)), 0.0, 1.0, 0.0)
+
+
+def _translate_y(image: Image, pixels: float) -> Image:
+    return _affine(image, 1.0, 0.0, 0.0, 0.0, 1.0, -float(int(pixels)))
+
+
+def _rotate(image: Image, degrees: float) -> Image:
+    """Counter-clockwise about the centre."""
+    x, y = image.shape[1] / 2, image.shape[0] / 2
+    cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return _affine(
+        image, cosine, -sine, x - cosine * x + sine * y, sine, cosine, y - sine * x - cosine * y
+    )
+
+
+def _brightness(image: Image, change: float) -> Image:
+    return cv2.LUT(image, _blend(np.uint8(0), _LEVELS, 1 + change))
+
+
+def _color(image: Image, change: float) -> Image:
+    return _blend(_grey(image)[..., None], image, 1 + change)
+
+
+def _contrast(image: Image, change: float) -> Image:
+    mean = np.uint8(_grey(image).mean() + 0.5)
+    return cv2.LUT(image, _blend(mean, _LEVELS, 1 + change))
+
+
+def _sharpness(image: Image, change: float) -> Image:
+    kernel = np.array([[1, 1, 1], [1, 5, 1], [1, 1, 1]], np.float32)
+    sums = cv2.filter2D(image, cv2.CV_16S, kernel)
+    smooth = ((2 * sums + 13) // 26).astype(np.uint8)
+    # Pillow's 3x3 filters leave the outermost pixels alone.
+    smooth[[0, -1]] = image[[0, -1]]
+    smooth[:, [0, -1]] = image[:, [0, -1]]
+    return _blend(smooth, image, 1 + change)
+
+
+def _posterize(image: Image, bits: float) -> Image:
+    return image & np.uint8(256 - 2 ** (8 - int(bits)))
+
+
+def _solarize(image: Image, threshold: float) -> Image:
+    table = np.where(threshold > _LEVELS, _LEVELS, 255 - _LEVELS)
+    return cv2.LUT(image, table.astype(np.uint8))
+
+
+def _autocontrast(image: Image, _: float) -> Image:
+    planes = cv2.split(image)  # numpy is slow at extrema along the short last axis
+    low = np.array([int(plane.min()) for plane in planes])
+    high = np.array([int(plane.max()) for plane in planes])
+    scale = 255.0 / np.maximum(high - low, 1)
+    table = np.clip(_LEVELS[:, None] * scale - low * scale, 0, 255)
+    table = np.where(high > low, table.astype(np.uint8), _LEVELS[:, None].astype(np.uint8))
+    return cv2.LUT(image, table[None])
+
+
+def _equalize(image: Image, _: float) -> Image:
+    tables = [_equalizing_table(image[..., channel]) for channel in range(3)]
+    return cv2.LUT(image, np.stack(tables, axis=-1)[None])
+
+
+def _equalizing_table(channel: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "256"]:
+    counts = np.bincount(channel.ravel(), minlength=256)
+    step = (channel.size - counts[counts > 0][-1]) // 255
+    if step == 0:
+        return _LEVELS.astype(np.uint8)
+    below = np.cumsum(counts) - counts
+    return np.minimum((step // 2 + below) // step, 255).astype(np.uint8)
+
+
+def _grey(image: Image) -> UInt8[np.ndarray, "h w"]:
+    return ((image @ _PILLOW_LUMA + 0x8000) >> 16).astype(np.uint8)
+
+
+def _blend(
+    start: np.ndarray | np.uint8, end: np.ndarray, factor: float
+) -> UInt8[np.ndarray, "..."]:
+    """From `start` at factor 0 to `end` at 1 and beyond, in float32 and cut off, as Pillow does."""
+    origin = np.float32(start)
+    blended = origin + np.float32(factor) * (end.astype(np.float32) - origin)
+    return np.clip(blended, 0, 255).astype(np.uint8)
+
+
+class Operation(NamedTuple):
+    """One operation of RandAugment."""
+
+    apply: Callable[[Image, float], Image]
+    strength: Callable[[float, int, int], float]
+    """From the magnitude as a fraction of its largest, the height and the width."""
+    signed: bool
+
+
+def _none(level: float, height: int, width: int) -> float:
+    return 0.0
+
+
+def _slope(level: float, height: int, width: int) -> float:
+    return 0.3 * level
+
+
+def _enhancement(level: float, height: int, width: int) -> float:
+    return 0.9 * level
+
+
+OPERATIONS: dict[str, Operation] = {
+    "Identity": Operation(_identity, _none, signed=False),
+    "ShearX": Operation(_shear_x, _slope, signed=True),
+    "ShearY": Operation(_shear_y, _slope, signed=True),
+    "TranslateX": Operation(_translate_x, lambda level, _, w: 150 / 331 * w * level, signed=True),
+    "TranslateY": Operation(_translate_y, lambda level, h, _: 150 / 331 * h * level, signed=True),
+    "Rotate": Operation(_rotate, lambda level, _h, _w: 30 * level, signed=True),
+    "Brightness": Operation(_brightness, _enhancement, signed=True),
+    "Color": Operation(_color, _enhancement, signed=True),
+    "Contrast": Operation(_contrast, _enhancement, signed=True),
+    "Sharpness": Operation(_sharpness, _enhancement, signed=True),
+    "Posterize": Operation(_posterize, lambda level, _h, _w: 8.0 - round(4 * level), signed=False),
+    "Solarize": Operation(_solarize, lambda level, _h, _w: 255 * (1 - level), signed=False),
+    "AutoContrast": Operation(_autocontrast, _none, signed=False),
+    "Equalize": Operation(_equalize, _none, signed=False),
+}
+"""The 14 operations by torchvision's names."""

@@ -1,0 +1,166 @@
+"""Training: what is frozen, the optimiser, and one compiled step (paper section 4.2)."""
+
+import dataclasses
+import functools
+import re
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
+
+from crisalad_jax.config import ModelConfig, MultiSimilarityConfig, OptimiserConfig
+from crisalad_jax.errors import InputError
+from crisalad_jax.losses import multi_similarity_loss
+from crisalad_jax.model import Crisalad, among, describe
+from crisalad_jax.nn.vit import Block
+from crisalad_jax.pytree import named_leaves
+
+ADAPTERS_AND_HEAD, ALL = "adapters+head", "all"
+_LAST_BLOCKS = re.compile(r"last-(\d+)-blocks\+head")
+
+
+class TrainState(NamedTuple):
+    """What changes from step to step. `None` stands in `trainable` where a parameter is frozen."""
+
+    step: Int[Array, ""]
+    trainable: PyTree
+    optimiser: PyTree
+
+
+class Metrics(NamedTuple):
+    """Scalars of one step."""
+
+    loss: Float[Array, ""]
+    b_acc: Float[Array, ""]
+    gradient_norm: Float[Array, ""]
+
+
+def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
+    """Split into (trainable, frozen), each of the model's structure with None for the other's leaves.
+
+    `trains` is "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "all", or
+    "last-N-blocks+head" (SALAD: the last N blocks, the final layer norm, and the head). For the
+    last, the stack of blocks is cut in two, so that no gradient passes the frozen ones;
+    `merge_params` makes it one again.
+
+    Raises:
+        InputError: an unknown name, or more blocks than there are.
+    """
+    head = ("aggregator.", "encoder.")
+    match = _LAST_BLOCKS.fullmatch(trains)
+    if trains == ALL:
+        prefixes: tuple[str, ...] = ("",)
+    elif trains == ADAPTERS_AND_HEAD:
+        prefixes = (*head, "backbone.blocks.adapter.")
+    elif match:
+        params = _cut_blocks(params, int(match[1]))
+        prefixes = (*head, "backbone.norm.", "backbone.blocks.1.")
+    else:
+        raise InputError(
+            f"trains: found {trains!r}, expected adapters+head, last-N-blocks+head or all"
+        )
+    names = iter(named_leaves(params))
+    chosen = jax.tree.map(lambda _: next(names).startswith(prefixes), params)
+    return eqx.partition(params, chosen)
+
+
+def _cut_blocks(params: Crisalad, last: int) -> Crisalad:
+    stack = params.backbone.blocks
+    assert isinstance(stack, Block)  # a model in training's hands alone is cut
+    depth = len(stack.ls1)
+    if last > depth:
+        raise InputError(f"trains: found the last {last} blocks, expected at most {depth}")
+    cut = depth - last
+    parts = (jax.tree.map(lambda x: x[:cut], stack), jax.tree.map(lambda x: x[cut:], stack))
+    backbone = dataclasses.replace(params.backbone, blocks=parts)
+    return dataclasses.replace(params, backbone=backbone)
+
+
+def merge_params(trainable: PyTree, frozen: PyTree) -> Crisalad:
+    """Undo `split_params`: a model with one stack of blocks."""
+    params = eqx.combine(trainable, frozen)
+    if isinstance(params.backbone.blocks, Block):
+        return params
+    stack = jax.tree.map(lambda *parts: jnp.concatenate(parts), *params.backbone.blocks)
+    backbone = dataclasses.replace(params.backbone, blocks=stack)
+    return dataclasses.replace(params, backbone=backbone)
+
+
+def learning_rate_schedule(config: OptimiserConfig, steps: int) -> optax.Schedule:
+    """Linear warm-up from 0, then linear decay to `final_fraction` at the last of `steps`."""
+    peak, end = config.learning_rate, config.learning_rate * config.final_fraction
+    decay = optax.linear_schedule(peak, end, max(steps - config.warmup_steps, 1))
+    if not config.warmup_steps:
+        return decay
+    # The first step of a warm-up of n is 1 / n of the peak, not a step of length 0.
+    warmup = optax.linear_schedule(
+        peak / config.warmup_steps, peak, max(config.warmup_steps - 1, 1)
+    )
+    return optax.join_schedules([warmup, decay], [config.warmup_steps])
+
+
+def make_optimiser(config: OptimiserConfig, steps: int) -> optax.GradientTransformation:
+    """AdamW as torch's (Loshchilov and Hutter 2019; decay on every parameter), clipped if asked."""
+    adamw = optax.adamw(
+        learning_rate_schedule(config, steps),
+        b1=config.b1,
+        b2=config.b2,
+        weight_decay=config.weight_decay,
+    )
+    if config.clip_norm is None:
+        return adamw
+    return optax.chain(optax.clip_by_global_norm(config.clip_norm), adamw)
+
+
+@dataclasses.dataclass(frozen=True)
+class StepConfig:
+    """What a compiled step depends on."""
+
+    model: ModelConfig
+    loss: MultiSimilarityConfig
+    optimiser: OptimiserConfig
+    steps: int
+
+
+def init_state(params: Crisalad, trains: str, config: StepConfig) -> tuple[TrainState, PyTree]:
+    """The state before step 0, and the frozen parameters, which no step touches."""
+    trainable, frozen = split_params(params, trains)
+    optimiser = make_optimiser(config.optimiser, config.steps).init(trainable)
+    return TrainState(jnp.zeros((), jnp.int32), trainable, optimiser), frozen
+
+
+@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
+def train_step(
+    state: TrainState,
+    frozen: PyTree,
+    images: UInt8[Array, "image height width 3"],
+    labels: Int[Array, " image"],
+    valid: Bool[Array, " image"],
+    key: PRNGKeyArray,
+    config: StepConfig,
+) -> tuple[TrainState, Metrics]:
+    """One step of AdamW on the mean multi-similarity loss of a batch.
+
+    The gradient is taken of the trainable parameters alone. Dropout is drawn from `key` and the
+    step's number, so that a resumed run repeats an uninterrupted one. Where loss or gradient is not
+    finite the state is returned as it was, and the metrics tell.
+    """
+    step_key = jax.random.fold_in(key, state.step)
+
+    def loss_of(trainable: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        params = eqx.combine(trainable, frozen)
+        descriptors = describe(params, images, config.model, mask=among(valid), key=step_key)
+        return multi_similarity_loss(descriptors, labels, config.loss, valid=valid)
+
+    (loss, b_acc), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
+    norm = optax.global_norm(gradient)
+    optimiser = make_optimiser(config.optimiser, config.steps)
+    updates, new_optimiser = optimiser.update(gradient, state.optimiser, state.trainable)
+    new = TrainState(state.step + 1, optax.apply_updates(state.trainable, updates), new_optimiser)
+    finite = jnp.isfinite(loss) & jnp.isfinite(norm)
+    kept = jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state)
+    return kept, Metrics(loss, b_acc, norm)
+

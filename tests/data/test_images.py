@@ -1,0 +1,280 @@
+"""Reading, resizing and listing images, against Pillow."""
+
+import io
+import pathlib
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+
+from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image, resize_image
+from crisalad_jax.errors import InputError
+
+PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
+
+FORMATS = {
+    "jpeg": ("JPEG", {}),
+    "progressive": ("JPEG", {"progressive": True}),
+    "restarts": ("JPEG", {"restart_marker_rows": 1}),
+    "png": ("PNG", {}),
+    "webp": ("WEBP", {}),
+    "lossless.webp": ("WEBP", {"lossless": True}),
+    "bmp": ("BMP", {}),
+    "tif": ("TIFF", {"compression": "raw"}),
+    "lzw.tif": ("TIFF", {"compression": "tiff_lzw"}),
+}
+
+
+def smooth_picture(height=60, width=80, channels=3, seed=0):
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 256, (8, 10, channels), dtype=np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def encode(image, file_format, **options):
+    buffer = io.BytesIO()
+    image.save(buffer, file_format, **options)
+    return buffer.getvalue()
+
+
+def pillow_rgb(data):
+    return np.asarray(ImageOps.exif_transpose(Image.open(io.BytesIO(data))).convert("RGB"))
+
+
+def read_bytes(tmp_path, data, name="picture.jpg"):
+    path = tmp_path / name
+    path.write_bytes(data)
+    return read_image(path)
+
+
+def largest_difference(a, b):
+    assert a.shape == b.shape
+    return np.abs(a.astype(int) - b.astype(int)).max()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_formats(tmp_path, name):
+    file_format, options = FORMATS[name]
+    data = encode(Image.fromarray(smooth_picture()), file_format, **options)
+    # Both decode with the same libraries; 2 leaves room for another inverse DCT.
+    assert largest_difference(read_bytes(tmp_path, data), pillow_rgb(data)) <= 2
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA"])
+def test_modes_of_png(tmp_path, mode):
+    picture = Image.fromarray(smooth_picture(channels=4), "RGBA").convert("RGB").convert(mode)
+    if mode in ("LA", "RGBA"):
+        # Transparency from 0 to 255: what it hides must show, as Pillow's convert shows it.
+        alpha = np.tile(np.linspace(0, 255, 80).astype(np.uint8), (60, 1))
+        picture.putalpha(Image.fromarray(alpha))
+    data = encode(picture, "PNG")
+    np.testing.assert_array_equal(read_bytes(tmp_path, data), pillow_rgb(data))
+
+
+@pytest.mark.parametrize("file_format", ["PNG", "TIFF"])
+def test_sixteen_bits_keep_the_high_byte(tmp_path, file_format):
+    values = (np.arange(256)[:, None] * 256 + np.arange(0, 256, 5)).astype(np.uint16)
+    image = read_bytes(tmp_path, encode(Image.fromarray(values), file_format))
+    high_byte = np.repeat(np.arange(256), values.shape[1]).reshape(values.shape)
+    np.testing.assert_array_equal(image, np.stack([high_byte] * 3, axis=-1))
+
+
+def test_sixteen_bit_colour_png(tmp_path):
+    red = np.arange(0, 65536, 32, dtype=np.uint16).reshape(32, 64)
+    rgb = np.stack([red, red // 2, red // 3], axis=-1)
+    data = cv2.imencode(".png", rgb[..., ::-1])[1].tobytes()
+    np.testing.assert_array_equal(read_bytes(tmp_path, data), rgb >> 8)
+
+
+@pytest.mark.parametrize("adobe", [True, False])
+def test_cmyk_jpeg(tmp_path, adobe):
+    cmyk = Image.frombytes("CMYK", (80, 60), smooth_picture(channels=4).tobytes())
+    data = encode(cmyk, "JPEG", quality=95)
+    start = data.index(b"\xff\xee")
+    if not adobe:
+        data = data[:start] + data[start + 2 + int.from_bytes(data[start + 2 : start + 4], "big") :]
+    # OpenCV divides by 256 where Pillow divides by 255, twice: a level each.
+    assert largest_difference(read_bytes(tmp_path, data), pillow_rgb(data)) <= 2
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("file_format", ["JPEG", "PNG", "TIFF", "WEBP"])
+def test_exif_orientation(tmp_path, file_format, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    data = encode(Image.fromarray(smooth_picture()), file_format, exif=exif)
+    # As in test_formats; a wrong orientation differs by tens of levels.
+    assert largest_difference(read_bytes(tmp_path, data), pillow_rgb(data)) <= 2
+
+
+def test_one_pixel(tmp_path):
+    data = encode(Image.new("RGB", (1, 1), (10, 20, 30)), "PNG")
+    np.testing.assert_array_equal(read_bytes(tmp_path, data), [[[10, 20, 30]]])
+
+
+def test_twenty_thousand_pixels_wide(tmp_path):
+    picture = Image.linear_gradient("L").resize((20_000, 8)).convert("RGB")
+    data = encode(picture, "PNG")
+    np.testing.assert_array_equal(read_bytes(tmp_path, data), np.asarray(picture))
+
+
+def test_unicode_path_and_foreign_suffix(tmp_path):
+    data = encode(Image.new("RGB", (3, 2), (1, 2, 3)), "PNG")
+    assert read_bytes(tmp_path, data, "Zürich 東京.jpg").shape == (2, 3, 3)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.9, 0.9999])
+def test_a_cut_file_is_an_error(tmp_path, capfd, name, share):
+    file_format, options = FORMATS[name]
+    data = encode(Image.fromarray(smooth_picture(240, 320)), file_format, **options)
+    with pytest.raises(InputError, match=r"picture\.jpg: found"):
+        read_bytes(tmp_path, data[: int(len(data) * share)])
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["jpeg", "progressive", "restarts", "png"])
+def test_a_cut_file_filled_with_zeros_is_an_error(tmp_path, name):
+    file_format, options = FORMATS[name]
+    data = encode(Image.fromarray(smooth_picture(240, 320)), file_format, **options)
+    with pytest.raises(InputError, match="cut short"):
+        read_bytes(tmp_path, data[: len(data) // 2] + bytes(len(data) // 2))
+
+
+@pytest.mark.parametrize("file_format", ["JPEG", "PNG"])
+def test_one_missing_byte_is_named_a_cut(tmp_path, file_format):
+    data = encode(Image.fromarray(smooth_picture()), file_format)
+    with pytest.raises(InputError, match="cut short"):
+        read_bytes(tmp_path, data[:-1])
+
+
+def test_a_cut_jpeg_with_a_whole_thumbnail_is_an_error(tmp_path):
+    picture = Image.fromarray(smooth_picture(240, 320))
+    thumbnail = encode(picture.resize((40, 30)), "JPEG")
+    data = encode(picture, "JPEG", exif=b"Exif\0\0" + thumbnail)
+    assert data.index(b"\xff\xd9") < len(data) // 2
+    assert read_bytes(tmp_path, data).shape == (240, 320, 3)
+    with pytest.raises(InputError, match="cut short"):
+        read_bytes(tmp_path, data[: len(data) // 2])
+
+
+@pytest.mark.parametrize("file_format", ["JPEG", "PNG"])
+def test_bytes_after_the_end_do_not_matter(tmp_path, file_format):
+    data = encode(Image.fromarray(smooth_picture()), file_format)
+    expected = read_bytes(tmp_path, data)
+    np.testing.assert_array_equal(read_bytes(tmp_path, data + b"\0" * 3 + data[:99]), expected)
+
+
+def png_of_claimed_size(width, height):
+    def chunk(kind, content):
+        checksum = struct.pack(">I", zlib.crc32(kind + content))
+        return struct.pack(">I", len(content)) + kind + content + checksum
+
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    content = (
+        chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(99))) + chunk(b"IEND", b"")
+    )
+    return b"\x89PNG\r\n\x1a\n" + content
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"\xff", b"this is text\n" * 50, png_of_claimed_size(60_000, 60_000)],
+    ids=["empty", "one byte", "text", "bomb"],
+)
+def test_no_image(tmp_path, data):
+    with pytest.raises(InputError, match=r"picture\.jpg: ") as caught:
+        read_bytes(tmp_path, data)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(InputError, match=r"nothing\.jpg: cannot read: No such file"):
+        read_image(tmp_path / "nothing.jpg")
+    with pytest.raises(InputError, match=f"{tmp_path.name}: cannot read: Is a directory"):
+        read_image(tmp_path)
+
+
+def test_the_log_level_is_restored(tmp_path):
+    before = cv2.utils.logging.getLogLevel()
+    for data in (encode(Image.new("RGB", (3, 2)), "PNG"), b"text"):
+        (tmp_path / "picture").write_bytes(data)
+        try:
+            read_image(tmp_path / "picture")
+        except InputError:
+            assert data == b"text"
+        assert cv2.utils.logging.getLogLevel() == before
+
+
+SIZES = [(224, 224), (322, 322), (70, 126), (448, 420)]
+
+
+@pytest.mark.parametrize("image_size", SIZES)
+@pytest.mark.parametrize("shape", [(480, 640), (72, 97), (224, 224), (1, 1), (3, 20_000), (701, 1)])
+def test_resize_is_pillows(shape, image_size):
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+    height, width = image_size
+    expected = np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))
+    resized = resize_image(image, image_size)
+    assert resized.dtype == np.uint8
+    # Pillow rounds after each direction, we once: at most a level, a quarter of one on average.
+    assert largest_difference(resized, expected) <= 1
+    assert np.abs(resized.astype(int) - expected).mean() < 0.25
+
+
+def test_resize_to_the_same_size_changes_nothing():
+    image = smooth_picture()
+    np.testing.assert_array_equal(resize_image(image, (60, 80)), image)
+
+
+def test_resize_of_a_mirrored_view():
+    image = smooth_picture()
+    mirrored = np.flip(image, axis=1)
+    np.testing.assert_array_equal(
+        resize_image(mirrored, (28, 42)), resize_image(np.ascontiguousarray(mirrored), (28, 42))
+    )
+
+
+def test_photographs_read_and_resize_as_by_pillow():
+    if not PHOTOGRAPHS.is_dir():
+        pytest.skip("no photographs beside the checkout")
+    for path in list_images(PHOTOGRAPHS)[::8]:
+        expected = Image.open(path).convert("RGB").resize((224, 224), Image.Resampling.BILINEAR)
+        resized = resize_image(read_image(path), (224, 224))
+        # One level from the resize, two from the JPEG decoder, as above.
+        assert largest_difference(resized, np.asarray(expected)) <= 3
+
+
+def test_list_images(tmp_path):
+    names = ["b/2.JPG", "b/10.jpeg", "a.png", "b.tif", "b/c/x.WebP", "b-1.bmp", "é.TIFF"]
+    ignored = [".hidden.jpg", "b/.cache/y.jpg", "notes.txt", "jpg", "z.jpg.part", "b/._2.JPG"]
+    for name in names + ignored:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    found = [path.relative_to(tmp_path).as_posix() for path in list_images(tmp_path)]
+    assert found == sorted(names)
+    assert {pathlib.Path(name).suffix.lower() for name in names} == set(IMAGE_SUFFIXES)
+    assert [str(path) for path in list_images(str(tmp_path))] == [f"{tmp_path}/{n}" for n in found]
+
+
+def test_list_images_follows_links_but_not_in_circles(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "a.jpg").touch()
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / "database").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "set" / "again").symlink_to(tmp_path / "set")
+    assert list_images(tmp_path / "set") == [tmp_path / "set" / "database" / "a.jpg"]
+
+
+def test_list_images_of_nothing(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(InputError, match=f"{tmp_path.name}: found no image"):
+        list_images(tmp_path)
+    with pytest.raises(InputError, match=r"notes\.txt: found a file, expected a folder"):
+        list_images(tmp_path / "notes.txt")
+    with pytest.raises(InputError, match="missing: found nothing, expected a folder"):
+        list_images(tmp_path / "missing")
