@@ -24,9 +24,7 @@ from crisalad_jax.serial import differences, from_plain, to_plain
 FORMAT = "crisalad-jax 1"
 
 
-def save_weights(
-    path: str | os.PathLike[str], params: Crisalad, config: ModelConfig
-) -> None:
+def save_weights(path: str | os.PathLike[str], params: Crisalad, config: ModelConfig) -> None:
     """Write parameters under their dotted names, and the configuration in the file's metadata.
 
     Raises:
@@ -114,7 +112,7 @@ class StateStore:
         """Write the arrays of `state` and the JSON values of `record`; an existing step stays."""
         if step in self._manager.all_steps():
             return
-        arrays = ocp.args.StandardSave(named_leaves(state))
+        arrays = ocp.args.StandardSave(_stored(state))
         self._manager.save(
             step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonSave(record))
         )
@@ -128,7 +126,7 @@ class StateStore:
         step = self._manager.latest_step()
         if step is None:
             return None
-        wanted = named_leaves(template)
+        wanted = _stored(template)
         arrays = ocp.args.StandardRestore(jax.tree.map(ocp.utils.to_shape_dtype_struct, wanted))
         try:
             saved = self._manager.restore(
@@ -138,9 +136,16 @@ class StateStore:
             raise InputError(
                 f"{self._manager.directory}: the saved state is not of this run: {error}"
             ) from error
-        leaves = [saved["state"][name] for name in wanted]
-        return Saved(step, jax.tree.unflatten(jax.tree.structure(template), leaves), saved["record"])
+        leaves = [saved["state"].get(name, leaf) for name, leaf in named_leaves(template).items()]
+        return Saved(
+            step, jax.tree.unflatten(jax.tree.structure(template), leaves), saved["record"]
+        )
 
     def close(self) -> None:
         """Wait for what is being written."""
         self._manager.close()
+
+
+def _stored(state: PyTree) -> dict[str, Any]:
+    """Leaves by name without the empty ones (registers of a model that has none), which orbax refuses."""
+    return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}

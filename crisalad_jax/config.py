@@ -168,7 +168,9 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""
-        choose("ModelConfig.normalisation", self.normalisation, {"imagenet": 0, "local-contrast": 0})
+        choose(
+            "ModelConfig.normalisation", self.normalisation, {"imagenet": 0, "local-contrast": 0}
+        )
         choose("ModelConfig.compute_dtype", self.compute_dtype, {"float32": 0, "bfloat16": 0})
         check_image_size(self.image_size, self.salad.clusters)
         if self.encoder.layers:
@@ -277,15 +279,17 @@ class LightAugmentConfig:
     """Largest relative change of brightness, of contrast and of saturation."""
     grey: float = 0.2
     """Probability of dropping the colour."""
+    gamma: float = 0.0
+    """Largest change of the logarithm of an exponent on intensities."""
+    illumination: float = 0.0
+    """Largest change of the logarithm of brightness in a smooth field over the image: uneven light."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         _require_fraction(self, "crop", "shift", "colour")
-        for name in ("rotation", "blur"):
+        for name in ("rotation", "blur", "gamma", "illumination"):
             value = getattr(self, name)
-            _require(
-                value >= 0, f"LightAugmentConfig.{name}: found {value}, expected at least 0"
-            )
+            _require(value >= 0, f"LightAugmentConfig.{name}: found {value}, expected at least 0")
         for name in ("flip", "grey"):
             value = getattr(self, name)
             _require(

@@ -1,12 +1,12 @@
 """Descriptors of whole folders, and Recall@K of a benchmark under several groupings of its images."""
 
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from crisalad_jax.config import ModelConfig, choose
 from crisalad_jax.data.benchmarks import Benchmark

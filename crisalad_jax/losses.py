@@ -68,9 +68,7 @@ def multi_similarity_loss(
     """
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
     similarities = jnp.matmul(wide, wide.T, precision="highest")
-    pairs = mine(
-        jax.lax.stop_gradient(similarities), labels, epsilon=config.epsilon, valid=valid
-    )
+    pairs = mine(jax.lax.stop_gradient(similarities), labels, epsilon=config.epsilon, valid=valid)
     centred = similarities - config.base
     per_anchor = (
         _log1p_sum_exp(-config.alpha * centred, pairs.positives) / config.alpha

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text as Label
 from matplotlib.ticker import MaxNLocator
 from rich.table import Table
@@ -126,7 +127,7 @@ def recall_curves(
 
 
 def training_curves(
-    path: str | os.PathLike[str], records: Sequence[Mapping[str, float]], title: str = ""
+    path: str | os.PathLike[str], records: Sequence[Mapping[str, int | float]], title: str = ""
 ) -> None:
     """Write a PNG of a run: loss, b_acc, learning rate and validation recalls against the step.
 
@@ -173,7 +174,7 @@ def training_curves(
     if recalls:
         _draw_curves(panels[-1], recalls)
         panels[-1].set_title("validation Recall@K", fontsize=10, color=_INK, loc="left")
-    panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     panels[-1].set_xlabel("step", fontsize=10, color=_INK)
     _save(figure, path)
 
@@ -339,8 +340,8 @@ def _draw_curves(axes: Axes, curves: Mapping[str, Mapping[int, float]]) -> None:
     }
     values = [value for line in lines.values() for _, value in line]
     # The whole scale from 0 unless the lines lie high, where it would hide their differences.
-    low = 0 if min(values) < 50 else 10 * ((min(values) - 2) // 10)
-    high = min(100, 10 * -((max(values) + 2) // -10))
+    low = 0.0 if min(values) < 50 else 10 * ((min(values) - 2) // 10)
+    high = min(100.0, 10 * -((max(values) + 2) // -10))
     _style(axes)
     axes.set_ylim(low, high)
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True, steps=(1, 2, 5, 10)))
@@ -407,18 +408,19 @@ def _draw_series(axes: Axes, series: Mapping[int, float], noisy: bool) -> None:
 
 
 def _curves_figure(height: float, title: str) -> Figure:
-    figure = Figure(figsize=(7, height), layout="constrained")
     # Inches around everything, so that no name touches the edge.
-    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
+    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1)
+    figure = Figure(figsize=(7, height), layout=layout)
     if title:
         _fit(figure.suptitle(title, fontsize=12, color=_INK, x=0.02, ha="left"), figure)
     return figure
 
 
 def _fit(label: Label, figure: Figure) -> None:
-    """Shrink a line of text that starts at the left margin until it ends before the right one."""
-    room = 0.96 * figure.bbox.width
-    label.set_fontsize(label.get_fontsize() * min(1, room / label.get_window_extent().width))
+    """Shrink a line of text so that its right margin is at least its left one."""
+    extent = label.get_window_extent()
+    room = figure.bbox.width - 2 * extent.x0
+    label.set_fontsize(float(label.get_fontsize()) * min(1, room / extent.width))
 
 
 def _style(axes: Axes) -> None:

@@ -166,11 +166,12 @@ def _search_block(
 def _top(
     block: Float32[Array, "chunk d"],
     queries: Float32[Array, "q d"],
-    valid: int,
+    valid: Int[Array, ""] | int,
     k: int,
 ) -> tuple[Float32[Array, "q k"], Int32[Array, "q k"]]:
     similarities = jnp.matmul(queries, block.T, precision=jax.lax.Precision.HIGHEST)
     # Of equal values top_k takes the lower index first, but it orders -0.0 below 0.0.
     similarities = jnp.where(similarities == 0, 0, similarities)
     padding = jnp.arange(len(block)) >= valid
-    return jax.lax.top_k(jnp.where(padding[None], -jnp.inf, similarities), k)
+    best, indices = jax.lax.top_k(jnp.where(padding[None], -jnp.inf, similarities), k)
+    return best, indices

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -163,4 +163,3 @@ def train_step(
     finite = jnp.isfinite(loss) & jnp.isfinite(norm)
     kept = jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state)
     return kept, Metrics(loss, b_acc, norm)
-

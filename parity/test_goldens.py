@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.config import CrossImageConfig, SaladConfig, ViTConfig
+from crisalad_jax.config import AdapterConfig, CrossImageConfig, SaladConfig, ViTConfig
 from crisalad_jax.nn.cross_image import cross_image_encoder
 from crisalad_jax.nn.layers import layer_norm
 from crisalad_jax.nn.salad import join, salad, transport
@@ -81,7 +81,14 @@ def check(
 )
 def test_vit(name: str, registers: int) -> None:
     golden = load(name)
-    config = ViTConfig(dim=48, depth=2, heads=3, registers=registers, position_grid=5, adapter=None)
+    config = ViTConfig(
+        dim=48,
+        depth=2,
+        heads=3,
+        registers=registers,
+        position_grid=5,
+        adapter=AdapterConfig(kind="none"),
+    )
 
     def one(params: Any, image: jax.Array) -> dict[str, jax.Array]:
         image = image.transpose(1, 2, 0)

@@ -56,7 +56,7 @@ def vit_from_torch(state: State, depth: int) -> ViT:
         register_tokens=jnp.asarray(state.get("register_tokens", np.zeros((1, 0, dim), "f"))[0]),
         pos_embed_cls=jnp.asarray(positions[0]),
         pos_embed=jnp.asarray(positions[1:].reshape(side, side, dim)),
-        blocks=(jax.tree.map(lambda *leaves: jnp.stack(leaves), *blocks),),
+        blocks=jax.tree.map(lambda *leaves: jnp.stack(leaves), *blocks),
         norm=_layer_norm(state, "norm"),
     )
 

@@ -55,7 +55,7 @@ def rand_augment(image: Image, config: RandAugmentConfig, generator: np.random.G
 def light_augment(
     image: Image, config: LightAugmentConfig, generator: np.random.Generator
 ) -> Image:
-    """One small warp, a blur, and changes of brightness, contrast and saturation, or no colour.
+    """One small warp, a blur, and changes of the light: even, uneven, of contrast and of colour.
 
     `config.flip` is left to the caller, who mirrors all images of a place alike. Every call draws
     the same number of random values, whatever the config.
@@ -68,6 +68,8 @@ def light_augment(
     brightness, contrast, saturation = generator.uniform(1 - config.colour, 1 + config.colour, 3)
     if generator.random() < config.grey:
         saturation = 0.0
+    exponent = math.exp(generator.uniform(-config.gamma, config.gamma))
+    light = generator.uniform(-config.illumination, config.illumination, (3, 3))
 
     turn = scale * np.array(
         [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
@@ -80,6 +82,12 @@ def light_augment(
     )
     if sigma > 0:
         image = cv2.GaussianBlur(image, (0, 0), sigma)
+    if exponent != 1:
+        levels = np.arange(256) / 255
+        image = cv2.LUT(image, np.round(255 * levels**exponent).astype(np.uint8))
+    if light.any():
+        field = cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)
+        image = np.clip(np.exp(field)[..., None] * image, 0, 255).round().astype(np.uint8)
     # The three factors are one affine map of the colours: brightness scales, contrast stretches
     # about the mean luma, saturation stretches about each pixel's luma.
     colour = saturation * np.eye(3) + (1 - saturation) * _LUMA

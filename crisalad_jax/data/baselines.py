@@ -4,6 +4,8 @@ Histograms of oriented gradients: Dalal and Triggs, CVPR 2005. OpenCV 5 left its
 modules, so this one needs no more of it than a Sobel filter.
 """
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -18,8 +20,10 @@ _CELLS = _SIDE // _CELL
 _BLOCK_STARTS = _CELLS - 1
 
 
-def hog_descriptors(images: UInt8[np.ndarray, "n h w 3"]) -> Float32[np.ndarray, "n 8100"]:
-    """Unit HOG descriptors of whole pictures.
+def hog_descriptors(
+    images: Sequence[UInt8[np.ndarray, "h w 3"]],
+) -> Float32[np.ndarray, "n 8100"]:
+    """Unit HOG descriptors of whole pictures, which may differ in size.
 
     Grey, 128 x 128 pixels, Sobel gradients, unsigned angles in 9 bins (linear between the two
     nearest), cells of 8 x 8 pixels, blocks of 2 x 2 cells one cell apart, each block divided by its

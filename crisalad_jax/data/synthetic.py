@@ -1,6 +1,7 @@
 """A procedural city: street canyons of planar polygons, drawn through a pinhole camera.
 
-It is written in two real layouts: GSV-Cities (Ali-bey et al. 2022) for training, VPR-datasets-downloader for evaluation.
+It is written in two real layouts: GSV-Cities (Ali-bey et al. 2022) to train on, and that of
+VPR-datasets-downloader to evaluate on.
 """
 
 import dataclasses
@@ -18,7 +19,7 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import write_json
@@ -152,16 +153,15 @@ def _scaled(colour: Colour, gain: float) -> Colour:
 
 
 class _Scene(NamedTuple):
-    """Parts as arrays: points (n, 3) in metres, polygons as runs of points, parts as runs of these."""
+    """Parts as arrays: points in metres, polygons as runs of points, parts as runs of polygons."""
 
-    points: np.ndarray
-    polygon_sizes: np.ndarray
-    part_sizes: np.ndarray
-    """Polygons in each part."""
-    albedo: np.ndarray
-    normal: np.ndarray
-    kind: np.ndarray
-    layer: np.ndarray
+    points: Float[np.ndarray, "point 3"]
+    polygon_sizes: Int[np.ndarray, " polygon"]
+    part_sizes: Int[np.ndarray, " part"]
+    albedo: Float[np.ndarray, "part 3"]
+    normal: Float[np.ndarray, "part 3"]
+    kind: Int[np.ndarray, " part"]
+    layer: Float[np.ndarray, " part"]
     """Painting order: larger is farther away."""
 
 
@@ -196,7 +196,7 @@ class _Mesh:
             np.array(albedo, np.float64),
             np.array(normal, np.float64),
             np.array(kind),
-            np.array(layer),
+            np.array(layer, np.float64),
         )
 
 
@@ -204,7 +204,7 @@ def _join(first: _Scene, second: _Scene) -> _Scene:
     return _Scene(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
 
-Number = float | np.ndarray
+Number = int | float | np.ndarray
 
 
 def _polygons(*corners: tuple[Number, Number, Number]) -> Float[np.ndarray, "n corner 3"]:
@@ -256,7 +256,7 @@ class _Front:
         kind: _Kind = _Kind.SOLID,
         normal: Vector | None = None,
     ) -> None:
-        """Polygons in the plane's own metres, which look out of it unless `normal` says otherwise."""
+        """Polygons in the plane's own metres, which look out of it unless `normal` differs."""
         self.mesh.add(uvd @ self._axes + self._origin, albedo, normal or self.normal, kind)
 
     def boxes(
@@ -284,9 +284,7 @@ def _street_front(mesh: _Mesh, x: float, z: float) -> _Front:
     return _Front(mesh, (x, 0.0, z), (0.0, 0.0, 1.0), normal, sees_start=True)
 
 
-def _block(
-    mesh: _Mesh, low: Vector, high: Vector, albedo: Colour, kind: _Kind = _Kind.SOLID
-) -> None:
+def _block(mesh: _Mesh, low: Vector, high: Vector, albedo: Colour) -> None:
     """An upright box: its top, the side that looks to the middle of the street, its near face."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     left = x0 + x1 < 0
@@ -294,8 +292,8 @@ def _block(
     top = _polygons((x0, y1, z0), (x1, y1, z0), (x1, y1, z1), (x0, y1, z1))
     side = _polygons((x, y0, z0), (x, y0, z1), (x, y1, z1), (x, y1, z0))
     mesh.add(top, albedo, _UP, _Kind.ROOF)
-    mesh.add(side, albedo, (1.0 if left else -1.0, 0.0, 0.0), kind)
-    mesh.add(_rectangles(x0, y0, x1, y1, z0), albedo, _TO_CAMERA, kind)
+    mesh.add(side, albedo, (1.0 if left else -1.0, 0.0, 0.0))
+    mesh.add(_rectangles(x0, y0, x1, y1, z0), albedo, _TO_CAMERA)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -547,7 +545,7 @@ def _windows(
     if rng.random() < 0.32:
         on = np.tile(rng.random(len(axis)) < rng.choice((0.4, 1.0)), len(low))
         if on.any():
-            rects = (left[on] - 0.35, v0[on] - 0.45, right[on] + 0.35, v0[on] + 0.6)
+            rects = (left[on] - 0.25, v0[on] - 0.45, right[on] + 0.25, v0[on] + 0.6)
             front.boxes(rects, 0.9, trim)
 
 
@@ -916,11 +914,11 @@ def _passers(seed: int, lanes: tuple[float, float, float, float]) -> _Scene:
                 if rng.random() < 0.55:
                     _vehicle(mesh, rng, x, z, bus=False, away=away)
                 z += rng.uniform(5.5, 8.0)
-    for _ in range(int(rng.integers(0, 3))):
+    for _ in range(int(rng.integers(0, 4))):
         bus, away = bool(rng.random() < 0.3), bool(rng.random() < 0.5)
         offset = rng.uniform(1.2, 1.8)
         x = (left_kerb + right_kerb) / 2 + (offset if away else -offset)
-        _vehicle(mesh, rng, x, rng.uniform(12.0 if bus else 7.5, 36.0), bus=bus, away=away)
+        _vehicle(mesh, rng, x, rng.uniform(9.0 if bus else 6.0, 34.0), bus=bus, away=away)
     for _ in range(int(rng.integers(1, 6))):
         low, high = ((left, left_kerb), (right_kerb, right))[int(rng.integers(2))]
         _person(mesh, rng, rng.uniform(low + 0.4, high - 0.4), rng.uniform(4.5, 26.0))
@@ -1220,7 +1218,7 @@ def _paint(
     parts: Iterable[int],
     outlines: list[np.ndarray | None],
     colours: Float[np.ndarray, "part 3"],
-    shines: Bool[np.ndarray, "polygon"],
+    shines: Bool[np.ndarray, " polygon"],
     lit: float,
 ) -> None:
     """Fill the parts' polygons in the order of `parts`; those that shine in their lamp's colour."""
@@ -1245,7 +1243,7 @@ def _paint(
             cv2.fillPoly(canvas.glow, bright, _bytes(lamp), cv2.LINE_8, 2)
 
 
-def _shining(scene: _Scene, draw: Float[np.ndarray, "polygon"], lit: float) -> np.ndarray:
+def _shining(scene: _Scene, draw: Float[np.ndarray, " polygon"], lit: float) -> np.ndarray:
     """Which polygons shine: of a window's kind a share, drawn; of lamps all; by day none."""
     share = np.zeros(max(_Kind) + 1)
     if lit:
@@ -1454,7 +1452,7 @@ def _panoid(rng: np.random.Generator) -> str:
 def _write_train(
     folder: pathlib.Path, config: SyntheticCityConfig, city: int, done: Callable[[], None]
 ) -> None:
-    """One city in the GSV-Cities layout, its degrees those of a sphere, in the middle of an ocean."""
+    """One city in the GSV-Cities layout; its degrees are those of a sphere, out on an ocean."""
     name, centre = CITY_NAMES[city], (10.0 + city, -40.0)
     images = folder / "Images" / name
     images.mkdir(parents=True)

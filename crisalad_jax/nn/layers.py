@@ -53,7 +53,9 @@ def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> Depthw
     weight_key, bias_key = jax.random.split(key)
     bound = 1 / kernel_size
     return DepthwiseConv(
-        jax.random.uniform(weight_key, (kernel_size, kernel_size, dim), minval=-bound, maxval=bound),
+        jax.random.uniform(
+            weight_key, (kernel_size, kernel_size, dim), minval=-bound, maxval=bound
+        ),
         jax.random.uniform(bias_key, (dim,), minval=-bound, maxval=bound),
     )
 

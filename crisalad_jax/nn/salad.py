@@ -72,7 +72,11 @@ def _two_layer(
 
 
 def transport(
-    params: Salad, patches: Float[Array, "patch dim"], config: SaladConfig, *, key: PRNGKeyArray | None
+    params: Salad,
+    patches: Float[Array, "patch dim"],
+    config: SaladConfig,
+    *,
+    key: PRNGKeyArray | None,
 ) -> SinkhornResult:
     """Assignment of patches to clusters, dustbin last (paper Eqs. 3 to 5), in float32.
 

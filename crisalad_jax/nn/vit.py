@@ -189,9 +189,7 @@ def block(
     return tokens + params.ls2.astype(tokens.dtype) * update
 
 
-def feed_forward(
-    params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]
-) -> Float[Array, "*batch dim"]:
+def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
     """GELU network, or SwiGLU (Shazeer 2020) where the parameters are its."""
     if isinstance(params, Mlp):
         return linear(params.fc2, gelu(linear(params.fc1, x)))

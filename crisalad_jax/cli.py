@@ -1,0 +1,448 @@
+"""The command line: parse, make a configuration, call the library.
+
+Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 1 anything else.
+"""
+
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal
+
+import jax
+import rich.console
+import rich.table
+import tyro
+
+from crisalad_jax.checkpoint import load_weights
+from crisalad_jax.config import ModelConfig, TrainConfig, check_image_size, choose, recipe
+from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.images import list_images
+from crisalad_jax.data.places import read_places
+from crisalad_jax.demo import DemoConfig, run_demo
+from crisalad_jax.descriptors import writer_for
+from crisalad_jax.errors import InputError
+from crisalad_jax.evaluation import GROUPINGS, evaluate, group, read_tokens
+from crisalad_jax.files import write_json
+from crisalad_jax.fit import fit, read_metrics
+from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.report import RecallRow, prediction_gallery, recall_table, training_curves
+from crisalad_jax.serial import read_config, to_plain
+from crisalad_jax.training import split_params
+
+_console = rich.console.Console()
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Render a small synthetic city, train a tiny model on it, and show Recall@K before and after."""
+
+    out: pathlib.Path = pathlib.Path("demo")
+    """Folder for the city, the run, the tables and the pictures."""
+    seed: int = 0
+    quiet: bool = False
+    """No progress bars."""
+
+
+def _demo(arguments: Demo) -> None:
+    summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
+    _console.print(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
+    _console.print(
+        f"A descriptor of this model may depend on its batch: {_grouping_words(GROUPINGS)}.",
+        soft_wrap=True,
+    )
+    _console.print(
+        f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "
+        f"Pictures: {', '.join(str(p) for p in summary.pictures)}",
+        soft_wrap=True,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train on places in the GSV-Cities layout; go on with the run if OUT holds one."""
+
+    data: pathlib.Path
+    """Folder with Dataframes/ and Images/."""
+    out: pathlib.Path
+    """Folder of the run."""
+    settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    val: pathlib.Path | None = None
+    """Evaluation set for early stopping, in any layout that `evaluate` reads."""
+    weights: pathlib.Path | None = None
+    """Weights to start from; none starts from random ones."""
+    preset: str = "b14"
+    """tiny, s14, b14, l14 or g14: model and recipe that the other flags start from."""
+    config: pathlib.Path | None = None
+    """Configuration of an earlier run (its config.json) to start from instead of a preset."""
+    image_size: tuple[int, int] | None = None
+    """Height and width, multiples of 14; short for --model.image-size."""
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or skip it (masked out of attention and loss, and counted)."""
+    quiet: bool = False
+    """No progress bars."""
+
+
+def _train(arguments: Train) -> None:
+    config = arguments.settings
+    if arguments.image_size is not None:
+        model = dataclasses.replace(config.model, image_size=arguments.image_size)
+        config = dataclasses.replace(config, model=model)
+    initial = None
+    if arguments.weights is not None:
+        initial, _ = load_weights(arguments.weights, expected=config.model)
+    elif config.trains != "all":
+        _console.print(
+            f"Note: no --weights, so the frozen part of the model ({config.trains} trains) is "
+            "random. --trains all trains everything.",
+            soft_wrap=True,
+        )
+    places = read_places(arguments.data, cities=config.cities, min_images=config.min_images)
+    validation = None if arguments.val is None else open_benchmark(arguments.val)
+    _console.print(
+        f"{arguments.data}: {len(places.place_id)} places, {len(places.files)} images"
+        + ("" if validation is None else f"; validation on {validation.name}"),
+        soft_wrap=True,
+    )
+    result = fit(
+        config,
+        places,
+        arguments.out,
+        validation=validation,
+        initial=initial,
+        on_bad_image=arguments.on_bad_image,
+        quiet=arguments.quiet,
+    )
+    picture = arguments.out / "curves.png"
+    training_curves(picture, read_metrics(arguments.out / "metrics.jsonl"))
+    words = f"{result.steps} steps"
+    if result.stopped_early:
+        words += ", stopped early"
+    if result.best_recall is not None:
+        words += f", best Recall@5 {100 * result.best_recall:.1f} in best.safetensors"
+    if result.skipped_images:
+        words += f", {result.skipped_images} unreadable images skipped"
+    _console.print(f"{arguments.out}: {words}; curves in {picture}", soft_wrap=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Print Recall@1/5/10/20 of a model on an evaluation set, under each grouping of the images."""
+
+    data: pathlib.Path
+    """Evaluation set: a folder of @UTM names, or VPR-Bench's layout."""
+    weights: pathlib.Path | None = None
+    """A .safetensors file of this package; none evaluates an untrained model of --preset."""
+    preset: str = "b14"
+    """Model to start untrained where there are no weights."""
+    image_size: tuple[int, int] | None = None
+    """Height and width, multiples of 14; by default the model's."""
+    grouping: str = ",".join(GROUPINGS)
+    """Comma-separated: single, shuffled, sequential."""
+    batch_size: int = 16
+    """Images that a cross-image encoder sees together (the paper: 16)."""
+    split: str | None = None
+    """train, val or test, where the set has several."""
+    radius: float = 25.0
+    """Largest distance of a positive in metres, for @UTM names."""
+    seed: int = 0
+    """Draws the shuffled order, and untrained weights."""
+    out: pathlib.Path | None = None
+    """Folder for a gallery of retrievals and the resolved configuration."""
+    json: pathlib.Path | None = None
+    """File for the table as JSON."""
+    quiet: bool = False
+    """No progress bars."""
+
+
+def _evaluate(arguments: Evaluate) -> None:
+    groupings = arguments.grouping.split(",")
+    for name in groupings:
+        choose("--grouping", name, GROUPINGS)
+    params, config, model_name = _model(
+        arguments.weights, arguments.preset, arguments.image_size, arguments.seed
+    )
+    benchmark = open_benchmark(arguments.data, arguments.split, arguments.radius)
+    _console.print(
+        f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
+        f"images; positive: {benchmark.rule}",
+        soft_wrap=True,
+    )
+    results = evaluate(
+        params,
+        config,
+        benchmark,
+        groupings=groupings,
+        batch_size=arguments.batch_size,
+        seed=arguments.seed,
+        quiet=arguments.quiet,
+    )
+    rows = [RecallRow(benchmark.name, model_name, r.grouping, r.recalls) for r in results]
+    _console.print(recall_table(rows))
+    if params.encoder is None:
+        _console.print("No cross-image encoder: no descriptor depends on its batch.")
+    else:
+        _console.print(
+            "A descriptor of this model depends on the images in its batch of "
+            f"{arguments.batch_size}: {_grouping_words(groupings)}.",
+            soft_wrap=True,
+        )
+    resolved = {
+        "weights": None if arguments.weights is None else str(arguments.weights),
+        "benchmark": benchmark.name,
+        "rule": benchmark.rule,
+        "batch_size": arguments.batch_size,
+        "seed": arguments.seed,
+        "model": to_plain(config),
+    }
+    if arguments.json is not None:
+        table = [
+            row._asdict() | {"recalls": {f"R@{k}": v for k, v in row.recalls.items()}}
+            for row in rows
+        ]
+        write_json(arguments.json, resolved | {"results": table})
+    if arguments.out is not None:
+        write_json(arguments.out / "config.json", resolved)
+        for result in results:
+            prediction_gallery(
+                arguments.out / f"gallery_{result.grouping}.png",
+                benchmark.queries,
+                benchmark.database,
+                *result.neighbours,
+                benchmark.positives,
+                title=f"{benchmark.name}, {model_name}, {result.grouping}",
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Extract:
+    """Write a descriptor of every image in a folder, in sorted path order."""
+
+    weights: pathlib.Path
+    """A .safetensors file of this package."""
+    images: pathlib.Path
+    """Folder, searched with its subfolders."""
+    out: pathlib.Path
+    """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
+    image_size: tuple[int, int] | None = None
+    """Height and width, multiples of 14; by default the model's."""
+    grouping: str = "single"
+    """single, shuffled or sequential: a cross-image model's descriptors depend on it."""
+    batch_size: int = 16
+    seed: int = 0
+    """Draws the shuffled order."""
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or leave it out and say so."""
+    quiet: bool = False
+    """No progress bars."""
+
+
+def _extract(arguments: Extract) -> None:
+    write = writer_for(arguments.out)
+    choose("--grouping", arguments.grouping, GROUPINGS)
+    if arguments.batch_size < 1:
+        raise InputError(f"--batch-size: found {arguments.batch_size}, expected at least 1")
+    params, config, _ = _model(arguments.weights, "", arguments.image_size, arguments.seed)
+    paths = list_images(arguments.images)
+    folder = read_tokens(
+        params,
+        config,
+        paths,
+        batch_size=arguments.batch_size,
+        label="images",
+        on_bad_image=arguments.on_bad_image,
+        quiet=arguments.quiet,
+    )
+    descriptors = group(
+        params,
+        config,
+        folder,
+        arguments.grouping,
+        batch_size=arguments.batch_size,
+        seed=arguments.seed,
+    )[folder.readable]
+    names = [path.relative_to(arguments.images).as_posix() for path in paths]
+    skipped = [name for name, ok in zip(names, folder.readable, strict=True) if not ok]
+    kept = [name for name, ok in zip(names, folder.readable, strict=True) if ok]
+    if not kept:
+        raise InputError(f"{arguments.images}: found {len(paths)} images, none of them readable")
+    write(arguments.out, descriptors, kept)
+    write_json(
+        arguments.out.with_suffix(".config.json"),
+        {
+            "weights": str(arguments.weights),
+            "images": str(arguments.images),
+            "grouping": arguments.grouping,
+            "batch_size": arguments.batch_size,
+            "seed": arguments.seed,
+            "skipped": skipped,
+            "model": to_plain(config),
+        },
+    )
+    _console.print(
+        f"{arguments.out}: {len(kept)} descriptors of {config.descriptor_dim} numbers, "
+        f"grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]})"
+        + (f"; {len(skipped)} unreadable images left out" if skipped else ""),
+        soft_wrap=True,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""
+
+    preset: str = "b14"
+    """tiny, s14, b14, l14 or g14."""
+    weights: pathlib.Path | None = None
+    """Describe the model in this file instead."""
+    image_size: tuple[int, int] | None = None
+    """Height and width, multiples of 14; by default the model's."""
+    trains: str | None = None
+    """adapters+head, last-N-blocks+head or all; by default the recipe's."""
+    batch_size: int = 16
+    """Images that look at each other in the cross-image encoder."""
+    json: pathlib.Path | None = None
+    """File for the table as JSON."""
+
+
+def _info(arguments: Info) -> None:
+    if arguments.weights is not None:
+        _, config = load_weights(arguments.weights)
+        title = str(arguments.weights)
+        trains = arguments.trains or "adapters+head"
+    else:
+        defaults = recipe(arguments.preset)
+        config, trains = defaults.model, arguments.trains or defaults.trains
+        title = arguments.preset
+    config = _resized(config, arguments.image_size)
+    costs = part_costs(config, images=arguments.batch_size)
+    total, macs = sum(c.parameters for c in costs), sum(c.macs for c in costs)
+    template = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
+    trainable = jax.eval_shape(lambda params: split_params(params, trains)[0], template)
+    trained = sum(leaf.size for leaf in jax.tree.leaves(trainable))
+    summary = {
+        "model": title,
+        "image_size": list(config.image_size),
+        "descriptor": config.descriptor_dim,
+        "trains": trains,
+        "trainable_parameters": trained,
+        "frozen_parameters": total - trained,
+        "parts": [cost._asdict() for cost in costs],
+    }
+    table = rich.table.Table(
+        "part", title=f"{title} at {config.image_size[0]} x {config.image_size[1]}"
+    )
+    table.add_column("parameters", justify="right")
+    table.add_column("multiply-accumulates an image", justify="right")
+    for cost in costs:
+        table.add_row(cost.part, f"{cost.parameters:,}", f"{cost.macs:,}")
+    table.add_section()
+    table.add_row("all", f"{total:,}", f"{macs:,}")
+    _console.print(table)
+    lines = [
+        f"descriptor            {config.descriptor_dim:>13,} numbers",
+        f"trainable             {trained:>13,} parameters ({trains})",
+        f"frozen                {total - trained:>13,} parameters",
+    ]
+    if config.backbone.adapter.kind != "none":
+        one = next(c.parameters for c in costs if c.part == "adapters") // config.backbone.depth
+        true, paper = adapter_macs(config), paper_adapter_macs(config)
+        summary["one_adapter"] = {"parameters": one, "macs": true, "paper_macs": paper}
+        lines += [
+            f"one adapter           {one:>13,} parameters",
+            f"  multiply-accumulates{true:>13,} an image, linears at every token",
+            f"  as the paper counts {paper:>13,} (Table 3: each linear once, convolutions at every "
+            "patch)",
+        ]
+    _console.print("\n".join(lines), soft_wrap=True, highlight=False)
+    if arguments.json is not None:
+        write_json(arguments.json, summary)
+
+
+def _model(
+    weights: pathlib.Path | None, preset: str, image_size: tuple[int, int] | None, seed: int
+) -> tuple[Crisalad, ModelConfig, str]:
+    """A model from a file or untrained, and what to call it."""
+    if weights is None:
+        config = recipe(preset).model
+        params = init_crisalad(jax.random.key(seed), config)
+        name = f"untrained {preset}, seed {seed}"
+    else:
+        params, config = load_weights(weights)
+        name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
+    return params, _resized(config, image_size), name
+
+
+def _resized(config: ModelConfig, image_size: tuple[int, int] | None) -> ModelConfig:
+    if image_size is None:
+        return config
+    check_image_size(image_size, config.salad.clusters)
+    return dataclasses.replace(config, image_size=image_size)
+
+
+def _grouping_words(groupings: Sequence[str]) -> str:
+    return "; ".join(f"{name} = {GROUPINGS[name]}" for name in groupings)
+
+
+_COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
+    "demo": (Demo, _demo),
+    "train": (Train, _train),
+    "evaluate": (Evaluate, _evaluate),
+    "extract": (Extract, _extract),
+    "info": (Info, _info),
+}
+
+
+def _train_defaults(arguments: list[str]) -> TrainConfig:
+    """What the flags of `train` start from: --config or --preset, wherever they stand."""
+    given = _flag(arguments, "--config")
+    if given is not None:
+        return read_config(TrainConfig, pathlib.Path(given))
+    return recipe(_flag(arguments, "--preset") or "b14")
+
+
+def _flag(arguments: list[str], name: str) -> str | None:
+    for position, argument in enumerate(arguments):
+        if argument.startswith(f"{name}="):
+            return argument.partition("=")[2]
+        if argument == name and position + 1 < len(arguments):
+            return arguments[position + 1]
+    return None
+
+
+def _usage() -> str:
+    lines = ["usage: crisalad COMMAND [--help] ...", "", "commands:"]
+    lines += [f"  {name:<10}{kind.__doc__}" for name, (kind, _) in _COMMANDS.items()]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ("-h", "--help"):
+        print(_usage(), file=sys.stdout if given else sys.stderr)
+        return 0 if given else 2
+    try:
+        kind, run = choose("command", given[0], _COMMANDS)
+        # Nested settings are annotated with an empty name, so their flags carry no prefix.
+        options: dict[str, Any] = {}
+        if kind is Train:
+            kind = Annotated[kind, tyro.conf.AvoidSubcommands]
+            options["default"] = Train(
+                data=tyro.MISSING, out=tyro.MISSING, settings=_train_defaults(given[1:])
+            )
+        run(tyro.cli(kind, prog=f"crisalad {given[0]}", args=given[1:], **options))
+    except InputError as error:
+        print(f"crisalad: {error}", file=sys.stderr)
+        return 2
+    except SystemExit as stop:  # from tyro: --help or arguments that do not parse
+        return stop.code if isinstance(stop.code, int) else 2
+    except KeyboardInterrupt:
+        print("crisalad: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""Files of descriptors: .npy with a list of names, or HDF5 as hloc reads it."""
+
+import os
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+
+import h5py
+import numpy as np
+from jaxtyping import Float
+
+from crisalad_jax.config import choose
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import atomic_path
+
+Descriptors = Float[np.ndarray, "image descriptor"]
+
+
+def writer_for(
+    path: str | os.PathLike[str],
+) -> Callable[[pathlib.Path, Descriptors, Sequence[str]], None]:
+    """The function that writes files of this suffix, to be asked for before any work is done.
+
+    Raises:
+        InputError: neither .npy nor .h5.
+    """
+    path = pathlib.Path(path)
+    writers: Mapping[str, Callable[[pathlib.Path, Descriptors, Sequence[str]], None]] = {
+        ".npy": _write_npy,
+        ".h5": _write_h5,
+    }
+    return choose(f"{path}: suffix of the descriptors' file", path.suffix, writers)
+
+
+def _write_npy(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:
+    """Row i of the array is the image of line i of `path` with the suffix .names.txt."""
+    with atomic_path(path.with_suffix(".names.txt")) as temporary:
+        temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+    with atomic_path(path) as temporary:
+        np.save(temporary, descriptors)
+
+
+def _write_h5(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:
+    """One group an image, named by its path, with the dataset `global_descriptor` (hloc's format)."""
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        for name, descriptor in zip(names, descriptors, strict=True):
+            if f"{name}/global_descriptor" in file:
+                raise InputError(f"{path}: found the image name {name!r} twice, expected it once")
+            file.create_dataset(f"{name}/global_descriptor", data=descriptor)
