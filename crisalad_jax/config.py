@@ -445,10 +445,11 @@ def recipe(preset: str) -> TrainConfig:
         ),
         trains="all",
         augment="light",
+        light_augment=LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6),
         images_per_place=2,
         min_images=2,
         batch_order="shuffled",
-        epochs=100,
+        epochs=150,
         validate_every=10,
         patience=None,
     )

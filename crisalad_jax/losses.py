@@ -79,6 +79,8 @@ def multi_similarity_loss(
     if config.library_quirk:
         few = (pairs.positives.sum() <= 1) & (pairs.negatives.sum() <= 1)
         loss = jnp.where(few, 0.0, loss)
+    # A NaN compares as no pair at all: without this line it would look like a perfect batch.
+    loss = jnp.where(jnp.isfinite(similarities).all(), loss, jnp.nan)
     b_acc = 1 - pairs.positives.any(axis=1).sum() / anchors
     return LossResult(loss, b_acc)
 

@@ -156,7 +156,7 @@ def train_step(
         return multi_similarity_loss(descriptors, labels, config.loss, valid=valid)
 
     (loss, b_acc), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
-    norm = optax.global_norm(gradient)
+    norm = optax.tree.norm(gradient)
     optimiser = make_optimiser(config.optimiser, config.steps)
     updates, new_optimiser = optimiser.update(gradient, state.optimiser, state.trainable)
     new = TrainState(state.step + 1, optax.apply_updates(state.trainable, updates), new_optimiser)

@@ -1,0 +1,54 @@
+"""The adapter against a torch computation from its description, and its parameter count."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.config import AdapterConfig, ViTConfig
+from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
+
+GRID = (3, 5)
+
+
+@pytest.mark.parametrize("special", [1, 5])
+@pytest.mark.parametrize("kernel_size", [1, 3, 5])
+def test_equals_torch(special: int, kernel_size: int) -> None:
+    config = ViTConfig(dim=16, heads=2, adapter=AdapterConfig(kernel_size=kernel_size))
+    params = init_adapter(jax.random.key(0), config)
+    up = dataclasses.replace(
+        params.up, weight=jax.random.normal(jax.random.key(1), params.up.weight.shape)
+    )
+    params = dataclasses.replace(params, up=up)
+    tokens = jax.random.normal(jax.random.key(2), (special + 15, 16))
+
+    t = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf)), params)
+    hidden = torch.relu(torch.tensor(np.asarray(tokens)) @ t.down.weight)
+    maps = hidden[special:].T.reshape(1, 8, *GRID)
+    maps = torch.nn.functional.conv2d(
+        maps,
+        t.depthwise.weight.permute(2, 0, 1)[:, None],
+        t.depthwise.bias,
+        padding=kernel_size // 2,
+        groups=8,
+    )
+    maps = torch.nn.functional.conv2d(maps, t.pointwise.weight.T[..., None, None], t.pointwise.bias)
+    branch = torch.cat([hidden[:special], torch.relu(maps)[0].reshape(8, -1).T])
+    expected = (branch + hidden) @ t.up.weight
+    # Chains of at most 25 products of order 1, then 8 of order 10.
+    np.testing.assert_allclose(adapter(params, tokens, GRID), expected, atol=2e-5)
+
+
+def test_the_papers_adapter_has_its_parameter_count() -> None:
+    """741.504 K in Table 3."""
+    shapes = jax.eval_shape(lambda key: init_adapter(key, ViTConfig()), jax.random.key(0))
+    assert sum(leaf.size for leaf in jax.tree.leaves(shapes)) == 741_504
+
+
+def test_untrained_adapter_adds_nothing() -> None:
+    params: Adapter = init_adapter(jax.random.key(0), ViTConfig(dim=16, heads=2))
+    tokens = jax.random.normal(jax.random.key(2), (16, 16))
+    np.testing.assert_array_equal(adapter(params, tokens, GRID), jnp.zeros((16, 16)))

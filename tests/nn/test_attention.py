@@ -1,0 +1,72 @@
+"""Attention against torch's scaled_dot_product_attention and nn.MultiheadAttention."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+
+from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.layers import init_linear
+
+TOKENS, DIM, HEADS = 7, 12, 3
+
+
+def make() -> tuple[Attention, jax.Array, torch.nn.MultiheadAttention]:
+    qkv, proj, data = jax.random.split(jax.random.key(0), 3)
+    params = Attention(init_linear(qkv, DIM, 3 * DIM), init_linear(proj, DIM, DIM))
+    theirs = torch.nn.MultiheadAttention(DIM, HEADS, batch_first=True)
+    with torch.no_grad():
+        for target, source in (
+            (theirs.in_proj_weight, params.qkv.weight.T),
+            (theirs.in_proj_bias, params.qkv.bias),
+            (theirs.out_proj.weight, params.proj.weight.T),
+            (theirs.out_proj.bias, params.proj.bias),
+        ):
+            target.copy_(torch.tensor(np.asarray(source)))
+    return params, jax.random.normal(data, (TOKENS, DIM)), theirs
+
+
+def test_equals_torch_with_and_without_mask() -> None:
+    params, x, theirs = make()
+    mask = np.random.default_rng(0).random((TOKENS, TOKENS)) < 0.5
+    np.fill_diagonal(mask, True)
+    tx = torch.tensor(np.asarray(x))[None]
+    for allowed in (None, mask):
+        forbidden = None if allowed is None else torch.tensor(~allowed)
+        expected = theirs(tx, tx, tx, attn_mask=forbidden, need_weights=False)[0][0]
+        ours = attention(
+            params, x, HEADS, mask=None if allowed is None else jnp.asarray(allowed), key=None
+        )
+        # Two products of 12 terms of order 1 in float32.
+        np.testing.assert_allclose(ours, expected.detach().numpy(), atol=2e-6)
+
+
+def test_a_masked_token_has_no_influence_and_no_gradient() -> None:
+    params, x, _ = make()
+    mask = jnp.ones((TOKENS, TOKENS), bool).at[:-1, -1].set(False)
+
+    def seen(x: jax.Array) -> jax.Array:
+        return attention(params, x, HEADS, mask=mask, key=None)[:-1]
+
+    np.testing.assert_array_equal(seen(x), seen(x.at[-1].set(1e6)))
+    gradient = jax.grad(lambda x: jnp.sin(seen(x)).sum())(x)
+    np.testing.assert_array_equal(gradient[-1], 0)
+    assert jnp.abs(gradient[:-1]).max() > 0
+
+
+def test_scores_of_bfloat16_are_float32() -> None:
+    params, x, _ = make()
+    ours = attention(params, x.astype(jnp.bfloat16), HEADS, key=None)
+    assert ours.dtype == jnp.bfloat16
+    # bfloat16 keeps 8 bits: inputs, weights and outputs of order 1 are each off by up to 2^-9.
+    np.testing.assert_allclose(
+        np.asarray(ours, np.float32), attention(params, x, HEADS, key=None), atol=0.02
+    )
+
+
+def test_dropout_needs_a_key_and_changes_the_output() -> None:
+    params, x, _ = make()
+    plain = attention(params, x, HEADS, dropout_rate=0.5, key=None)
+    np.testing.assert_array_equal(plain, attention(params, x, HEADS, key=None))
+    dropped = attention(params, x, HEADS, dropout_rate=0.5, key=jax.random.key(1))
+    assert not np.allclose(plain, dropped, atol=1e-3)

@@ -1,0 +1,89 @@
+"""The cross-image encoder against torch.nn.TransformerEncoder with masks; its sequences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.config import CrossImageConfig, SaladConfig
+from crisalad_jax.nn.cross_image import (
+    as_sequence,
+    cross_image_encoder,
+    from_sequence,
+    init_cross_image,
+)
+from crisalad_jax.nn.salad import SaladTokens
+
+CONFIG = CrossImageConfig(layers=2, heads=4, feedforward=24, dropout=0.1)
+IMAGES, TOKENS, DIM = 5, 3, 16
+
+
+def torch_encoder(params) -> torch.nn.TransformerEncoder:
+    layer = torch.nn.TransformerEncoderLayer(
+        DIM, 4, 24, dropout=0.0, activation="gelu", batch_first=False
+    )
+    encoder = torch.nn.TransformerEncoder(layer, 2, enable_nested_tensor=False).eval()
+    with torch.no_grad():
+        for theirs, ours in zip(encoder.layers, params.layers, strict=True):
+            pairs = [
+                (theirs.self_attn.in_proj_weight, ours.attn.qkv.weight.T),
+                (theirs.self_attn.in_proj_bias, ours.attn.qkv.bias),
+                (theirs.self_attn.out_proj.weight, ours.attn.proj.weight.T),
+                (theirs.self_attn.out_proj.bias, ours.attn.proj.bias),
+                (theirs.linear1.weight, ours.linear1.weight.T),
+                (theirs.linear1.bias, ours.linear1.bias),
+                (theirs.linear2.weight, ours.linear2.weight.T),
+                (theirs.linear2.bias, ours.linear2.bias),
+            ]
+            for target, source in pairs:
+                target.copy_(torch.tensor(np.asarray(source)))
+    return encoder
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_equals_torch(masked: bool) -> None:
+    params = init_cross_image(jax.random.key(0), DIM, CONFIG)
+    tokens = jax.random.normal(jax.random.key(1), (IMAGES, TOKENS, DIM))
+    mask = None
+    if masked:
+        mask = np.random.default_rng(0).random((IMAGES, IMAGES)) < 0.5
+        np.fill_diagonal(mask, True)
+    forbidden = None if mask is None else torch.tensor(~mask)
+    expected = torch_encoder(params)(torch.tensor(np.asarray(tokens)), mask=forbidden)
+    ours = cross_image_encoder(
+        params, tokens, CONFIG, mask=None if mask is None else jnp.asarray(mask), key=None
+    )
+    # Two layers of normalised numbers of order 1: some tens of float32's last place.
+    np.testing.assert_allclose(ours, expected.detach().numpy(), atol=5e-6)
+
+
+def test_starts_as_torch_does() -> None:
+    """Glorot-uniform attention with zero biases: the largest weight comes close to the bound."""
+    params = init_cross_image(jax.random.key(0), 64, CONFIG)
+    attn = params.layers[0].attn
+    bound = np.sqrt(6 / (64 + 192))
+    assert 0.99 * bound < float(jnp.abs(attn.qkv.weight).max()) <= bound
+    assert not attn.qkv.bias.any()
+    assert not attn.proj.bias.any()
+
+
+def test_dropout_is_on_with_a_key_only() -> None:
+    params = init_cross_image(jax.random.key(0), DIM, CONFIG)
+    tokens = jax.random.normal(jax.random.key(1), (IMAGES, TOKENS, DIM))
+    plain = cross_image_encoder(params, tokens, CONFIG, key=None)
+    dropped = cross_image_encoder(params, tokens, CONFIG, key=jax.random.key(2))
+    assert not np.allclose(plain, dropped, atol=1e-3)
+
+
+@pytest.mark.parametrize("global_token", [True, False])
+def test_sequences_round_trip(global_token: bool) -> None:
+    salad = SaladConfig(clusters=3, cluster_dim=4, token_dim=8)
+    config = CrossImageConfig(global_token=global_token)
+    tokens = SaladTokens(jnp.arange(8.0), jnp.arange(12.0).reshape(3, 4))
+    sequence = as_sequence(tokens, salad, config)
+    assert sequence.shape == (5 if global_token else 3, 4)
+    back = from_sequence(2 * sequence, tokens, salad, config)
+    factor = 2 if global_token else 1  # left out, it comes back untouched
+    np.testing.assert_array_equal(back.global_token, factor * tokens.global_token)
+    np.testing.assert_array_equal(back.clusters, 2 * tokens.clusters)

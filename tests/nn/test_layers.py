@@ -1,0 +1,123 @@
+"""Small layers against torch's own, in float32.
+
+Bounds of 1e-6 relative to outputs of order 1 are a few units of float32's last place.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.nn.layers import (
+    DepthwiseConv,
+    LayerNorm,
+    Linear,
+    depthwise_conv,
+    dropout,
+    gelu,
+    init_depthwise_conv,
+    init_linear,
+    l2_normalise,
+    layer_norm,
+    linear,
+    split_key,
+)
+
+
+def normal(seed: int, *shape: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
+
+
+def test_linear_equals_torch() -> None:
+    x, weight, bias = normal(0, 5, 7), normal(1, 7, 3), normal(2, 3)
+    expected = torch.nn.functional.linear(*map(torch.tensor, (x, weight.T.copy(), bias)))
+    ours = linear(Linear(jnp.asarray(weight), jnp.asarray(bias)), jnp.asarray(x))
+    np.testing.assert_allclose(ours, expected, atol=2e-6)
+    without = linear(Linear(jnp.asarray(weight), None), jnp.asarray(x))
+    np.testing.assert_allclose(without, expected.numpy() - bias, atol=2e-6)
+
+
+def test_layer_norm_equals_torch() -> None:
+    x, weight, bias = 3 + 2 * normal(0, 5, 16), normal(1, 16), normal(2, 16)
+    expected = torch.nn.functional.layer_norm(
+        torch.tensor(x), (16,), torch.tensor(weight), torch.tensor(bias), eps=1e-2
+    )
+    ours = layer_norm(
+        LayerNorm(jnp.asarray(weight), jnp.asarray(bias)), jnp.asarray(x), epsilon=1e-2
+    )
+    np.testing.assert_allclose(ours, expected, atol=5e-6)
+
+
+def test_layer_norm_of_bfloat16_is_computed_in_float32() -> None:
+    x = jnp.asarray(100 + normal(0, 4, 64)).astype(jnp.bfloat16)
+    unit = LayerNorm(jnp.ones(64), jnp.zeros(64))
+    ours = layer_norm(unit, x, epsilon=1e-6)
+    assert ours.dtype == jnp.bfloat16
+    wide = np.asarray(x, np.float64)
+    expected = (wide - wide.mean(1, keepdims=True)) / wide.std(1, keepdims=True)
+    # One rounding to bfloat16, 2^-9 relative of values up to 4; a bfloat16 mean alone is off by 0.25.
+    np.testing.assert_allclose(np.asarray(ours, np.float64), expected, atol=4 * 2**-8)
+
+
+@pytest.mark.parametrize("size", [1, 3, 5])
+def test_depthwise_conv_equals_torch(size: int) -> None:
+    x, weight, bias = normal(0, 4, 6, 8), normal(1, size, size, 8), normal(2, 8)
+    expected = torch.nn.functional.conv2d(
+        torch.tensor(x).permute(2, 0, 1)[None],
+        torch.tensor(weight).permute(2, 0, 1)[:, None],
+        torch.tensor(bias),
+        padding=size // 2,
+        groups=8,
+    )[0].permute(1, 2, 0)
+    ours = depthwise_conv(DepthwiseConv(jnp.asarray(weight), jnp.asarray(bias)), jnp.asarray(x))
+    # 25 products of order 1: their sum's rounding.
+    np.testing.assert_allclose(ours, expected, atol=5e-6)
+
+
+def test_gelu_equals_torch_and_not_the_tanh_form() -> None:
+    x = np.linspace(-6, 6, 1001, dtype=np.float32)
+    expected = torch.nn.functional.gelu(torch.tensor(x)).numpy()
+    tanh = torch.nn.functional.gelu(torch.tensor(x), approximate="tanh").numpy()
+    np.testing.assert_allclose(gelu(jnp.asarray(x)), expected, atol=2e-6)
+    assert np.abs(tanh - expected).max() > 1e-4  # so the line above tells the two apart
+
+
+def test_l2_normalise_has_unit_length_and_a_finite_gradient_at_zero() -> None:
+    x = jnp.asarray(normal(0, 3, 8))
+    expected = torch.nn.functional.normalize(torch.tensor(np.asarray(x)), dim=-1)
+    np.testing.assert_allclose(l2_normalise(x), expected, atol=1e-6)
+    zero = jnp.zeros((1, 8))
+    np.testing.assert_array_equal(l2_normalise(zero), zero)
+    assert jnp.isfinite(jax.grad(lambda v: l2_normalise(v).sum())(zero)).all()
+
+
+def test_dropout() -> None:
+    x = jnp.ones(100_000)
+    assert dropout(x, 0.3, key=None) is x
+    assert dropout(x, 0.0, key=jax.random.key(0)) is x
+    dropped = np.asarray(dropout(x, 0.3, key=jax.random.key(0)))
+    assert set(np.unique(dropped)) == {np.float32(0), np.float32(1 / 0.7)}
+    # The share of zeros is binomial: deviation sqrt(0.21 / 1e5) = 0.0014; five of them.
+    assert abs((dropped == 0).mean() - 0.3) < 0.007
+
+
+def test_split_key() -> None:
+    assert split_key(None, 3) == [None, None, None]
+    keys = split_key(jax.random.key(0), 2)
+    assert len(keys) == 2
+    assert keys[0] is not None
+    assert keys[1] is not None
+    assert not jnp.array_equal(jax.random.key_data(keys[0]), jax.random.key_data(keys[1]))
+
+
+def test_starts_are_torch_defaults() -> None:
+    """Uniform within 1 / sqrt(fan in): the largest of many draws comes within 1 % of the bound."""
+    layer = init_linear(jax.random.key(0), 64, 400)
+    assert layer.bias is not None
+    for values in (layer.weight, layer.bias):
+        largest = float(jnp.abs(values).max())
+        assert 0.99 / 8 < largest <= 1 / 8
+    assert init_linear(jax.random.key(0), 64, 4, bias=False).bias is None
+    conv = init_depthwise_conv(jax.random.key(0), 3, 400)
+    assert 0.99 / 3 < float(jnp.abs(conv.weight).max()) <= 1 / 3

@@ -1,0 +1,44 @@
+"""Normalisation against its definition in numpy and OpenCV, in float64."""
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.nn.pixels import LOCAL_WINDOW, normalise
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (42, 56, 3), dtype=np.uint8)
+
+
+def test_imagenet() -> None:
+    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    expected = (PIXELS / 255 - mean) / deviation
+    np.testing.assert_allclose(normalise(jnp.asarray(PIXELS), "imagenet"), expected, atol=1e-6)
+
+
+def test_local_contrast_in_the_interior() -> None:
+    """OpenCV's box filter, away from the border, where the two treat missing pixels differently."""
+    image = PIXELS / 255
+    window = (LOCAL_WINDOW, LOCAL_WINDOW)
+    centred = image - cv2.blur(image, window)
+    expected = centred / np.sqrt(cv2.blur(centred**2, window) + 0.02**2)
+    ours = normalise(jnp.asarray(PIXELS), "local-contrast")
+    inside = np.s_[20:-20, 20:-20]  # two windows' reach
+    # Float32 sums of 441 numbers against float64.
+    np.testing.assert_allclose(ours[inside], expected[inside], atol=1e-5)
+
+
+def test_local_contrast_ignores_brightness_and_contrast() -> None:
+    half = (PIXELS // 4 + 100).astype(np.uint8)
+    full = (half - 100) * 4
+    a, b = (normalise(jnp.asarray(x.astype(np.uint8)), "local-contrast") for x in (half, full))
+    # Only the guard of 0.02 against flat areas tells them apart: noise of deviation 0.07 / 4 x 4.
+    np.testing.assert_allclose(a, b, atol=0.1)
+    flat = jnp.full((42, 42, 3), 200, jnp.uint8)
+    np.testing.assert_allclose(normalise(flat, "local-contrast"), 0, atol=1e-5)
+
+
+def test_unknown_name() -> None:
+    with pytest.raises(InputError, match="imagenet, local-contrast"):
+        normalise(jnp.asarray(PIXELS), "none")

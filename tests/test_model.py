@@ -1,0 +1,186 @@
+"""The whole model: shapes, unit norm, what a descriptor depends on, precision, errors."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.config import (
+    PRESETS,
+    CrossImageConfig,
+    ModelConfig,
+    SaladConfig,
+    ViTConfig,
+)
+from crisalad_jax.errors import InputError
+from crisalad_jax.model import alone, among, describe, init_crisalad, relate, tokenise
+from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.pytree import named_leaves
+
+CONFIG = ModelConfig(
+    image_size=(42, 56),
+    backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),
+    salad=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
+    encoder=CrossImageConfig(heads=2, feedforward=16),
+)
+# Descriptors have entries of order 0.1; float32 sums compiled for another batch size differ by
+# some units in the last place after a few layers.
+TOLERANCE = 2e-6
+
+
+@pytest.fixture(scope="module")
+def params():
+    """With LayerNorms off their start, so that no symmetry hides an error."""
+    params = init_crisalad(jax.random.key(0), CONFIG)
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [
+        leaf + 0.05 * jax.random.normal(key, leaf.shape)
+        for leaf, key in zip(leaves, keys, strict=True)
+    ]
+    return jax.tree.unflatten(structure, noisy)
+
+
+def pictures(count: int, seed: int = 0) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    return generator.integers(0, 256, (count, 42, 56, 3), dtype=np.uint8)
+
+
+def test_descriptors_are_unit_vectors(params) -> None:
+    descriptors = describe(params, pictures(4), CONFIG)
+    assert descriptors.shape == (4, 16 + 4 * 8)
+    np.testing.assert_allclose(jnp.linalg.norm(descriptors, axis=1), 1, atol=1e-6)
+
+
+def test_the_papers_descriptor_has_8448_numbers() -> None:
+    config = PRESETS["b14"]
+    params = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
+    images = jax.ShapeDtypeStruct((2, 224, 224, 3), jnp.uint8)
+    assert jax.eval_shape(lambda p, x: describe(p, x, config), params, images).shape == (2, 8448)
+    assert config.descriptor_dim == 8448
+
+
+@pytest.mark.parametrize("preset", ["s14", "l14", "g14"])
+def test_every_preset_composes(preset: str) -> None:
+    config = PRESETS[preset]
+    params = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
+    images = jax.ShapeDtypeStruct((1, 224, 308, 3), jnp.uint8)
+    assert jax.eval_shape(lambda p, x: describe(p, x, config), params, images).shape == (1, 8448)
+
+
+def test_padding_images_change_nothing(params) -> None:
+    images = pictures(3)
+    bare = describe(params, images, CONFIG)
+    padded = np.concatenate([images, pictures(5, seed=1)])
+    mask = among(jnp.arange(8) < 3)
+    np.testing.assert_allclose(
+        describe(params, padded, CONFIG, mask=mask)[:3], bare, atol=TOLERANCE
+    )
+    # Without the mask the five others are looked at, so the test above can fail.
+    assert np.abs(describe(params, padded, CONFIG)[:3] - bare).max() > 100 * TOLERANCE
+
+
+def test_any_order_of_the_batch_gives_the_same_descriptors(params) -> None:
+    images, order = pictures(5), np.array([3, 1, 4, 0, 2])
+    permuted = describe(params, images[order], CONFIG)
+    np.testing.assert_allclose(permuted, describe(params, images, CONFIG)[order], atol=TOLERANCE)
+
+
+def test_alone_is_a_batch_of_one(params) -> None:
+    images = pictures(4)
+    together = describe(params, images, CONFIG, mask=alone(4))
+    one_by_one = np.concatenate([describe(params, images[i : i + 1], CONFIG) for i in range(4)])
+    np.testing.assert_allclose(together, one_by_one, atol=TOLERANCE)
+    assert np.abs(describe(params, images, CONFIG) - together).max() > 100 * TOLERANCE
+
+
+def test_without_encoder_no_image_matters_to_another() -> None:
+    config = dataclasses.replace(CONFIG, encoder=CrossImageConfig(layers=0))
+    bare = init_crisalad(jax.random.key(0), config)
+    assert bare.encoder is None
+    images = pictures(4)
+    np.testing.assert_allclose(
+        describe(bare, images, config),
+        describe(bare, images, config, mask=alone(4)),
+        atol=TOLERANCE,
+    )
+
+
+def test_describe_is_relate_after_tokenise(params) -> None:
+    images, mask = pictures(3), among(jnp.array([True, True, False]))
+    tokens = tokenise(params, images, CONFIG)
+    np.testing.assert_allclose(
+        relate(params, tokens, CONFIG, mask=mask),
+        describe(params, images, CONFIG, mask=mask),
+        atol=TOLERANCE,
+    )
+
+
+def test_bytes_are_normalised_and_floats_are_taken_as_they_are(params) -> None:
+    images = jnp.asarray(pictures(2))
+    floats = jax.vmap(lambda image: normalise(image, "imagenet"))(images)
+    np.testing.assert_allclose(
+        describe(params, floats, CONFIG), describe(params, images, CONFIG), atol=TOLERANCE
+    )
+
+
+def test_other_sides_than_the_configs_work(params) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (2, 84, 28, 3), dtype=np.uint8)
+    descriptors = describe(params, images, CONFIG)
+    np.testing.assert_allclose(jnp.linalg.norm(descriptors, axis=1), 1, atol=1e-6)
+
+
+def test_bfloat16_stays_close(params) -> None:
+    config = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
+    half, full = (describe(params, pictures(4), c) for c in (config, CONFIG))
+    assert half.dtype == jnp.float32
+    cosine = (half * full).sum(axis=1)
+    # 8 bits of mantissa through 4 layers: each rounding turns a vector by at most 2^-9.
+    assert cosine.min() > 0.999
+    assert np.abs(half - full).max() > 1e-5  # it did compute in bfloat16
+
+
+def test_dropout_is_drawn_from_the_key(params) -> None:
+    plain, first, again, other = (
+        describe(params, pictures(3), CONFIG, key=key)
+        for key in (None, jax.random.key(1), jax.random.key(1), jax.random.key(2))
+    )
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-3
+    assert np.abs(first - plain).max() > 1e-3
+
+
+def test_same_seed_same_parameters() -> None:
+    a, b, c = (named_leaves(init_crisalad(jax.random.key(seed), CONFIG)) for seed in (0, 0, 1))
+    assert all(jnp.array_equal(a[name], b[name]) for name in a)
+    weights = [
+        name for name in a if name.endswith(".weight") and "norm" not in name and ".up." not in name
+    ]
+    assert weights
+    assert all(not jnp.array_equal(a[name], c[name]) for name in weights)
+
+
+def test_names_read_like_torchs() -> None:
+    shapes = jax.eval_shape(lambda key: init_crisalad(key, CONFIG), jax.random.key(0))
+    names = named_leaves(shapes)
+    assert names["backbone.blocks.attn.qkv.weight"].shape == (2, 32, 96)
+    assert names["backbone.blocks.mlp.fc1.bias"].shape == (2, 128)
+    assert names["aggregator.score.fc2.weight"].shape == (16, 4)
+    assert names["encoder.layers.1.linear2.weight"].shape == (16, 8)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((1, 43, 56, 3), "found 43 x 56, expected sides that are multiples of 14"),
+        ((1, 28, 28, 3), "found 28 x 28, which is 4 patches for 4 clusters.*42 x 42"),
+        ((1, 42, 56, 4), "expected \\(image, height, width, 3\\)"),
+        ((42, 56, 3), "expected \\(image, height, width, 3\\)"),
+    ],
+)
+def test_images_that_do_not_fit_raise_while_tracing(params, shape, message: str) -> None:
+    images = jax.ShapeDtypeStruct(shape, jnp.uint8)
+    with pytest.raises(InputError, match=message):
+        jax.eval_shape(lambda p, x: describe(p, x, CONFIG), params, images)

@@ -1,0 +1,260 @@
+"""What trains, the optimiser against torch, and one compiled step."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.config import MultiSimilarityConfig, OptimiserConfig
+from crisalad_jax.errors import InputError
+from crisalad_jax.losses import multi_similarity_loss
+from crisalad_jax.model import describe, init_crisalad
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.training import (
+    StepConfig,
+    init_state,
+    learning_rate_schedule,
+    make_optimiser,
+    merge_params,
+    split_params,
+    train_step,
+)
+from tests.test_model import CONFIG, pictures
+
+# No dropout, so that a step can be compared with one taken by hand.
+MODEL = dataclasses.replace(
+    CONFIG,
+    salad=dataclasses.replace(CONFIG.salad, dropout=0.0),
+    encoder=dataclasses.replace(CONFIG.encoder, dropout=0.0),
+)
+STEP = StepConfig(MODEL, MultiSimilarityConfig(base=0.5), OptimiserConfig(learning_rate=1e-3), 10)
+LABELS = np.array([0, 0, 1, 1, 2, 2])
+VALID = np.ones(6, bool)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return init_crisalad(jax.random.key(0), MODEL)
+
+
+def fresh(params):
+    """A copy, since a step takes over the buffers of its state."""
+    return jax.tree.map(jnp.copy, params)
+
+
+@pytest.mark.parametrize(
+    ("trains", "prefixes"),
+    [
+        ("adapters+head", ("aggregator.", "encoder.", "backbone.blocks.adapter.")),
+        ("last-1-blocks+head", ("aggregator.", "encoder.", "backbone.norm.", "backbone.blocks.1.")),
+        ("last-0-blocks+head", ("aggregator.", "encoder.", "backbone.norm.", "backbone.blocks.1.")),
+        ("all", ("",)),
+    ],
+)
+def test_what_trains_is_chosen_by_name(params, trains: str, prefixes: tuple[str, ...]) -> None:
+    trainable, frozen = split_params(params, trains)
+    trained, fixed = named_leaves(trainable), named_leaves(frozen)
+    assert not trained.keys() & fixed.keys()
+    assert all(name.startswith(prefixes) for name in trained)
+    assert not any(name.startswith(prefixes) for name in fixed)
+    assert trained
+    whole = named_leaves(merge_params(trainable, frozen))
+    for name, leaf in named_leaves(params).items():
+        np.testing.assert_array_equal(whole[name], leaf)
+
+
+def test_blocks_are_counted_from_the_end(params) -> None:
+    trainable, frozen = split_params(params, "last-1-blocks+head")
+    for tree, block in ((frozen, "0"), (trainable, "1")):
+        weight = named_leaves(tree)[f"backbone.blocks.{block}.attn.qkv.weight"]
+        index = int(block)
+        np.testing.assert_array_equal(
+            weight, params.backbone.blocks.attn.qkv.weight[index : index + 1]
+        )
+    nothing, _ = split_params(params, "last-0-blocks+head")
+    sizes = [leaf.size for name, leaf in named_leaves(nothing).items() if ".blocks." in name]
+    assert sum(sizes) == 0
+
+
+@pytest.mark.parametrize(
+    ("trains", "message"),
+    [("head", "found 'head', expected adapters"), ("last-3-blocks+head", "at most 2")],
+)
+def test_unknown_parts_raise(params, trains: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        split_params(params, trains)
+
+
+@pytest.mark.parametrize("trains", ["adapters+head", "last-1-blocks+head", "all"])
+def test_a_step_changes_what_trains_and_nothing_else(params, trains: str) -> None:
+    state, frozen = init_state(fresh(params), trains, STEP)
+    trainable_names = named_leaves(state.trainable).keys()
+    # The optimiser's two moments stand beside trainable leaves only.
+    moments = [n for n in named_leaves(state.optimiser) if ".mu." in n or ".nu." in n]
+    assert len(moments) == 2 * len(trainable_names)
+    before = named_leaves(fresh(state.trainable))
+    frozen_before = named_leaves(fresh(frozen))
+    state, metrics = train_step(state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    assert state.step == 1
+    assert metrics.gradient_norm > 0
+    # The dustbin's score has no effect (sinkhorn.py), but weight decay moves it.
+    after = named_leaves(state.trainable)
+    still = {name for name in after if jnp.array_equal(after[name], before[name])}
+    # Biases that start at 0 and have no gradient, and empty registers, may stay.
+    assert not {name for name in still if name.endswith("weight") and after[name].size}
+    for name, leaf in named_leaves(frozen).items():
+        np.testing.assert_array_equal(leaf, frozen_before[name])
+
+
+def test_frozen_parameters_get_no_gradient_buffers(params) -> None:
+    """The compiled step of adapters+head makes no array of a frozen block weight's stacked shape
+    but the weights themselves: no gradient, no moment."""
+    state, frozen = init_state(fresh(params), "adapters+head", STEP)
+    new_state, _ = jax.eval_shape(
+        lambda s, f: train_step(s, f, pictures(6), LABELS, VALID, jax.random.key(0), STEP),
+        state,
+        frozen,
+    )
+    assert named_leaves(new_state.trainable).keys() == named_leaves(state.trainable).keys()
+    program = jax.make_jaxpr(
+        lambda s, f: train_step(s, f, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    )(state, frozen)
+
+    def made(jaxpr) -> list[tuple[int, ...]]:
+        shapes = []
+        for equation in jaxpr.eqns:
+            shapes += [v.aval.shape for v in equation.outvars]
+            for value in equation.params.values():
+                if hasattr(value, "jaxpr"):
+                    shapes += made(value.jaxpr)
+                elif hasattr(value, "eqns"):
+                    shapes += made(value)
+        return shapes
+
+    shape = params.backbone.blocks.mlp.fc1.weight.shape
+    assert shape not in made(program.jaxpr)
+    everything, nothing = init_state(fresh(params), "all", STEP)
+    program = jax.make_jaxpr(
+        lambda s, f: train_step(s, f, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    )(everything, nothing)
+    assert shape in made(program.jaxpr)  # so the search above can find one
+
+
+def test_the_step_is_adamw_on_the_losss_gradient(params) -> None:
+    """Loss and update recomputed outside the step, the update by torch.optim.AdamW."""
+    images = pictures(6)
+    state, frozen = init_state(fresh(params), "all", STEP)
+    stepped, metrics = train_step(state, frozen, images, LABELS, VALID, jax.random.key(0), STEP)
+
+    def loss(p):
+        return multi_similarity_loss(describe(p, images, MODEL), LABELS, STEP.loss).loss
+
+    value, gradient = jax.value_and_grad(loss)(params)
+    np.testing.assert_allclose(metrics.loss, value, rtol=1e-5)
+    tensors = {n: torch.tensor(np.asarray(v)) for n, v in named_leaves(params).items()}
+    for name, g in named_leaves(gradient).items():
+        tensors[name].grad = torch.tensor(np.asarray(g))
+    torch.optim.AdamW(tensors.values(), lr=1e-3, weight_decay=0.01).step()
+    after = named_leaves(stepped.trainable)
+    for name in after:
+        # Adam's first step is lr times the gradient's sign: where the gradient is rounding noise
+        # around 0, so is its sign. Elsewhere the two agree to the last places.
+        g = np.abs(np.asarray(named_leaves(gradient)[name]))
+        sure = g > 1e-6
+        np.testing.assert_allclose(
+            np.asarray(after[name])[sure], tensors[name].numpy()[sure], atol=2e-6, err_msg=name
+        )
+
+
+def test_several_steps_of_the_optimiser_equal_torch() -> None:
+    """Five steps of AdamW under linear decay, clipped, on given gradients."""
+    config = OptimiserConfig(
+        learning_rate=0.1, final_fraction=0.2, weight_decay=0.05, b2=0.9, clip_norm=1.0
+    )
+    generator = np.random.default_rng(0)
+    start = generator.standard_normal(7).astype(np.float32)
+    gradients = generator.standard_normal((5, 7)).astype(np.float32)
+    optimiser = make_optimiser(config, steps=5)
+    ours, state = jnp.asarray(start), optimiser.init(jnp.asarray(start))
+    tensor = torch.tensor(start, requires_grad=True)
+    theirs = torch.optim.AdamW([tensor], lr=0.1, betas=(0.9, 0.9), weight_decay=0.05)
+    linear = torch.optim.lr_scheduler.LinearLR(theirs, 1.0, 0.2, total_iters=5)
+    for gradient in gradients:
+        updates, state = optimiser.update(jnp.asarray(gradient), state, ours)
+        ours = ours + updates
+        tensor.grad = torch.tensor(gradient)
+        torch.nn.utils.clip_grad_norm_([tensor], 1.0)
+        theirs.step()
+        linear.step()
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), atol=2e-6)
+
+
+def test_schedule_by_hand() -> None:
+    schedule = learning_rate_schedule(
+        OptimiserConfig(learning_rate=1.0, final_fraction=0.1, warmup_steps=4), 14
+    )
+    found = [float(schedule(step)) for step in (0, 1, 3, 4, 9, 14)]
+    np.testing.assert_allclose(found, [0.25, 0.5, 1.0, 1.0, 0.55, 0.1], atol=1e-6)
+    paper = learning_rate_schedule(OptimiserConfig(), 10)
+    np.testing.assert_allclose([float(paper(s)) for s in (0, 5, 10)], [6e-5, 3e-5, 0], atol=1e-10)
+
+
+def test_invalid_images_change_no_gradient(params) -> None:
+    images, valid = pictures(6), np.array([True] * 4 + [False] * 2)
+    results = []
+    for seed in (1, 2):
+        images[4:] = pictures(2, seed)
+        state, frozen = init_state(fresh(params), "all", STEP)
+        state, metrics = train_step(state, frozen, images, LABELS, valid, jax.random.key(0), STEP)
+        results.append((float(metrics.loss), float(metrics.gradient_norm)))
+    np.testing.assert_allclose(*results, rtol=1e-5)
+    state, frozen = init_state(fresh(params), "all", STEP)
+    _, all_valid = train_step(state, frozen, images, LABELS, VALID, jax.random.key(0), STEP)
+    assert abs(float(all_valid.loss) - results[0][0]) > 1e-3
+
+
+def test_a_step_that_is_not_finite_keeps_the_state(params) -> None:
+    broken = dataclasses.replace(
+        params, aggregator=dataclasses.replace(params.aggregator, dust_bin=jnp.float32(jnp.nan))
+    )
+    state, frozen = init_state(fresh(broken), "adapters+head", STEP)
+    before = named_leaves(fresh(state.trainable))
+    state, metrics = train_step(state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    assert not jnp.isfinite(metrics.loss)
+    assert state.step == 0
+    for name, leaf in named_leaves(state.trainable).items():
+        np.testing.assert_array_equal(leaf, before[name])
+
+
+def test_same_key_same_bits_and_dropout_changes_with_the_step() -> None:
+    config = dataclasses.replace(STEP, model=CONFIG)
+    start = init_crisalad(jax.random.key(0), CONFIG)
+
+    def losses(key: int, steps: int = 2) -> list[float]:
+        state, frozen = init_state(fresh(start), "adapters+head", config)
+        found = []
+        for _ in range(steps):
+            state, metrics = train_step(
+                state, frozen, pictures(6), LABELS, VALID, jax.random.key(key), config
+            )
+            found.append(float(metrics.loss))
+        return found
+
+    assert losses(0) == losses(0)
+    assert losses(0, 1) != losses(1, 1)
+
+
+def test_training_learns(params) -> None:
+    """Thirty steps on one batch of six pictures bring the loss down by half of what is above its floor."""
+    config = dataclasses.replace(STEP, steps=100)
+    state, frozen = init_state(fresh(params), "all", config)
+    found = []
+    for _ in range(30):
+        state, metrics = train_step(
+            state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), config
+        )
+        found.append(float(metrics.loss))
+    assert found[-1] < found[0] - 0.2
