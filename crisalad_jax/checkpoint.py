@@ -1,4 +1,4 @@
-"""Files of weights (safetensors, the configuration inside) and the resumable state of a run (orbax)."""
+"""Files of weights (safetensors, configuration inside) and the state that a run resumes from."""
 
 import functools
 import json
@@ -99,7 +99,7 @@ class Saved(NamedTuple):
 
 
 class StateStore:
-    """The resumable states of one run: a folder of which each step is written whole or not at all."""
+    """The resumable states of a run (orbax): each step is written whole or not at all."""
 
     def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
         """Open or make the folder; the last `keep` states stay."""
@@ -147,5 +147,5 @@ class StateStore:
 
 
 def _stored(state: PyTree) -> dict[str, Any]:
-    """Leaves by name without the empty ones (registers of a model that has none), which orbax refuses."""
+    """Leaves by name, without the empty ones (absent registers), which orbax refuses."""
     return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}

@@ -36,7 +36,7 @@ _console = rich.console.Console()
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Render a small synthetic city, train a tiny model on it, and show Recall@K before and after."""
+    """Render a synthetic city, train a tiny model on it, and show Recall@K before and after."""
 
     out: pathlib.Path = pathlib.Path("demo")
     """Folder for the city, the run, the tables and the pictures."""

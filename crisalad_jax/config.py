@@ -1,6 +1,6 @@
 """Frozen configurations: what a model is, how it trains, the presets, and their validation.
 
-Every field is hashable, so a configuration is a static argument of jit and names a compiled program.
+Every field is hashable: a configuration is a static argument of jit and names a compiled program.
 The values of the presets are the paper's (Xu et al., Appl. Sci. 2025, 15, 5287, section 4.2) unless
 a comment says otherwise.
 """
@@ -103,7 +103,7 @@ class ViTConfig:
 
     @property
     def hidden(self) -> int:
-        """Hidden width of the feed-forward network (DINOv2 rounds SwiGLU's 2/3 up to a multiple of 8)."""
+        """Hidden width of the feed-forward network; SwiGLU's 2/3 go up to a multiple of 8."""
         hidden = int(self.dim * self.mlp_ratio)
         return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
 
@@ -123,7 +123,7 @@ class SaladConfig:
     """Width of the global token."""
     hidden: int = 512
     dropout: float = 0.3
-    sinkhorn: SinkhornConfig = SinkhornConfig()
+    sinkhorn: SinkhornConfig = dataclasses.field(default_factory=SinkhornConfig)
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -133,7 +133,7 @@ class SaladConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CrossImageConfig:
-    """The transformer encoder whose attention runs across the images of a batch (paper section 3.4)."""
+    """The transformer encoder that attends across the images of a batch (paper section 3.4)."""
 
     layers: int = 2
     """0 leaves the encoder out: an image's descriptor then never depends on other images."""
@@ -159,7 +159,7 @@ class ModelConfig:
     image_size: tuple[int, int] = (224, 224)
     """Height and width that images are resized to, multiples of 14."""
     normalisation: Literal["imagenet", "local-contrast"] = "imagenet"
-    """What is done to 8-bit pixels: ImageNet mean and deviation, or the local mean and deviation."""
+    """What 8-bit pixels are normalised by: ImageNet or local mean and deviation."""
     backbone: ViTConfig = ViTConfig()
     salad: SaladConfig = SaladConfig()
     encoder: CrossImageConfig = CrossImageConfig()
@@ -194,7 +194,7 @@ class ModelConfig:
 
 
 def check_image_size(image_size: tuple[int, int], clusters: int) -> None:
-    """Check that images of this height and width make whole patches, and more of them than clusters.
+    """Check that images of this size make whole patches, and more of them than clusters.
 
     Raises:
         InputError: a side is no multiple of 14, or there are too few patches.
@@ -209,8 +209,9 @@ def check_image_size(image_size: tuple[int, int], clusters: int) -> None:
     side = next(s for s in range(1, clusters + 2) if s * s > clusters) * PATCH_SIZE
     _require(
         patches > clusters,
-        f"image size: found {height} x {width}, which is {patches} patches for {clusters} clusters; "
-        f"expected more patches than clusters (the smallest square that works: {side} x {side})",
+        f"image size: found {height} x {width}, which is {patches} patches for {clusters} "
+        "clusters; expected more patches than clusters (the smallest square that works: "
+        f"{side} x {side})",
     )
 
 
@@ -229,8 +230,8 @@ class MultiSimilarityConfig:
     epsilon: float = 0.1
     """Margin of the miner."""
     library_quirk: bool = False
-    """Return 0, as pytorch-metric-learning does, where at most one positive and at most one negative
-    pair are mined in the whole batch."""
+    """Return 0, as pytorch-metric-learning does, where at most one positive and at most one
+    negative pair are mined in the whole batch."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -243,7 +244,7 @@ class MultiSimilarityConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RandAugmentConfig:
-    """RandAugment with torchvision's 14 operations (Cubuk et al. 2020; field defaults of GSV-Cities)."""
+    """RandAugment (Cubuk et al. 2020), torchvision's 14 operations, GSV-Cities' strength."""
 
     operations: int = 3
     magnitude: int = 9
@@ -282,7 +283,7 @@ class LightAugmentConfig:
     gamma: float = 0.0
     """Largest change of the logarithm of an exponent on intensities."""
     illumination: float = 0.0
-    """Largest change of the logarithm of brightness in a smooth field over the image: uneven light."""
+    """Largest change of log brightness in a smooth field over the image: uneven light."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -344,7 +345,7 @@ class TrainConfig:
     min_images: int = 4
     """Places with fewer images are left out."""
     batch_order: Literal["within-city", "shuffled"] = "within-city"
-    """A batch of places of one city (hard negatives; the public loaders' order) or of all cities."""
+    """A batch of one city's places (hard negatives; the public loaders) or of all cities'."""
     cities: tuple[str, ...] | None = None
     """Which cities; None takes all."""
     epochs: int = 8

@@ -40,7 +40,7 @@ def _write_npy(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str
 
 
 def _write_h5(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:
-    """One group an image, named by its path, with the dataset `global_descriptor` (hloc's format)."""
+    """A group an image, named by its path, with a dataset `global_descriptor` (as hloc)."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         for name, descriptor in zip(names, descriptors, strict=True):
             if f"{name}/global_descriptor" in file:

@@ -1,4 +1,4 @@
-"""The one error that means "your input is wrong"; the command line prints it as one line and exits with 2."""
+"""The error that means "your input is wrong": one line from the command line, exit code 2."""
 
 
 class InputError(ValueError):

@@ -1,10 +1,11 @@
-"""Descriptors of whole folders, and Recall@K of a benchmark under several groupings of its images."""
+"""Descriptors of whole folders, and Recall@K of a benchmark by how its images are grouped."""
 
 import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -27,9 +28,10 @@ GROUPINGS = {
 
 
 class FolderTokens(NamedTuple):
-    """Tokens of many images on the host, and which of the images could be read."""
+    """Tokens of many images on the host (see `SaladTokens`), and which images could be read."""
 
-    tokens: SaladTokens
+    global_tokens: Float[np.ndarray, "image token_dim"]
+    clusters: Float[np.ndarray, "image cluster cluster_dim"]
     readable: Bool[np.ndarray, " image"]
 
 
@@ -49,8 +51,7 @@ def read_tokens(
     Raises:
         InputError: an image cannot be read, and `on_bad_image` is "stop".
     """
-    parts: list[SaladTokens] = []
-    readable: list[np.ndarray] = []
+    parts: list[tuple[np.ndarray, ...]] = []
     batches = image_batches(
         paths,
         image_size=config.image_size,
@@ -62,13 +63,9 @@ def read_tokens(
         for batch in batches:
             used = int((batch.indices >= 0).sum())
             tokens = jax.device_get(tokenise(params, batch.images, config))
-            parts.append(SaladTokens(*(leaf[:used] for leaf in tokens)))
-            readable.append(batch.valid[:used])
+            parts.append(tuple(leaf[:used] for leaf in (*tokens, batch.valid)))
             advance(used)
-    return FolderTokens(
-        SaladTokens(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True))),
-        np.concatenate(readable),
-    )
+    return FolderTokens(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
 
 
 def group(
@@ -97,8 +94,10 @@ def group(
         # A last batch that is not full repeats its first image, unseen, so that shapes stay alike.
         padded = np.resize(chosen, batch_size)
         valid = folder.readable[padded] & (np.arange(batch_size) < len(chosen))
-        mask = alone(batch_size) if grouping == "single" else among(valid)
-        tokens = SaladTokens(*(leaf[padded] for leaf in folder.tokens))
+        mask = alone(batch_size) if grouping == "single" else among(jnp.asarray(valid))
+        tokens = SaladTokens(
+            jnp.asarray(folder.global_tokens[padded]), jnp.asarray(folder.clusters[padded])
+        )
         descriptors[chosen] = relate(params, tokens, config, mask=mask)[: len(chosen)]
     return descriptors
 

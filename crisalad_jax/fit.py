@@ -188,7 +188,7 @@ class _Run:
         rate, self._stepped_at = len(batch.images) / (now - self._stepped_at), now
         skipped = int((~batch.valid).sum())
         self.record.skipped_images += skipped
-        learning_rate = float(self._schedule(self.step))
+        learning_rate = float(np.asarray(self._schedule(self.step)))
         self.step += 1
         self._log.write(
             {
@@ -260,7 +260,7 @@ class MetricsLog:
     """A file of JSON lines, one a step and one a validation."""
 
     def __init__(self, path: pathlib.Path, *, keep_up_to: int) -> None:
-        """Open the log; lines past step `keep_up_to`, which a resumed run will repeat, are dropped."""
+        """Open the log and drop lines past step `keep_up_to`, which a resumed run repeats."""
         self._path = path
         kept = [r for r in read_metrics(path) if r["step"] <= keep_up_to] if path.exists() else []
         with atomic_path(path) as temporary:
@@ -290,5 +290,5 @@ def _checksum(tree: PyTree) -> int:
     """CRC of all arrays, to tell other weights from the same."""
     value = 0
     for leaf in jax.tree.leaves(tree):
-        value = zlib.crc32(np.ascontiguousarray(leaf), value)
+        value = zlib.crc32(np.asarray(leaf).tobytes(), value)
     return value

@@ -1,4 +1,4 @@
-"""Multi-similarity loss with online mining (Wang et al., CVPR 2019), as GSV-Cities trains with it."""
+"""Multi-similarity loss with online mining (Wang et al., CVPR 2019), as used with GSV-Cities."""
 
 from typing import NamedTuple
 
@@ -33,9 +33,9 @@ def mine(
 ) -> MinedPairs:
     """Pairs that violate the order within their row by less than `epsilon` of margin.
 
-    A positive is kept if it is less similar than the hardest negative plus epsilon, a negative if it
-    is more similar than the hardest positive minus epsilon, strictly. An anchor without positives or
-    without negatives mines nothing. Images that are not `valid` are in no pair.
+    A positive is kept if it is less similar than the hardest negative plus epsilon, a negative if
+    it is more similar than the hardest positive minus epsilon, strictly. An anchor without
+    positives or without negatives mines nothing. Images that are not `valid` are in no pair.
     """
     same = labels[:, None] == labels[None, :]
     usable = jnp.ones_like(same) if valid is None else valid[:, None] & valid[None, :]
@@ -52,7 +52,7 @@ def mine(
 def multi_similarity_loss(
     descriptors: Float[Array, "image descriptor"],
     labels: Int[Array, " image"],
-    config: MultiSimilarityConfig = MultiSimilarityConfig(),
+    config: MultiSimilarityConfig,
     *,
     valid: Bool[Array, " image"] | None = None,
 ) -> LossResult:

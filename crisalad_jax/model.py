@@ -84,7 +84,7 @@ def tokenise(
     """The first half of `describe`: every image's tokens, which owe nothing to other images."""
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
-    check_image_size(images.shape[1:3], config.salad.clusters)
+    check_image_size((images.shape[1], images.shape[2]), config.salad.clusters)
 
     def one(
         image: UInt8[Array, "height width 3"] | Float[Array, "height width 3"],
@@ -123,7 +123,7 @@ def relate(
 
 
 def alone(count: int) -> Bool[Array, "image image"]:
-    """The mask under which every image looks at itself only: a descriptor owes nothing to a batch."""
+    """The mask under which every image looks at itself only, and owes nothing to its batch."""
     return jnp.eye(count, dtype=bool)
 
 

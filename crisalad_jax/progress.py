@@ -11,7 +11,7 @@ import rich.progress
 def progress_bar(
     label: str, total: int, unit: str, *, quiet: bool, done: int = 0
 ) -> Iterator[Callable[..., None]]:
-    """Yield `advance(count, note="")`; the bar shows the share, the rate in `unit`/s and the time left.
+    """Yield `advance(count, note="")`; the bar shows share, rate in `unit`/s and time left.
 
     `done` units of `total` were done before, and do not count for the rate.
     """

@@ -35,6 +35,6 @@ def params(cls: type[_T]) -> type[_T]:
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """The leaves of `tree` by dotted path, as in `backbone.blocks.mlp.fc1.weight`, in tree order."""
+    """Leaves by dotted path, as in `backbone.blocks.mlp.fc1.weight`, in tree order."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

@@ -1,8 +1,8 @@
-"""Entropic optimal transport for aggregation: Sinkhorn's algorithm in the log domain, with a dustbin.
+"""Entropic optimal transport for aggregation: Sinkhorn in the log domain, with a dustbin.
 
-The iteration is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR 2024)
-took from SuperGlue (Sarlin et al., CVPR 2020). Arrays are laid out (..., N, K): N rows (patches),
-K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
+The iteration is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR
+2024) took from SuperGlue (Sarlin et al., CVPR 2020). Arrays are laid out (..., N, K): N rows
+(patches), K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ class SinkhornResult(NamedTuple):
 
     log_plan: Float[Array, "*batch rows columns"]
     row_error: Float[Array, "*batch"]
-    """Largest absolute difference between a row's mass and its marginal, relative to the marginal."""
+    """Largest difference between a row's mass and its marginal, relative to the marginal."""
     column_error: Float[Array, "*batch"]
     """The same for columns. Rows are updated last, so this is the error that iterations lower."""
 

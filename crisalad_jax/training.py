@@ -39,7 +39,7 @@ class Metrics(NamedTuple):
 
 
 def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
-    """Split into (trainable, frozen), each of the model's structure with None for the other's leaves.
+    """Split into (trainable, frozen): the model's structure, None for the other's leaves.
 
     `trains` is "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "all", or
     "last-N-blocks+head" (SALAD: the last N blocks, the final layer norm, and the head). For the

@@ -134,8 +134,8 @@ def test_salad() -> None:
 
     params = salad_from_torch(under(golden, "state."))
     inputs = {name: jnp.asarray(golden[f"in.{name}"]) for name in ("features", "token")}
-    # A constant added to a column of scores is absorbed by the column's potential. So the dustbin's
-    # score and the score network's last bias have no effect, and their gradients are rounding noise.
+    # A constant added to a column of scores is absorbed by the column's potential: the dustbin's
+    # score and the score network's last bias have no effect, their gradients are rounding noise.
     dead = {"dust_bin": "dust_bin", "score.fc2.bias": "score.3.bias"}
     check(function, golden, params, inputs, salad_from_torch, exempt=tuple(dead))
     gradients = named_leaves(jax.grad(lambda p: golden_loss(function(p, inputs)))(params))

@@ -1,4 +1,4 @@
-"""Our parameters from a dictionary under the public torch names: the parts that golden files hold."""
+"""Our parameters from arrays under the public torch names: the parts that golden files hold."""
 
 from collections.abc import Mapping
 

@@ -2,8 +2,8 @@
 
     python scripts/study_photographs.py --data DIR --out OUT
 
-DIR holds `sped_train` (GSV-Cities layout), `sped_val` (@UTM layout) and `corridor` (VPR-Bench layout).
-Runs that OUT already holds are gone on with. The tables are written to OUT/photographs.md.
+DIR holds `sped_train` (GSV-Cities layout), `sped_val` (@UTM layout) and `corridor` (VPR-Bench
+layout). Runs that OUT already holds are gone on with. The tables are written to OUT/photographs.md.
 """
 
 import argparse
@@ -68,7 +68,7 @@ def hog_recalls(benchmark: Benchmark) -> dict[int, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Train and tabulate; see the top.")
     parser.add_argument("--data", type=pathlib.Path, required=True)
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])

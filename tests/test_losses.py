@@ -18,6 +18,8 @@ from pytorch_metric_learning.miners import MultiSimilarityMiner
 from crisalad_jax.config import MultiSimilarityConfig
 from crisalad_jax.losses import mine, multi_similarity_loss
 
+PAPER = MultiSimilarityConfig()
+
 
 def unit(x: np.ndarray) -> np.ndarray:
     return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
@@ -93,13 +95,13 @@ def test_batches_without_pairs_have_loss_and_gradient_zero(labels: list[int]) ->
     value, gradient = ours(jnp.asarray(x), jnp.asarray(labels), MultiSimilarityConfig())
     assert value == 0
     np.testing.assert_array_equal(gradient, 0)
-    assert multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels)).b_acc == 1
+    assert multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).b_acc == 1
 
 
 def test_a_nan_is_not_taken_for_a_perfect_batch() -> None:
     x, labels = random_batch(0)
     x[0] = np.nan
-    assert jnp.isnan(multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels)).loss)
+    assert jnp.isnan(multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).loss)
 
 
 def test_identical_images_stay_finite() -> None:
@@ -114,8 +116,8 @@ def test_identical_images_stay_finite() -> None:
 def test_the_librarys_quirk_is_an_option() -> None:
     """One positive and one negative pair mined in the whole batch: the library says 0.
 
-    Anchor 0 alone has a positive (1) less similar than a negative (2) plus 0.1; anchor 1's pairs and
-    2's are in order, since similarity is compared within a row: made so by hand.
+    Anchor 0 alone has a positive (1) less similar than a negative (2) plus 0.1; the pairs of
+    anchor 1 are in order, and anchor 2 has no positive.
     """
     similarities = np.array([[1.0, 0.60, 0.55], [0.60, 1.0, 0.10], [0.55, 0.10, 1.0]])
     x = np.linalg.cholesky(similarities).astype(np.float32)
@@ -140,19 +142,22 @@ def test_images_that_are_not_valid_take_no_part() -> None:
     full = np.concatenate([x, unit(np.random.default_rng(9).standard_normal((5, 6)))])
     full_labels = np.concatenate([labels, labels[:5] if len(labels) >= 5 else np.zeros(5, int)])
     valid = jnp.arange(len(full)) < len(x)
-    alone = multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels))
+    alone = multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels), PAPER)
 
     def loss(full: jax.Array) -> jax.Array:
-        return multi_similarity_loss(full, jnp.asarray(full_labels), valid=valid).loss
+        return multi_similarity_loss(full, jnp.asarray(full_labels), PAPER, valid=valid).loss
 
-    padded = multi_similarity_loss(jnp.asarray(full), jnp.asarray(full_labels), valid=valid)
+    padded = multi_similarity_loss(jnp.asarray(full), jnp.asarray(full_labels), PAPER, valid=valid)
     assert alone.loss > 0
     np.testing.assert_allclose(padded.loss, alone.loss, rtol=1e-6)
     np.testing.assert_allclose(padded.b_acc, alone.b_acc, rtol=1e-6)
     np.testing.assert_array_equal(jax.grad(loss)(jnp.asarray(full))[len(x) :], 0)
     nothing = jnp.zeros(len(full), bool)
     assert (
-        multi_similarity_loss(jnp.asarray(full), jnp.asarray(full_labels), valid=nothing).loss == 0
+        multi_similarity_loss(
+            jnp.asarray(full), jnp.asarray(full_labels), PAPER, valid=nothing
+        ).loss
+        == 0
     )
 
 
@@ -162,6 +167,6 @@ def test_b_acc_counts_anchors_without_a_hard_positive() -> None:
     labels = jnp.array([0, 0, 1, 1])
     # Anchors 2 and 3 each have the other as a hard positive; 0 and 1 have each other at similarity
     # 1, while the stray is as similar: within epsilon, so hard too. b_acc = 0.
-    assert multi_similarity_loss(jnp.asarray(x), labels).b_acc == 0
+    assert multi_similarity_loss(jnp.asarray(x), labels, PAPER).b_acc == 0
     x[3] = [0, 1]
-    assert multi_similarity_loss(jnp.asarray(x), labels).b_acc == 1
+    assert multi_similarity_loss(jnp.asarray(x), labels, PAPER).b_acc == 1

@@ -248,7 +248,7 @@ def test_same_key_same_bits_and_dropout_changes_with_the_step() -> None:
 
 
 def test_training_learns(params) -> None:
-    """Thirty steps on one batch of six pictures bring the loss down by half of what is above its floor."""
+    """Thirty steps on one batch of six pictures lower its loss."""
     config = dataclasses.replace(STEP, steps=100)
     state, frozen = init_state(fresh(params), "all", config)
     found = []

@@ -42,11 +42,11 @@ def init_adapter(key: PRNGKeyArray, config: ViTConfig) -> Adapter:
 def adapter(
     params: Adapter, tokens: Float[Array, "token dim"], grid: tuple[int, int]
 ) -> Float[Array, "token dim"]:
-    """Down, ReLU, separable convolution on the patch grid plus skip, up (the Adapter of paper Eq. 2).
+    """Down, ReLU, separable convolution on the patch grid plus skip, up (Adapter of paper Eq. 2).
 
-    The last `grid[0] * grid[1]` tokens are patches in row order. The class and register tokens before
-    them take no part in the convolution: it acts on them as the identity, so with the skip they
-    count twice, as in CricaVPR.
+    The last `grid[0] * grid[1]` tokens are patches in row order. The class and register tokens
+    before them take no part in the convolution: it acts on them as the identity, so with the skip
+    they count twice, as in CricaVPR.
     """
     hidden = jax.nn.relu(linear(params.down, tokens))
     special = tokens.shape[0] - grid[0] * grid[1]

@@ -1,4 +1,4 @@
-"""The cross-image encoder (paper section 3.4): transformer layers that look across a batch's images.
+"""The cross-image encoder (paper section 3.4): transformer layers across a batch's images.
 
 Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact GELU.
 """

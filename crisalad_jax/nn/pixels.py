@@ -1,4 +1,4 @@
-"""From 8-bit pixels to the numbers a backbone sees. It runs on the device: images travel as bytes."""
+"""From 8-bit pixels to a backbone's input, on the device: images travel as bytes."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +43,6 @@ def _local_contrast(image: Float[Array, "height width 3"]) -> Float[Array, "heig
 
 
 def _box(side: int) -> np.ndarray:
-    """(side, side) averaging matrix; at the border the box is cut and its mean is of what is left."""
+    """(side, side) averaging matrix; at the border the mean is of what is left of the box."""
     near = np.abs(np.arange(side)[:, None] - np.arange(side)) <= LOCAL_WINDOW // 2
     return (near / near.sum(axis=1, keepdims=True)).astype(np.float32)

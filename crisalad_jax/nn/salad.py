@@ -32,7 +32,8 @@ class TwoLayer:
 class Salad:
     """The three networks over features, and the dustbin's score.
 
-    The published constant dustbin score changes nothing: the transport absorbs it, its gradient is 0.
+    The published constant dustbin score changes nothing: the transport absorbs it. So is the bias
+    of the score network's last layer. Both have gradient 0; public checkpoints hold them.
     """
 
     token_features: TwoLayer

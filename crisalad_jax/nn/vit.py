@@ -54,8 +54,8 @@ class Block:
 class ViT:
     """The backbone. In `blocks` every leaf has a leading depth axis.
 
-    A tuple of such stacks is run one after the other: so training keeps the frozen blocks out of the
-    gradient where only the last ones train.
+    A tuple of such stacks is run one after the other: so training keeps the frozen blocks out of
+    the gradient where only the last ones train.
     """
 
     patch_embed: Linear
@@ -238,7 +238,7 @@ def _bicubic_weights(source: int, target: int) -> np.ndarray:
 
 @functools.cache
 def _antialias_weights(source: int, target: int) -> np.ndarray:
-    """(target, source) weights of torch's antialiased bicubic: a kernel as wide as the shrinking."""
+    """(target, source) weights of torch's antialiased bicubic, wider where it shrinks."""
     scale = source / target
     stretch = max(scale, 1.0)
     centres = (np.arange(target) + 0.5) * scale

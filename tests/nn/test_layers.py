@@ -56,7 +56,7 @@ def test_layer_norm_of_bfloat16_is_computed_in_float32() -> None:
     assert ours.dtype == jnp.bfloat16
     wide = np.asarray(x, np.float64)
     expected = (wide - wide.mean(1, keepdims=True)) / wide.std(1, keepdims=True)
-    # One rounding to bfloat16, 2^-9 relative of values up to 4; a bfloat16 mean alone is off by 0.25.
+    # One rounding to bfloat16, 2^-9 of values up to 4; a bfloat16 mean alone is off by 0.25.
     np.testing.assert_allclose(np.asarray(ours, np.float64), expected, atol=4 * 2**-8)
 
 

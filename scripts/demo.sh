@@ -1,0 +1,6 @@
+#!/usr/bin/env bash
+# Sets up what is missing and runs the demo: no data and no accelerator needed.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+source scripts/environment.sh ""
+exec crisalad demo --out demo "$@"

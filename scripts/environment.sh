@@ -1,0 +1,16 @@
+# Sourced by the other scripts from the repository's root: makes .venv once, installs the package
+# into it with the given extras, and activates it. PYTHON chooses the interpreter.
+extras="$1"
+if [ ! -x .venv/bin/python ]; then
+  "${PYTHON:-python3}" -m venv .venv
+fi
+# shellcheck disable=SC1091
+source .venv/bin/activate
+stamp=".venv/installed${extras}"
+if [ ! -f "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
+  echo "Installing crisalad-jax${extras} into .venv; the first time takes some minutes." >&2
+  # Torch first, by itself: its exact version may be at hand as a smaller CPU build.
+  case "$extras" in *dev*) python -m pip install --quiet "$(grep -o 'torch==[0-9.]*' pyproject.toml)" ;; esac
+  python -m pip install --quiet --editable ".${extras}"
+  touch "$stamp"
+fi

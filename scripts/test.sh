@@ -1,0 +1,9 @@
+#!/usr/bin/env bash
+# Sets up what is missing, then runs the linter, the type checker and the tests.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+source scripts/environment.sh "[dev]"
+ruff check .
+ruff format --check .
+pyright
+exec python -m pytest -m "not slow" "$@"
