@@ -1,16 +1,19 @@
-"""CriSALAD visual place recognition in pure JAX."""
+"""CriSALAD visual place recognition in pure JAX.
 
+Names are imported on first use, so that reading pictures takes no jax and a model no file formats.
+"""
+
+import importlib
 from typing import TYPE_CHECKING, Any
-
-from crisalad_jax.config import PRESETS, ModelConfig, TrainConfig, recipe
-from crisalad_jax.errors import InputError
-from crisalad_jax.losses import multi_similarity_loss
-from crisalad_jax.model import Crisalad, alone, among, describe, init_crisalad
-from crisalad_jax.sinkhorn import sinkhorn
 
 if TYPE_CHECKING:
     from crisalad_jax.checkpoint import load_weights as load
     from crisalad_jax.checkpoint import save_weights as save
+    from crisalad_jax.config import PRESETS, ModelConfig, TrainConfig, recipe
+    from crisalad_jax.errors import InputError
+    from crisalad_jax.losses import multi_similarity_loss
+    from crisalad_jax.model import Crisalad, alone, among, describe, init_crisalad
+    from crisalad_jax.sinkhorn import sinkhorn as solve_transport
 
 __all__ = [
     "PRESETS",
@@ -26,16 +29,31 @@ __all__ = [
     "multi_similarity_loss",
     "recipe",
     "save",
-    "sinkhorn",
+    "solve_transport",
 ]
 
-_FILES = {"load": "load_weights", "save": "save_weights"}
+_HOMES = {
+    "PRESETS": "config.PRESETS",
+    "Crisalad": "model.Crisalad",
+    "InputError": "errors.InputError",
+    "ModelConfig": "config.ModelConfig",
+    "TrainConfig": "config.TrainConfig",
+    "alone": "model.alone",
+    "among": "model.among",
+    "describe": "model.describe",
+    "init_crisalad": "model.init_crisalad",
+    "load": "checkpoint.load_weights",
+    "multi_similarity_loss": "losses.multi_similarity_loss",
+    "recipe": "config.recipe",
+    "save": "checkpoint.save_weights",
+    # `crisalad_jax.sinkhorn` is the module.
+    "solve_transport": "sinkhorn.sinkhorn",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """`load` and `save` on first use: the model itself does without what reads and writes files."""
-    if name in _FILES:
-        from crisalad_jax import checkpoint
-
-        return getattr(checkpoint, _FILES[name])
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """A public name, from the module it lives in."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _HOMES[name].partition(".")
+    return getattr(importlib.import_module(f"{__name__}.{module}"), attribute)

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.sinkhorn import SinkhornConfig
 
 PATCH_SIZE = 14
 
@@ -114,6 +113,19 @@ class ViTConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SinkhornConfig:
+    """How the transport is solved; by default as SALAD was published."""
+
+    iterations: int = 3
+    epsilon: float = 1.0
+    """Entropic regularisation: scores are divided by it."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "iterations", "epsilon")
+
+
+@dataclasses.dataclass(frozen=True)
 class SaladConfig:
     """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
 
@@ -123,7 +135,7 @@ class SaladConfig:
     """Width of the global token."""
     hidden: int = 512
     dropout: float = 0.3
-    sinkhorn: SinkhornConfig = dataclasses.field(default_factory=SinkhornConfig)
+    sinkhorn: SinkhornConfig = SinkhornConfig()
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -5,7 +5,6 @@ The iteration is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierd
 (patches), K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
 """
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -13,28 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.errors import InputError
-
-
-@dataclasses.dataclass(frozen=True)
-class SinkhornConfig:
-    """How the transport is solved.
-
-    SALAD's published setting: 3 iterations at regularisation 1.
-    """
-
-    iterations: int = 3
-    epsilon: float = 1.0
-    """Entropic regularisation: scores are divided by it."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if self.iterations < 1:
-            raise InputError(
-                f"SinkhornConfig.iterations: found {self.iterations}, expected at least 1"
-            )
-        if not self.epsilon > 0:
-            raise InputError(f"SinkhornConfig.epsilon: found {self.epsilon}, expected more than 0")
 
 
 class SinkhornResult(NamedTuple):
@@ -57,7 +36,7 @@ def append_dustbin(
 
 def log_marginals(
     rows: int, clusters: int, dtype: jnp.dtype | type = jnp.float32
-) -> tuple[Float[Array, " rows"], Float[Array, " clusters+1"]]:
+) -> tuple[Float[Array, " {rows}"], Float[Array, " {clusters}+1"]]:
     """SALAD's marginals, as logarithms: each row has mass 1, each cluster 1, the dustbin the rest.
 
     Raises:

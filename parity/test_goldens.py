@@ -15,13 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.config import AdapterConfig, CrossImageConfig, SaladConfig, ViTConfig
+from crisalad_jax.config import (
+    AdapterConfig,
+    CrossImageConfig,
+    SaladConfig,
+    SinkhornConfig,
+    ViTConfig,
+)
 from crisalad_jax.nn.cross_image import cross_image_encoder
 from crisalad_jax.nn.layers import layer_norm
 from crisalad_jax.nn.salad import join, salad, transport
 from crisalad_jax.nn.vit import NORM_EPSILON, Features, embed, grid_of, run_blocks
 from crisalad_jax.pytree import named_leaves
-from crisalad_jax.sinkhorn import SinkhornConfig, assign
+from crisalad_jax.sinkhorn import assign
 from parity.torch_names import encoder_from_torch, salad_from_torch, vit_from_torch
 
 GOLDENS = pathlib.Path(__file__).parent / "goldens"

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.sinkhorn import (
-    SinkhornConfig,
     append_dustbin,
     assign,
     log_marginals,

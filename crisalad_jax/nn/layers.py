@@ -13,24 +13,24 @@ from crisalad_jax.pytree import params
 class Linear:
     """Weights of `x @ weight + bias`; torch stores `weight` transposed."""
 
-    weight: Float[Array, "d_in d_out"]
-    bias: Float[Array, " d_out"] | None
+    weight: Float[Array, "*stack d_in d_out"]
+    bias: Float[Array, "*stack d_out"] | None
 
 
 @params
 class LayerNorm:
     """Gain and shift of a layer norm."""
 
-    weight: Float[Array, " dim"]
-    bias: Float[Array, " dim"]
+    weight: Float[Array, "*stack dim"]
+    bias: Float[Array, "*stack dim"]
 
 
 @params
 class DepthwiseConv:
     """One k x k filter a channel."""
 
-    weight: Float[Array, "k k dim"]
-    bias: Float[Array, " dim"]
+    weight: Float[Array, "*stack k k dim"]
+    bias: Float[Array, "*stack dim"]
 
 
 def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:

@@ -43,10 +43,10 @@ class Block:
 
     norm1: LayerNorm
     attn: Attention
-    ls1: Float[Array, " dim"]
+    ls1: Float[Array, "*stack dim"]
     norm2: LayerNorm
     mlp: Mlp | SwiGlu
-    ls2: Float[Array, " dim"]
+    ls2: Float[Array, "*stack dim"]
     adapter: Adapter | None
 
 
@@ -111,10 +111,10 @@ def _init_block(key: PRNGKeyArray, config: ViTConfig) -> Block:
     return Block(
         norm1=init_layer_norm(dim),
         attn=Attention(_init_linear(qkv, dim, 3 * dim), _init_linear(proj, dim, dim)),
-        ls1=jnp.full(dim, config.layer_scale_start),
+        ls1=jnp.full(dim, config.layer_scale_start, jnp.float32),
         norm2=init_layer_norm(dim),
         mlp=mlp,
-        ls2=jnp.full(dim, config.layer_scale_start),
+        ls2=jnp.full(dim, config.layer_scale_start, jnp.float32),
         adapter=None if config.adapter.kind == "none" else init_adapter(adapter_key, config),
     )
 
