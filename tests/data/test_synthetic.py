@@ -18,10 +18,10 @@ from crisalad_jax.data.synthetic import (
     SEASONS,
     SyntheticCityConfig,
     View,
-    _place_seed,
     render,
     write_synthetic_city,
 )
+from crisalad_jax.data.synthetic.city import place_seed
 from crisalad_jax.errors import InputError
 
 SMALL = SyntheticCityConfig(
@@ -162,8 +162,8 @@ def test_train_places_meet_every_season(city):
 
 def test_no_place_is_in_both_splits_or_twice():
     config = SyntheticCityConfig()
-    seeds = [_place_seed(config, 0, i) for i in range(config.train_places)]
-    seeds += [_place_seed(config, 1, i) for i in range(config.test_places)]
+    seeds = [place_seed(config, 0, i) for i in range(config.train_places)]
+    seeds += [place_seed(config, 1, i) for i in range(config.test_places)]
     assert len(set(seeds)) == config.train_places + config.test_places
     # And another seed is another place: the same view of each is another picture.
     assert len({render(seed, View(), (42, 56)).tobytes() for seed in seeds[::10]}) == 39
@@ -251,14 +251,35 @@ def test_progress_counts_every_image(tmp_path):
     assert calls == [(i, TOTAL) for i in range(1, TOTAL + 1)]
 
 
+# An error of the system's from the caller's own function must not pass for one of writing.
+@pytest.mark.parametrize("error", [RuntimeError("stopped"), OSError(5, "stopped")])
 @pytest.mark.parametrize("at", [3, TOTAL])
-def test_a_failure_midway_leaves_nothing(tmp_path, at):
+def test_a_failure_midway_is_passed_on_and_leaves_nothing(tmp_path, at, error):
     def fail(done: int, total: int) -> None:
         if done == at:
-            raise RuntimeError("stopped")
+            raise error
 
-    with pytest.raises(RuntimeError, match="stopped"):
+    with pytest.raises(type(error), match="stopped") as caught:
         write_synthetic_city(tmp_path / "city", SMALL, progress=fail)
+    assert caught.value is error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_where_nothing_can_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file/city: cannot write the city here: Not a dir"):
+        write_synthetic_city(tmp_path / "file" / "city", SMALL)
+
+
+def test_a_failure_to_write_midway_is_named_and_leaves_nothing(tmp_path):
+    def block(done: int, total: int) -> None:
+        # A file where the folder of the evaluation images is to be made.
+        if done == 1:
+            (folder,) = tmp_path.iterdir()
+            (folder / "test").write_text("")
+
+    with pytest.raises(InputError, match="city: cannot write the city here: Not a dir"):
+        write_synthetic_city(tmp_path / "city", SMALL, progress=block)
     assert list(tmp_path.iterdir()) == []
 
 
