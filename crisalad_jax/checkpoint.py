@@ -48,8 +48,8 @@ def load_weights(
 
     Raises:
         InputError: the file is missing, cut short or no such file; its parameters do not fit its
-            configuration (all that are missing, unknown or misshaped are listed); or its
-            configuration is not `expected` (all fields that differ are listed).
+            configuration or are not finite (all that are missing, unknown or wrong are listed); or
+            its configuration is not `expected` (all fields that differ are listed).
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -65,7 +65,11 @@ def load_weights(
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (safetensors.SafetensorError, OSError) as error:
         raise InputError(f"{path}: not a whole safetensors file: {error}") from error
-    config = from_plain(ModelConfig, json.loads(metadata["config"]), source=f"{path} (metadata)")
+    try:
+        plain = json.loads(metadata.get("config", ""))
+    except ValueError as error:
+        raise InputError(f"{path}: found no configuration in its metadata: {error}") from error
+    config = from_plain(ModelConfig, plain, source=f"{path} (metadata)")
     if expected is not None:
         same_size = expected.__class__(**{**vars(config), "image_size": expected.image_size})
         wrong = differences(same_size, expected)
@@ -76,17 +80,22 @@ def load_weights(
 
 def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:
     template = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
-    shapes = {name: leaf.shape for name, leaf in named_leaves(template).items()}
-    problems = [f"{name} missing" for name in shapes.keys() - found.keys()]
-    problems += [f"{name} unknown" for name in found.keys() - shapes.keys()]
-    problems += [
-        f"{name} found {found[name].shape}, expected {shape}"
-        for name, shape in shapes.items()
-        if name in found and found[name].shape != shape
-    ]
+    wanted = named_leaves(template)
+    problems = [f"{name} missing" for name in wanted.keys() - found.keys()]
+    problems += [f"{name} unknown" for name in found.keys() - wanted.keys()]
+    for name, leaf in wanted.items():
+        if name not in found:
+            continue
+        array = found[name]
+        if (array.dtype, array.shape) != (leaf.dtype, leaf.shape):
+            problems.append(
+                f"{name} found {array.dtype} {array.shape}, expected {leaf.dtype} {leaf.shape}"
+            )
+        elif not np.isfinite(array).all():
+            problems.append(f"{name} holds NaN or infinity")
     if problems:
         raise InputError(f"{path}: weights do not fit: {'; '.join(sorted(problems))}")
-    leaves = [jnp.asarray(found[name]) for name in shapes]
+    leaves = [jnp.asarray(found[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
@@ -136,7 +145,11 @@ class StateStore:
             raise InputError(
                 f"{self._manager.directory}: the saved state is not of this run: {error}"
             ) from error
-        leaves = [saved["state"].get(name, leaf) for name, leaf in named_leaves(template).items()]
+        # Through numpy, for arrays that orbax has bound to a device would compile the step anew.
+        leaves = [
+            jnp.asarray(np.asarray(saved["state"].get(name, leaf)))
+            for name, leaf in named_leaves(template).items()
+        ]
         return Saved(
             step, jax.tree.unflatten(jax.tree.structure(template), leaves), saved["record"]
         )

@@ -3,10 +3,12 @@
 Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 1 anything else.
 """
 
+import contextlib
 import dataclasses
+import io
 import pathlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any, Literal
 
 import jax
@@ -23,7 +25,7 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.demo import DemoConfig, run_demo
 from crisalad_jax.descriptors import writer_for
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import GROUPINGS, evaluate, group, read_tokens
+from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate, group, read_tokens
 from crisalad_jax.files import write_json
 from crisalad_jax.fit import fit, read_metrics
 from crisalad_jax.model import Crisalad, init_crisalad
@@ -31,7 +33,8 @@ from crisalad_jax.report import RecallRow, prediction_gallery, recall_table, tra
 from crisalad_jax.serial import read_config, to_plain
 from crisalad_jax.training import split_params
 
-_console = rich.console.Console()
+# Into a file or a pipe, wide enough that tables do not wrap.
+_console = rich.console.Console(width=None if sys.stdout.isatty() else 120)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,8 +161,7 @@ class Evaluate:
 
 def _evaluate(arguments: Evaluate) -> None:
     groupings = arguments.grouping.split(",")
-    for name in groupings:
-        choose("--grouping", name, GROUPINGS)
+    check_grouping(groupings, arguments.batch_size, arguments.seed)
     params, config, model_name = _model(
         arguments.weights, arguments.preset, arguments.image_size, arguments.seed
     )
@@ -240,9 +242,7 @@ class Extract:
 
 def _extract(arguments: Extract) -> None:
     write = writer_for(arguments.out)
-    choose("--grouping", arguments.grouping, GROUPINGS)
-    if arguments.batch_size < 1:
-        raise InputError(f"--batch-size: found {arguments.batch_size}, expected at least 1")
+    check_grouping([arguments.grouping], arguments.batch_size, arguments.seed)
     params, config, _ = _model(arguments.weights, "", arguments.image_size, arguments.seed)
     paths = list_images(arguments.images)
     folder = read_tokens(
@@ -381,7 +381,7 @@ def _resized(config: ModelConfig, image_size: tuple[int, int] | None) -> ModelCo
     return dataclasses.replace(config, image_size=image_size)
 
 
-def _grouping_words(groupings: Sequence[str]) -> str:
+def _grouping_words(groupings: Iterable[str]) -> str:
     return "; ".join(f"{name} = {GROUPINGS[name]}" for name in groupings)
 
 
@@ -411,6 +411,36 @@ def _flag(arguments: list[str], name: str) -> str | None:
     return None
 
 
+def _parse(kind: Any, given: list[str], options: dict[str, Any]) -> Any:
+    """The flags as an instance of `kind`; what tyro finds wrong, in a box, becomes one line."""
+    program = f"crisalad {given[0]}"
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(kind, prog=program, args=given[1:], **options)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        error: BaseException | None = stop
+        while error is not None and not isinstance(error, InputError):
+            error = error.__context__
+        reason = _unboxed(complaint.getvalue()) if error is None else str(error)
+        raise InputError(f"{reason} (see {program} --help)") from stop
+
+
+def _unboxed(box: str) -> str:
+    """The text of one of tyro's boxes, without its frame, the helptexts and the footer."""
+    sections = [[]]
+    for line in box.splitlines():
+        row = line.removeprefix("│ ").removesuffix("│").rstrip()
+        if line.startswith("│") and not row.strip("─ "):
+            sections.append([])
+        elif line.startswith("│") and not row.startswith(" " * 5):
+            sections[-1].append(row.strip())
+    texts = [" ".join(rows) for rows in sections]
+    return "; ".join(t for t in texts if t and not t.startswith(("Argument help", "For full")))
+
+
 def _usage() -> str:
     lines = ["usage: crisalad COMMAND [--help] ...", "", "commands:"]
     lines += [f"  {name:<10}{kind.__doc__}" for name, (kind, _) in _COMMANDS.items()]
@@ -432,12 +462,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options["default"] = Train(
                 data=tyro.MISSING, out=tyro.MISSING, settings=_train_defaults(given[1:])
             )
-        run(tyro.cli(kind, prog=f"crisalad {given[0]}", args=given[1:], **options))
+        run(_parse(kind, given, options))
     except InputError as error:
-        print(f"crisalad: {error}", file=sys.stderr)
+        print("crisalad:", *str(error).splitlines(), file=sys.stderr)
         return 2
-    except SystemExit as stop:  # from tyro: --help or arguments that do not parse
-        return stop.code if isinstance(stop.code, int) else 2
+    except SystemExit:  # from tyro, after --help
+        return 0
     except KeyboardInterrupt:
         print("crisalad: interrupted", file=sys.stderr)
         return 130

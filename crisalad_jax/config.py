@@ -90,6 +90,10 @@ class ViTConfig:
         """Check the ranges."""
         _require_positive(self, "dim", "depth", "heads", "mlp_ratio", "position_grid")
         _require(
+            self.registers >= 0,
+            f"ViTConfig.registers: found {self.registers}, expected at least 0",
+        )
+        _require(
             self.dim % self.heads == 0,
             f"ViTConfig.dim: found {self.dim}, expected a multiple of the {self.heads} heads",
         )

@@ -27,6 +27,19 @@ GROUPINGS = {
 """Which images look at each other in the cross-image encoder. Queries and database never mix."""
 
 
+def check_grouping(groupings: Sequence[str], batch_size: int, seed: int) -> None:
+    """Check how images are to be grouped, before the work of describing them.
+
+    Raises:
+        InputError: an unknown grouping, a batch of none, or a negative seed.
+    """
+    for grouping in groupings:
+        choose("grouping", grouping, GROUPINGS)
+    for name, value, least in (("batch size", batch_size, 1), ("seed", seed, 0)):
+        if value < least:
+            raise InputError(f"{name}: found {value}, expected at least {least}")
+
+
 class FolderTokens(NamedTuple):
     """Tokens of many images on the host (see `SaladTokens`), and which images could be read."""
 
@@ -82,9 +95,9 @@ def group(
     Images that could not be read are seen by none; their rows hold nothing of use.
 
     Raises:
-        InputError: no such grouping.
+        InputError: what `check_grouping` raises.
     """
-    choose("grouping", grouping, GROUPINGS)
+    check_grouping([grouping], batch_size, seed)
     count = len(folder.readable)
     order = np.random.default_rng(seed).permutation(count) if grouping == "shuffled" else None
     order = np.arange(count) if order is None else order
@@ -128,12 +141,9 @@ def evaluate(
     A model without a cross-image encoder has one result, `any`: no descriptor depends on a batch.
 
     Raises:
-        InputError: an image cannot be read, or there is no such grouping.
+        InputError: an image cannot be read, or what `check_grouping` raises.
     """
-    for grouping in groupings:
-        choose("grouping", grouping, GROUPINGS)
-    if batch_size < 1:
-        raise InputError(f"batch size: found {batch_size}, expected at least 1")
+    check_grouping(groupings, batch_size, seed)
 
     def tokens_of(paths: Sequence[pathlib.Path], label: str) -> FolderTokens:
         return read_tokens(

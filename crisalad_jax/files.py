@@ -19,9 +19,11 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     made as needed.
 
     Raises:
-        InputError: the folder cannot be made or written to.
+        InputError: the folder cannot be made, or `path` is a folder itself.
     """
     path = pathlib.Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: found a folder, expected a file or nothing yet")
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

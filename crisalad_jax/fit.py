@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -129,7 +130,7 @@ class _Run:
     def __init__(
         self, config: TrainConfig, places: Places, out: pathlib.Path, initial: Crisalad | None
     ) -> None:
-        # Raises for places that do not fit before anything is written.
+        # What does not fit raises before claim_run writes the first file.
         self.steps_per_epoch = len(
             epoch_batches(
                 places,
@@ -140,7 +141,6 @@ class _Run:
                 epoch=0,
             )
         )
-        claim_run(out, config)
         self.config, self.out = config, out
         self.steps = self.steps_per_epoch * config.epochs
         self.cache = ImageCache()
@@ -148,7 +148,10 @@ class _Run:
         self._schedule = learning_rate_schedule(config.optimiser, self.steps)
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         params = init_crisalad(init_key, config.model) if initial is None else initial
-        self.state, self._frozen = init_state(params, config.trains, self._compiled)
+        state, self._frozen = init_state(params, config.trains, self._compiled)
+        # A step takes over the buffers of its state; `initial` stays the caller's.
+        self.state = jax.tree.map(jnp.copy, state)
+        claim_run(out, config)
         self.store = StateStore(out / "state")
         self.record = _Record(frozen_checksum=_checksum(self._frozen))
         self.step = 0
@@ -168,6 +171,9 @@ class _Run:
 
     def take_step(self, batch: ImageBatch, epoch: int) -> str:
         """Train on a batch, log it, and say in a few words how it went."""
+        # Before the step: after an epoch's last one its validation still has to enter the state.
+        if time.monotonic() - self._saved_at > SAVE_SECONDS:
+            self.save()
         self.state, device_metrics = train_step(
             self.state,
             self._frozen,
@@ -200,8 +206,6 @@ class _Run:
                 "skipped_images": skipped,
             }
         )
-        if now - self._saved_at > SAVE_SECONDS:
-            self.save()
         note = f"loss {metrics['loss']:.3f}  b_acc {metrics['b_acc']:.2f}  {rate:.0f} images/s"
         if self.record.best_recall is not None:
             note += f"  best R@5 {100 * self.record.best_recall:.1f}"

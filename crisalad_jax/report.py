@@ -66,7 +66,8 @@ def recall_table(rows: Sequence[RecallRow], title: str | None = None) -> Table:
     header, body = _recall_cells(rows)
     table = Table(title=title, title_justify="left")
     for name in header:
-        table.add_column(name, justify="right" if name.startswith("R@") else "left")
+        justify = "right" if name.startswith("R@") else "left"
+        table.add_column(name, justify=justify, overflow="fold")
     for cells, following in zip(body, [*body[1:], None], strict=True):
         last = following is not None and following[0] != cells[0]
         # Text: square brackets in a name are no markup.

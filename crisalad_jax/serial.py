@@ -6,6 +6,8 @@ import pathlib
 from typing import Any, TypeVar
 
 import cattrs
+import cattrs.errors
+import cattrs.v
 
 from crisalad_jax.errors import InputError
 
@@ -25,12 +27,34 @@ def from_plain(kind: type[_T], value: Any, *, source: str) -> _T:
     Raises:
         InputError: naming `source`, an unknown field, or a value that does not fit.
     """
-    converter = cattrs.Converter(forbid_extra_keys=True)
+    if not isinstance(value, dict):
+        raise InputError(f"{source}: found {type(value).__name__}, expected an object of fields")
     try:
-        return converter.structure(value, kind)
+        return _CONVERTER.structure(value, kind)
     except cattrs.BaseValidationError as error:
-        reasons = "; ".join(cattrs.transform_error(error, path="config"))
+        reasons = "; ".join(cattrs.transform_error(error, "config", _reason))
         raise InputError(f"{source}: {reasons}") from error
+
+
+def _exactly(value: Any, kind: type) -> Any:
+    """A plain value of just this type, where cattrs would convert: 3.7 is no number of epochs."""
+    if type(value) is kind:
+        return value
+    if kind is float and type(value) is int:
+        return float(value)
+    raise InputError(f"found {value!r}, expected {kind.__name__}")
+
+
+def _reason(error: BaseException, kind: type | None) -> str:
+    # A configuration's own check, and what cattrs has no category for, say more than the category.
+    if isinstance(error, ValueError) or type(error) is cattrs.errors.CattrsError:
+        return str(error)
+    return cattrs.v.format_exception(error, kind)
+
+
+_CONVERTER = cattrs.Converter(forbid_extra_keys=True)
+for _kind in (bool, int, float, str):
+    _CONVERTER.register_structure_hook(_kind, _exactly)
 
 
 def read_config(kind: type[_T], path: pathlib.Path) -> _T:

@@ -185,7 +185,7 @@ def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -
 
 
 def _write_test(folder: pathlib.Path, config: SyntheticCityConfig) -> Iterator[None]:
-    """Database by day in spring and summer, queries by dusk and night in autumn and winter.
+    """Database by day in spring and summer, queries at all hours in autumn and winter.
 
     Yields after every image.
     """
@@ -290,4 +290,4 @@ def _database_view(rng: np.random.Generator) -> View:
 
 
 def _query_view(rng: np.random.Generator) -> View:
-    return _draw_view(rng, SEASONS[2 + rng.integers(2)], TIMES[1 + rng.integers(2)])
+    return _draw_view(rng, SEASONS[2 + rng.integers(2)], TIMES[rng.choice(3, p=(0.4, 0.4, 0.2))])

@@ -1,0 +1,160 @@
+"""A model and data sets so small that a training run takes a second, shared by the tests.
+
+All tests use the same shapes, so that each program is compiled once for the whole session.
+"""
+
+import csv
+import dataclasses
+import functools
+import pathlib
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoint import save_weights
+from crisalad_jax.config import (
+    CrossImageConfig,
+    ModelConfig,
+    MultiSimilarityConfig,
+    OptimiserConfig,
+    SaladConfig,
+    TrainConfig,
+    ViTConfig,
+)
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.places import COLUMNS, read_places
+from crisalad_jax.files import write_json
+from crisalad_jax.fit import fit
+from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.serial import to_plain
+
+MODEL = ModelConfig(
+    image_size=(42, 56),
+    backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),
+    salad=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
+    encoder=CrossImageConfig(heads=2, feedforward=16),
+)
+# Eight places make two batches of three an epoch: six steps in all. The dropouts of MODEL and the
+# light augmentation draw random numbers in every step.
+RECIPE = TrainConfig(
+    model=MODEL,
+    loss=MultiSimilarityConfig(base=0.5),
+    optimiser=OptimiserConfig(learning_rate=1e-3),
+    trains="all",
+    augment="light",
+    places_per_batch=3,
+    images_per_place=2,
+    min_images=2,
+    epochs=3,
+    patience=2,
+    seed=5,
+)
+STEPS = 6
+CITIES, PLACES_PER_CITY, IMAGES_PER_PLACE = ("Aston", "Brill"), 4, 3
+BATCH = 4
+"""Of evaluation: the town's seven database images and five queries leave a last batch unfilled."""
+
+
+def write_picture(path: pathlib.Path, seed: int, noise: float = 0.0) -> None:
+    """A smooth random picture; the same seed with noise is another view of the same place."""
+    generator = np.random.default_rng(seed)
+    coarse = generator.uniform(0, 255, (4, 5, 3)).astype(np.float32)
+    picture = cv2.resize(coarse, (70, 50), interpolation=cv2.INTER_CUBIC)
+    picture += generator.normal(0, noise, picture.shape)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.clip(picture, 0, 255).astype(np.uint8))
+
+
+def write_city(root: pathlib.Path) -> pathlib.Path:
+    """A training set in the layout of GSV-Cities."""
+    for city_number, city in enumerate(CITIES):
+        rows = []
+        for place in range(PLACES_PER_CITY):
+            for view in range(IMAGES_PER_PLACE):
+                rows.append([place, 2020, 5, view, city, "1.5", "2.5", "pano"])
+                name = f"{city}_{place:07d}_2020_05_{view:03d}_1.5_2.5_pano.jpg"
+                seed = 100 * city_number + place
+                write_picture(root / "Images" / city / name, seed, noise=10.0 * (1 + view))
+        (root / "Dataframes").mkdir(exist_ok=True)
+        with (root / "Dataframes" / f"{city}.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([COLUMNS, *rows])
+    return root
+
+
+def write_town(root: pathlib.Path) -> pathlib.Path:
+    """An evaluation set with @UTM names; the last query is far from everything."""
+    for part, eastings in (
+        ("database", [0, 40, 80, 120, 160, 200, 210]),
+        ("queries", [3, 45, 130, 205, 9000]),
+    ):
+        for east in eastings:
+            name = f"@{east:07.2f}@5000000.00@10@S@@@{part}@@@@@@@@.jpg"
+            seed = 500 + round(east / 40)
+            write_picture(root / "images" / "test" / part / name, seed, noise=20.0)
+    return root
+
+
+@pytest.fixture
+def city(tmp_path: pathlib.Path) -> pathlib.Path:
+    """A training set that a test may spoil."""
+    return write_city(tmp_path / "city")
+
+
+@pytest.fixture
+def town(tmp_path: pathlib.Path) -> pathlib.Path:
+    """An evaluation set that a test may spoil."""
+    return write_town(tmp_path / "town")
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """Files to read only: city/, town/, weights.safetensors, recipe.json."""
+    root = tmp_path_factory.mktemp("shared")
+    write_city(root / "city")
+    write_town(root / "town")
+    write_json(root / "recipe.json", to_plain(RECIPE))
+    save_weights(root / "weights.safetensors", random_params(MODEL), MODEL)
+    return root
+
+
+def random_params(config: ModelConfig) -> Crisalad:
+    """Parameters whose every number matters: an untrained model has zeros and ones."""
+    generator = np.random.default_rng(3)
+    template = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+    leaves = []
+    for name, leaf in named_leaves(template).items():
+        noise = generator.standard_normal(leaf.shape)
+        if name.endswith("bias"):
+            value = 0.1 * noise
+        elif leaf.ndim < 2 or ".norm" in name or ".ls" in name:  # scales
+            value = 1 + 0.1 * noise
+        else:
+            value = noise / np.sqrt(leaf.shape[-2])
+        leaves.append(jnp.asarray(value, leaf.dtype))
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+@pytest.fixture(scope="session")
+def params() -> Crisalad:
+    """The parameters in weights.safetensors."""
+    return random_params(MODEL)
+
+
+@pytest.fixture(scope="session")
+def benchmark(shared: pathlib.Path) -> Benchmark:
+    """The town, opened."""
+    return open_benchmark(shared / "town")
+
+
+@pytest.fixture(scope="session")
+def run(shared: pathlib.Path, params: Crisalad, benchmark: Benchmark) -> pathlib.Path:
+    """A finished run of RECIPE from `params`, never stopped early, to read only."""
+    places = read_places(shared / "city", min_images=2)
+    recipe = dataclasses.replace(RECIPE, patience=None)
+    out = shared / "run"
+    fit(recipe, places, out, validation=benchmark, initial=params, quiet=True)
+    return out

@@ -1,0 +1,180 @@
+"""Weights there and back bit for bit, files that are none of ours, and states to resume from."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import struct
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+
+import crisalad_jax
+from crisalad_jax.checkpoint import StateStore, load_weights, save_weights
+from crisalad_jax.config import PRESETS
+from crisalad_jax.errors import InputError
+from crisalad_jax.model import Crisalad
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.serial import to_plain
+from crisalad_jax.training import StepConfig, init_state
+from tests.conftest import MODEL, RECIPE, random_params
+
+WITHOUT_ENCODER = dataclasses.replace(MODEL, encoder=dataclasses.replace(MODEL.encoder, layers=0))
+REGISTERS = dataclasses.replace(
+    MODEL, backbone=dataclasses.replace(MODEL.backbone, registers=4, ffn="swiglu")
+)
+
+
+def assert_equal(found: Crisalad, expected: Crisalad) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for (name, a), b in zip(named_leaves(found).items(), jax.tree.leaves(expected), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+@pytest.mark.parametrize("config", [MODEL, WITHOUT_ENCODER, REGISTERS])
+def test_weights_survive_a_file_bit_for_bit(tmp_path, config):
+    params = random_params(config)
+    save_weights(tmp_path / "new" / "w.safetensors", params, config)
+    assert os.listdir(tmp_path / "new") == ["w.safetensors"]
+    found, found_config = load_weights(tmp_path / "new" / "w.safetensors")
+    assert found_config == config
+    assert_equal(found, params)
+
+
+def test_the_package_offers_both(tmp_path, params):
+    crisalad_jax.save(tmp_path / "w.safetensors", params, MODEL)
+    found, config = crisalad_jax.load(str(tmp_path / "w.safetensors"))
+    assert config == MODEL
+    assert_equal(found, params)
+
+
+def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
+    """Read by the format's own description: a length, a JSON header, the bytes."""
+    data = (shared / "weights.safetensors").read_bytes()
+    (length,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + length])
+    metadata = header.pop("__metadata__")
+    assert json.loads(metadata["config"]) == to_plain(MODEL)
+    assert header.keys() == named_leaves(params).keys()
+    entry = header["aggregator.score.fc1.weight"]
+    assert (entry["dtype"], entry["shape"]) == ("F32", [32, 16])
+    start, end = entry["data_offsets"]
+    values = np.frombuffer(data[8 + length + start : 8 + length + end], "<f4").reshape(32, 16)
+    np.testing.assert_array_equal(values, params.aggregator.score.fc1.weight)
+
+
+def test_the_image_size_is_free_and_nothing_else(shared):
+    path = shared / "weights.safetensors"
+    load_weights(path, expected=dataclasses.replace(MODEL, image_size=(56, 70)))
+    with pytest.raises(InputError, match=f"^{path}: these weights are of another model: ") as error:
+        load_weights(path, expected=PRESETS["tiny"])
+    assert "backbone.dim: found 32, expected 128" in str(error.value)
+    assert "salad.clusters: found 4, expected 16" in str(error.value)
+    assert "image_size" not in str(error.value)
+
+
+def rewrite(shared: pathlib.Path, path: pathlib.Path, change, metadata=None) -> None:
+    """The shared weights with changed arrays, or other metadata."""
+    arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
+    change(arrays)
+    ours = {"format": "crisalad-jax 1", "config": json.dumps(to_plain(MODEL))}
+    safetensors.numpy.save_file(arrays, path, metadata=ours if metadata is None else metadata)
+
+
+SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.pop(SCORE), [f"{SCORE} missing"]),
+        (lambda a: a.update(extra=np.zeros(2)), ["extra unknown"]),
+        (lambda a: a.update({SCORE: a[SCORE].T.copy()}), [SCORE, "(16, 32), expected", "(32, 16)"]),
+        (lambda a: a.update({SCORE: a[SCORE].astype("f8")}), ["float64", "expected float32"]),
+        (lambda a: a.update({DUST: np.float32(np.nan)[...]}), [f"{DUST} holds NaN or infinity"]),
+        (lambda a: (a.pop(SCORE), a.pop(DUST)), [f"{SCORE} missing", f"{DUST} missing"]),
+        (lambda a: a.clear(), ["backbone.norm.bias missing"]),
+    ],
+)
+def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words):
+    path = tmp_path / "w.safetensors"
+    rewrite(shared, path, change)
+    with pytest.raises(InputError, match=f"^{path}: weights do not fit: ") as error:
+        load_weights(path)
+    assert "\n" not in str(error.value)
+    for word in words:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "words"),
+    [
+        ({}, "found format None"),
+        ({"format": "pt"}, "found format 'pt'"),
+        ({"format": "crisalad-jax 1"}, "found no configuration in its metadata"),
+        ({"format": "crisalad-jax 1", "config": "{"}, "found no configuration in its metadata"),
+        ({"format": "crisalad-jax 1", "config": "[]"}, "found list"),
+        ({"format": "crisalad-jax 1", "config": '{"clusters": 3}'}, "clusters"),
+    ],
+)
+def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
+    path = tmp_path / "w.safetensors"
+    rewrite(shared, path, lambda arrays: None, metadata)
+    with pytest.raises(InputError, match=words) as error:
+        load_weights(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("length", [0, 5, 40, 5000, -1])
+def test_a_file_cut_short_is_refused(tmp_path, shared, length):
+    path = tmp_path / "w.safetensors"
+    path.write_bytes((shared / "weights.safetensors").read_bytes()[:length])
+    with pytest.raises(InputError, match=f"^{path}: not a whole safetensors file") as error:
+        load_weights(path)
+    assert "\n" not in str(error.value)
+
+
+def test_no_file_or_another_one_is_refused(tmp_path):
+    for path in (tmp_path, tmp_path / "none.safetensors"):
+        with pytest.raises(InputError, match=f"^{path}: found no such file"):
+            load_weights(path)
+    (tmp_path / "w.safetensors").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
+    with pytest.raises(InputError, match=r"w\.safetensors: not a whole safetensors file"):
+        load_weights(tmp_path / "w.safetensors")
+
+
+@pytest.fixture
+def state(params):
+    step = StepConfig(MODEL, RECIPE.loss, RECIPE.optimiser, 6)
+    return init_state(params, "adapters+head", step)[0]
+
+
+def test_a_state_survives_bit_for_bit_and_the_last_ones_stay(tmp_path, state):
+    store = StateStore(tmp_path / "state", keep=2)
+    assert store.load(state) is None
+    for step in (1, 2, 5):
+        moved = jax.tree.map(lambda leaf, step=step: leaf + step, state)
+        store.save(step, moved, {"best": 0.1 * step})
+    store.save(5, state, {"best": 9.0})  # there already: stays as it is
+    store.close()
+    assert sorted(os.listdir(tmp_path / "state")) == ["2", "5"]
+    again = StateStore(tmp_path / "state")
+    saved = again.load(state)
+    again.close()
+    assert saved is not None
+    assert (saved.step, saved.record) == (5, {"best": 0.5})
+    assert_equal(saved.state, jax.tree.map(lambda leaf: leaf + 5, state))
+
+
+def test_a_state_of_another_model_is_refused(tmp_path, state):
+    store = StateStore(tmp_path / "state")
+    store.save(1, state, {})
+    other = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, 2), leaf.dtype), state)
+    with pytest.raises(InputError, match=f"{tmp_path}/state: the saved state is not of this run"):
+        store.load(other)
+    store.close()

@@ -1,0 +1,177 @@
+"""Presets, recipes, and what a configuration refuses."""
+
+import dataclasses
+import re
+
+import pytest
+
+from crisalad_jax.config import (
+    PRESETS,
+    AdapterConfig,
+    CrossImageConfig,
+    LightAugmentConfig,
+    ModelConfig,
+    MultiSimilarityConfig,
+    OptimiserConfig,
+    RandAugmentConfig,
+    SaladConfig,
+    SinkhornConfig,
+    TrainConfig,
+    ViTConfig,
+    check_image_size,
+    choose,
+    recipe,
+)
+from crisalad_jax.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("preset", "dim", "depth", "heads", "hidden"),
+    # Oquab et al. 2023, table 17, and the public checkpoints' shapes: w12 of g14 is 2 x 4096.
+    [
+        ("s14", 384, 12, 6, 1536),
+        ("b14", 768, 12, 12, 3072),
+        ("l14", 1024, 24, 16, 4096),
+        ("g14", 1536, 40, 24, 4096),
+    ],
+)
+def test_presets_are_the_four_sizes_of_dinov2(preset, dim, depth, heads, hidden):
+    backbone = PRESETS[preset].backbone
+    assert (backbone.dim, backbone.depth, backbone.heads) == (dim, depth, heads)
+    assert backbone.hidden == hidden
+    assert PRESETS[preset].descriptor_dim == 8448
+
+
+def test_the_recipe_is_the_papers():
+    config = recipe("b14")  # section 4.2
+    assert config.optimiser.learning_rate == 6e-5
+    assert (config.places_per_batch, config.images_per_place) == (48, 4)
+    assert config.trains == "adapters+head"
+    assert config.model.image_size == (224, 224)
+    assert (config.loss.alpha, config.loss.beta, config.loss.epsilon) == (1.0, 50.0, 0.1)
+    assert config.augmentation == RandAugmentConfig(operations=3)
+
+
+def test_augmentation_is_the_one_named():
+    light = LightAugmentConfig(blur=3.0)
+    config = TrainConfig(augment="light", light_augment=light)
+    assert config.augmentation is light
+    assert TrainConfig(augment="none").augmentation is None
+
+
+def test_equal_configurations_name_one_program():
+    assert hash(recipe("tiny")) == hash(recipe("tiny"))
+    assert recipe("tiny").model == PRESETS["tiny"]
+
+
+def test_an_unknown_name_lists_the_known():
+    with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
+        recipe("b16")
+    with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
+        choose("colour", "", {"red": 1, "blue": 2})
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "nearest"),
+    [(224, 230, "224 x 224"), (99, 98, "98 x 98"), (1, 14, "14 x 14"), (0, 98, "14 x 98")],
+)
+def test_sides_are_multiples_of_14(height, width, nearest):
+    words = rf"found {height} x {width}, expected .* 14 \(nearest: {nearest}\)"
+    with pytest.raises(InputError, match=words):
+        check_image_size((height, width), 4)
+
+
+@pytest.mark.parametrize(
+    ("clusters", "side"), [(3, 28), (4, 42), (8, 42), (9, 56), (64, 126), (63, 112)]
+)
+def test_more_patches_than_clusters(clusters, side):
+    """The message's smallest square works, and the next smaller one does not."""
+    check_image_size((side, side), clusters)
+    smaller = side - 14
+    words = rf"{(smaller // 14) ** 2} patches for {clusters} clusters.*: {side} x {side}\)"
+    with pytest.raises(InputError, match=words):
+        check_image_size((smaller, smaller), clusters)
+
+
+def test_one_patch_more_than_clusters_is_enough():
+    check_image_size((14, 70), 4)
+    with pytest.raises(InputError, match="5 patches for 5 clusters"):
+        check_image_size((14, 70), 5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "words"),
+    [
+        (AdapterConfig, {"kind": "mlp"}, "AdapterConfig.kind: found 'mlp', expected one of"),
+        (AdapterConfig, {"kernel_size": 4}, "AdapterConfig.kernel_size: found 4, expected an odd"),
+        (AdapterConfig, {"bottleneck": 0.0}, "AdapterConfig.bottleneck: found 0.0"),
+        (ViTConfig, {"heads": 7}, "ViTConfig.dim: found 768, expected a multiple of the 7 heads"),
+        (ViTConfig, {"depth": 0}, "ViTConfig.depth: found 0, expected more than 0"),
+        (ViTConfig, {"registers": -1}, "ViTConfig.registers: found -1, expected at least 0"),
+        (ViTConfig, {"ffn": "glu"}, "ViTConfig.ffn: found 'glu'"),
+        (
+            ViTConfig,
+            {"dim": 6, "heads": 1, "position_start": "sincos"},
+            "ViTConfig.dim: found 6, expected a multiple of 4",
+        ),
+        (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
+        (SinkhornConfig, {"epsilon": -1.0}, "SinkhornConfig.epsilon: found -1.0"),
+        (SinkhornConfig, {"epsilon": float("nan")}, "SinkhornConfig.epsilon: found nan"),
+        (SaladConfig, {"dropout": 1.0}, "SaladConfig.dropout: found 1.0, expected .* less than 1"),
+        (SaladConfig, {"clusters": 0}, "SaladConfig.clusters: found 0"),
+        (CrossImageConfig, {"layers": -1}, "CrossImageConfig.layers: found -1"),
+        (CrossImageConfig, {"dropout": float("nan")}, "CrossImageConfig.dropout: found nan"),
+        (ModelConfig, {"compute_dtype": "float16"}, "ModelConfig.compute_dtype: found 'float16'"),
+        (ModelConfig, {"normalisation": "none"}, "ModelConfig.normalisation: found 'none'"),
+        (ModelConfig, {"image_size": (224, 225)}, "image size: found 224 x 225"),
+        (ModelConfig, {"image_size": (112, 112)}, "64 patches for 64 clusters"),
+        (
+            ModelConfig,
+            {"encoder": CrossImageConfig(heads=12)},
+            "SaladConfig.cluster_dim: found 128, expected a multiple of .* 12 heads",
+        ),
+        (
+            ModelConfig,
+            {"salad": SaladConfig(token_dim=200)},
+            "SaladConfig.token_dim: found 200, expected a multiple of cluster_dim 128",
+        ),
+        (MultiSimilarityConfig, {"beta": 0.0}, "MultiSimilarityConfig.beta: found 0.0"),
+        (MultiSimilarityConfig, {"epsilon": -0.1}, "MultiSimilarityConfig.epsilon: found -0.1"),
+        (RandAugmentConfig, {"magnitude": 31}, "RandAugmentConfig.magnitude: found 31"),
+        (RandAugmentConfig, {"operations": -1}, "RandAugmentConfig.operations: found -1"),
+        (LightAugmentConfig, {"crop": 1.0}, "LightAugmentConfig.crop: found 1.0"),
+        (LightAugmentConfig, {"grey": 1.1}, "LightAugmentConfig.grey: found 1.1"),
+        (LightAugmentConfig, {"blur": -1.0}, "LightAugmentConfig.blur: found -1.0"),
+        (OptimiserConfig, {"learning_rate": 0.0}, "OptimiserConfig.learning_rate: found 0.0"),
+        (OptimiserConfig, {"weight_decay": -1.0}, "OptimiserConfig.weight_decay: found -1.0"),
+        (OptimiserConfig, {"b2": 1.0}, "OptimiserConfig.b2: found 1.0"),
+        (OptimiserConfig, {"clip_norm": 0.0}, "OptimiserConfig.clip_norm: found 0.0"),
+        (TrainConfig, {"augment": "heavy"}, "TrainConfig.augment: found 'heavy'"),
+        (TrainConfig, {"batch_order": "any"}, "TrainConfig.batch_order: found 'any'"),
+        (TrainConfig, {"epochs": 0}, "TrainConfig.epochs: found 0"),
+        (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
+        (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, .*images_per_place .4"),
+        (TrainConfig, {"trains": "head"}, "TrainConfig.trains: found 'head', expected adapters"),
+        (TrainConfig, {"trains": "last--1-blocks+head"}, "TrainConfig.trains"),
+        (TrainConfig, {"patience": 0}, "TrainConfig.patience: found 0"),
+        (TrainConfig, {"seed": -1}, "TrainConfig.seed: found -1"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
+    with pytest.raises(InputError, match=words) as caught:
+        kind(**fields)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_model_without_adapters_cannot_train_them():
+    bare = ModelConfig(backbone=ViTConfig(adapter=AdapterConfig(kind="none")))
+    with pytest.raises(InputError, match=re.escape("found adapters+head for a model without")):
+        TrainConfig(model=bare)
+    assert TrainConfig(model=bare, trains="last-4-blocks+head").model is bare
+
+
+def test_without_an_encoder_its_widths_need_not_fit():
+    config = ModelConfig(encoder=CrossImageConfig(layers=0, heads=7))
+    assert config.descriptor_dim == 8448
+    with pytest.raises(InputError, match="7 heads"):
+        dataclasses.replace(config, encoder=CrossImageConfig(heads=7))

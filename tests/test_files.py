@@ -1,0 +1,65 @@
+"""Files appear whole or not at all."""
+
+import json
+import os
+import pathlib
+
+import pytest
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import atomic_path, write_json
+
+
+def test_the_file_appears_when_it_is_whole(tmp_path: pathlib.Path):
+    path = tmp_path / "new" / "folder" / "numbers.npy"
+    with atomic_path(path) as temporary:
+        assert temporary.suffix == ".npy"
+        assert temporary.parent == path.parent  # a rename within a folder is atomic
+        temporary.write_bytes(b"12")
+        assert not path.exists()
+    assert path.read_bytes() == b"12"
+    assert os.listdir(path.parent) == ["numbers.npy"]
+
+
+def test_an_error_leaves_the_old_file_and_no_other(tmp_path: pathlib.Path):
+    path = tmp_path / "numbers.npy"
+    path.write_bytes(b"old")
+
+    def fail() -> None:
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(b"half")
+            raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        fail()
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["numbers.npy"]
+
+
+def test_two_writers_do_not_share_a_temporary_file(tmp_path: pathlib.Path):
+    path = tmp_path / "numbers.txt"
+    with atomic_path(path) as first, atomic_path(path) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    assert path.read_text() == "first"  # the last to finish
+
+
+def test_a_folder_that_cannot_be_made_or_is_in_the_way_is_named(tmp_path: pathlib.Path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(InputError, match=f"^{tmp_path}/file: cannot make this folder"):
+        write_json(tmp_path / "file" / "x.json", {})
+    with pytest.raises(InputError, match=f"^{tmp_path}/taken: found a folder"):
+        write_json(tmp_path / "taken", {})
+    assert sorted(os.listdir(tmp_path)) == ["file", "taken"]
+
+
+def test_json_is_written_whole_or_not_at_all(tmp_path: pathlib.Path):
+    path = tmp_path / "x.json"
+    write_json(path, {"a": [1, 2.5, None]})
+    assert json.loads(path.read_text()) == {"a": [1, 2.5, None]}
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert json.loads(path.read_text()) == {"a": [1, 2.5, None]}
+    assert os.listdir(tmp_path) == ["x.json"]

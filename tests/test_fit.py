@@ -1,0 +1,326 @@
+"""A run and its files: resumed bit for bit, stopped early, stopped by NaN, claimed by one run."""
+
+import dataclasses
+import json
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+
+import crisalad_jax.fit
+from crisalad_jax.checkpoint import load_weights
+from crisalad_jax.config import TrainConfig
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.errors import InputError
+from crisalad_jax.evaluation import GroupingResult, evaluate
+from crisalad_jax.fit import FitResult, MetricsLog, claim_run, fit, read_metrics
+from crisalad_jax.model import Crisalad
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.retrieval import Neighbours
+from crisalad_jax.serial import read_config
+from crisalad_jax.training import Metrics, train_step
+from tests.conftest import RECIPE, STEPS
+
+ENDLESS = dataclasses.replace(RECIPE, patience=None)
+
+
+class Interrupted(Exception):
+    """Stands for a kill: nothing is saved on its way out."""
+
+
+@pytest.fixture(scope="module")
+def places(shared: pathlib.Path) -> Places:
+    return read_places(shared / "city", min_images=2)
+
+
+def metrics_of(out: pathlib.Path) -> list[dict]:
+    """All that a run logs, except for its speed."""
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k != "images_per_second"} for line in lines]
+
+
+def assert_same_params(found: Crisalad, expected: Crisalad) -> None:
+    found_leaves, expected_leaves = named_leaves(found), named_leaves(expected)
+    assert found_leaves.keys() == expected_leaves.keys()
+    for name, leaf in found_leaves.items():
+        np.testing.assert_array_equal(leaf, expected_leaves[name], err_msg=name)
+
+
+def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
+    assert metrics_of(found) == metrics_of(expected)
+    for name in ("last.safetensors", "best.safetensors"):
+        assert_same_params(load_weights(found / name)[0], load_weights(expected / name)[0])
+
+
+def fail_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> None:
+    """Let the given call, counted from 1, of a function that `fit` uses end the process."""
+    function = getattr(crisalad_jax.fit, name)
+    calls = []
+
+    def counted(*args, **kwargs):
+        calls.append(None)
+        if len(calls) == call:
+            raise Interrupted
+        return function(*args, **kwargs)
+
+    monkeypatch.setattr(crisalad_jax.fit, name, counted)
+
+
+def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
+    assert {path.name for path in run.iterdir()} == {
+        "config.json",
+        "metrics.jsonl",
+        "state",
+        "last.safetensors",
+        "best.safetensors",
+    }
+    assert read_config(TrainConfig, run / "config.json") == ENDLESS
+    lines = metrics_of(run)
+    steps = [line for line in lines if "loss" in line]
+    assert [(line["step"], line["epoch"]) for line in steps] == [
+        (1, 0),
+        (2, 0),
+        (3, 1),
+        (4, 1),
+        (5, 2),
+        (6, 2),
+    ]
+    # Linear from 1e-3 to 0 over six steps; float32 keeps seven digits.
+    np.testing.assert_allclose(
+        [line["learning_rate"] for line in steps], 1e-3 * (1 - np.arange(6) / 6), rtol=1e-6
+    )
+    validations = [line for line in lines if "R@5" in line]
+    assert [(line["step"], line["epoch"]) for line in validations] == [(2, 1), (4, 2), (6, 3)]
+    params, config = load_weights(run / "last.safetensors")
+    (result,) = evaluate(params, config, benchmark, groupings=("single",), quiet=True)
+    assert validations[-1] == {
+        "step": 6,
+        "epoch": 3,
+        **{f"R@{k}": recall for k, recall in result.recalls.items()},
+    }
+
+
+def test_training_changes_every_parameter_and_leaves_the_initial_ones_to_the_caller(
+    run: pathlib.Path, params: Crisalad
+):
+    trained, _ = load_weights(run / "last.safetensors")
+    before, after = named_leaves(params), named_leaves(trained)
+    for name, leaf in before.items():
+        assert not leaf.is_deleted()
+        # Neither has a gradient (see `Salad`), and decay leaves a score that moves by < 1e-4.
+        if leaf.size and not name.endswith("dust_bin"):
+            assert not np.array_equal(leaf, after[name]), name
+
+
+@pytest.mark.parametrize(
+    ("function", "call", "saved_step"),
+    [
+        ("train_step", 4, 3),
+        # The last step of an epoch is done, its validation is not: the state in hand must not be
+        # one that would go on without it.
+        ("evaluate", 2, 3),
+        ("save_weights", 6, 2),  # after the weights, before the state
+    ],
+)
+def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
+    tmp_path, places, params, benchmark, run, monkeypatch, function, call, saved_step
+):
+    def go() -> FitResult:
+        return fit(
+            ENDLESS, places, tmp_path / "run", validation=benchmark, initial=params, quiet=True
+        )
+
+    with monkeypatch.context() as patch:
+        patch.setattr(crisalad_jax.fit, "SAVE_SECONDS", -1.0)
+        fail_at(patch, function, call)
+        with pytest.raises(Interrupted):
+            go()
+    assert max(int(p.name) for p in (tmp_path / "run" / "state").iterdir()) == saved_step
+    result = go()
+    assert_same_run(tmp_path / "run", run)
+    assert result.steps == STEPS
+    assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
+
+
+def test_a_finished_run_is_not_trained_further(tmp_path, places, params, benchmark, monkeypatch):
+    result = fit(RECIPE, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    files = {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
+    fail_at(monkeypatch, "train_step", 1)
+    fail_at(monkeypatch, "evaluate", 1)
+    again = fit(RECIPE, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert again[1:] == result[1:]
+    assert_same_params(again.params, result.params)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == files
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, recalls_at_5: list[float]) -> list[Crisalad]:
+    """Validations that find these recalls; returned: the parameters that each was asked about."""
+    seen = []
+
+    def fake(params, config, benchmark, *, groupings, cache, quiet):
+        assert groupings == ("single",)
+        seen.append(jax.device_get(params))
+        recall = recalls_at_5[len(seen) - 1]
+        neighbours = Neighbours(np.zeros((1, 1), np.int64), np.zeros((1, 1), np.float32))
+        return [GroupingResult("single", {1: 1 - recall, 5: recall, 10: 1.0}, neighbours)]
+
+    monkeypatch.setattr(crisalad_jax.fit, "evaluate", fake)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("found", "validations", "best", "stopped"),
+    [
+        ([0.5, 0.4, 0.5], 3, 0, True),  # equal is not better
+        ([0.5, 0.6, 0.55], 3, 1, False),
+        ([0.5, 0.4, 0.6], 3, 2, False),  # gain starts the count again
+    ],
+)
+def test_early_stop_and_best_weights(
+    tmp_path, places, params, benchmark, monkeypatch, found, validations, best, stopped
+):
+    seen = scripted(monkeypatch, found)
+    result = fit(RECIPE, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert len(seen) == validations
+    assert result.stopped_early == stopped
+    assert result.best_recall == found[best]
+    assert_same_params(load_weights(tmp_path / "best.safetensors")[0], seen[best])
+    assert_same_params(load_weights(tmp_path / "last.safetensors")[0], seen[-1])
+
+
+def test_early_stop_ends_training_and_stays_so(tmp_path, places, params, benchmark, monkeypatch):
+    impatient = dataclasses.replace(RECIPE, patience=1)
+    scripted(monkeypatch, [0.5, 0.5])
+    result = fit(impatient, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert (result.steps, result.stopped_early) == (4, True)
+    again = fit(impatient, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert (again.steps, again.stopped_early) == (4, True)
+    assert [line["step"] for line in metrics_of(tmp_path) if "loss" in line] == [1, 2, 3, 4]
+
+
+def test_validations_come_every_so_many_epochs_and_at_the_end(
+    tmp_path, places, params, benchmark, monkeypatch
+):
+    seen = scripted(monkeypatch, [0.5, 0.5])
+    config = dataclasses.replace(RECIPE, validate_every=2)
+    fit(config, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert [line["epoch"] for line in metrics_of(tmp_path) if "R@5" in line] == [2, 3]
+    assert len(seen) == 2
+
+
+def test_without_validation_there_is_no_best(tmp_path, places, params):
+    result = fit(RECIPE, places, tmp_path, initial=params, quiet=True)
+    assert (result.steps, result.best_recall, result.stopped_early) == (STEPS, None, False)
+    assert not (tmp_path / "best.safetensors").exists()
+
+
+def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
+    tmp_path, places, params, monkeypatch
+):
+    good = []
+
+    def step(state, *args):
+        if len(good) == 3:
+            return state, Metrics(*map(np.float32, (np.nan, 0.0, 1.0)))
+        state, metrics = train_step(state, *args)
+        good.append(jax.device_get(state.trainable))
+        return state, metrics
+
+    with monkeypatch.context() as patch:
+        patch.setattr(crisalad_jax.fit, "train_step", step)
+        with pytest.raises(InputError, match=r"loss nan.* at step 4,.* after step 3 is kept"):
+            fit(RECIPE, places, tmp_path, initial=params, quiet=True)
+    assert [line["step"] for line in metrics_of(tmp_path)] == [1, 2, 3]
+    assert_same_params(load_weights(tmp_path / "last.safetensors")[0], good[-1])
+    # The state is whole: the run goes on from it.
+    assert fit(RECIPE, places, tmp_path, initial=params, quiet=True).steps == STEPS
+
+
+def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, params):
+    places = read_places(city, min_images=2)
+    bad = np.arange(0, len(places.files), 5)
+    for image in bad:
+        places.path(image).write_bytes(b"")
+    drawn = [
+        epoch_batches(
+            places, places_per_batch=3, images_per_place=2, order="within-city", seed=5, epoch=epoch
+        )
+        for epoch in range(3)
+    ]
+    expected = np.isin(np.concatenate(drawn).reshape(STEPS, 6), bad).sum(axis=1)
+    assert expected.sum() > 0
+    result = fit(RECIPE, places, tmp_path / "run", initial=params, on_bad_image="skip", quiet=True)
+    assert result.skipped_images == expected.sum()
+    assert [line["skipped_images"] for line in metrics_of(tmp_path / "run")] == expected.tolist()
+    assert (
+        fit(
+            RECIPE, places, tmp_path / "run", initial=params, on_bad_image="skip", quiet=True
+        ).skipped_images
+        == expected.sum()
+    )
+
+
+def test_a_skipped_image_has_no_influence(tmp_path, city, params):
+    """Which bytes an unreadable file holds must not show in the weights."""
+    places = read_places(city, min_images=2)
+    runs = []
+    for content in (b"", b"not an image"):
+        for image in range(0, len(places.files), 5):
+            places.path(image).write_bytes(content)
+        out = tmp_path / f"run{len(content)}"
+        fit(RECIPE, places, out, initial=params, on_bad_image="skip", quiet=True)
+        runs.append(load_weights(out / "last.safetensors")[0])
+    assert_same_params(*runs)
+
+
+def test_what_does_not_fit_is_found_before_anything_is_written(tmp_path, places, params):
+    for change, words in (
+        ({"trains": "last-3-blocks+head"}, "last 3 blocks"),
+        ({"places_per_batch": 9}, "8 places"),
+        ({"images_per_place": 4, "min_images": 4}, "images_per_place 4"),
+    ):
+        config = dataclasses.replace(RECIPE, **change)
+        with pytest.raises(InputError, match=words):
+            fit(config, places, tmp_path / "run", initial=params, quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_gone_on_with_only_from_the_same_frozen_weights(tmp_path, places, params):
+    config = dataclasses.replace(RECIPE, trains="adapters+head")
+    run = crisalad_jax.fit._Run(config, places, tmp_path, params)
+    run.save()
+    run.store.close()
+    other = jax.tree.map(lambda leaf: leaf + 1, params)
+    with pytest.raises(InputError, match=f"{tmp_path}: the run started from other weights"):
+        crisalad_jax.fit._Run(config, places, tmp_path, other)
+
+
+def test_a_folder_belongs_to_one_configuration(tmp_path):
+    claim_run(tmp_path / "new" / "run", RECIPE)
+    claim_run(tmp_path / "new" / "run", RECIPE)
+    with pytest.raises(InputError, match=r"seed: found 6, expected 5.*another folder"):
+        claim_run(tmp_path / "new" / "run", dataclasses.replace(RECIPE, seed=6))
+
+
+def test_a_folder_of_other_files_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("words")
+    with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
+        claim_run(tmp_path, RECIPE)
+    with pytest.raises(InputError, match=r"thesis\.tex: found files but no run"):
+        claim_run(tmp_path / "thesis.tex", RECIPE)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_the_log_drops_what_will_be_repeated_and_a_line_cut_off(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 1}\n{"step": 2}\n{"step": 2, "R@5": 0.5}\n{"step": 3}\n{"st')
+    log = MetricsLog(path, keep_up_to=2)
+    log.write({"step": 3, "loss": 0.1})
+    assert read_metrics(path) == [
+        {"step": 1},
+        {"step": 2},
+        {"step": 2, "R@5": 0.5},
+        {"step": 3, "loss": 0.1},
+    ]
