@@ -431,11 +431,12 @@ def _parse(kind: Any, given: list[str], options: dict[str, Any]) -> Any:
 def _unboxed(box: str) -> str:
     """The text of one of tyro's boxes, without its frame, the helptexts and the footer."""
     sections = [[]]
-    for line in box.splitlines():
-        row = line.removeprefix("│ ").removesuffix("│").rstrip()
-        if line.startswith("│") and not row.strip("─ "):
+    # The title goes; the frame is of spaces and hyphens where stdout is not known to take UTF-8.
+    for line in box.splitlines()[1:]:
+        row = line[2:].rstrip("│ ")
+        if not row.strip("─╯-"):
             sections.append([])
-        elif line.startswith("│") and not row.startswith(" " * 5):
+        elif not row.startswith(" " * 5):
             sections[-1].append(row.strip())
     texts = [" ".join(rows) for rows in sections]
     return "; ".join(t for t in texts if t and not t.startswith(("Argument help", "For full")))

@@ -62,8 +62,8 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
     )
     images = city.train_places * city.images_per_place
     images += city.test_places * (city.database_per_place + city.queries_per_place)
-    with progress_bar("rendering the city", images, "images", quiet=quiet) as advance:
-        write_synthetic_city(out / "city", city, progress=lambda done, total: advance(1))
+    with progress_bar("rendering the city", images, "images", quiet=quiet) as bar:
+        write_synthetic_city(out / "city", city, progress=lambda done, total: bar.advance(1))
     benchmark = open_benchmark(out / "city" / "test")
     places = read_places(out / "city" / "train")
 

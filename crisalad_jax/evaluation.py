@@ -72,12 +72,12 @@ def read_tokens(
         on_bad_image=on_bad_image,
         cache=cache,
     )
-    with progress_bar(label, len(paths), "images", quiet=quiet) as advance:
+    with progress_bar(label, len(paths), "images", quiet=quiet) as bar:
         for batch in batches:
             used = int((batch.indices >= 0).sum())
             tokens = jax.device_get(tokenise(params, batch.images, config))
             parts.append(tuple(leaf[:used] for leaf in (*tokens, batch.valid)))
-            advance(used)
+            bar.advance(used)
     return FolderTokens(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
 
 

@@ -92,7 +92,7 @@ def fit(
             state before that step is saved).
     """
     run = _Run(config, places, out, initial)
-    with progress_bar("training", run.steps, "steps", quiet=quiet, done=run.step) as advance:
+    with progress_bar("training", run.steps, "steps", quiet=quiet, done=run.step) as bar:
         while run.step < run.steps and not run.record.stopped_early:
             epoch, start_step = divmod(run.step, run.steps_per_epoch)
             batches = training_batches(
@@ -109,12 +109,12 @@ def fit(
                 cache=run.cache,
             )
             for batch in batches:
-                advance(1, note=run.take_step(batch, epoch))
+                bar.advance(1, note=run.take_step(batch, epoch))
             ended = epoch + 1
             if validation is not None and (
                 ended % config.validate_every == 0 or ended == config.epochs
             ):
-                run.validate(validation, ended)
+                bar.say(run.validate(validation, ended))
                 run.save()
     run.save()
     run.store.close()
@@ -211,8 +211,8 @@ class _Run:
             note += f"  best R@5 {100 * self.record.best_recall:.1f}"
         return note
 
-    def validate(self, benchmark: Benchmark, epoch: int) -> None:
-        """Log the recalls, keep the best weights, and decide on stopping early."""
+    def validate(self, benchmark: Benchmark, epoch: int) -> str:
+        """Log the recalls, keep the best weights, decide on an early stop; the recalls in words."""
         params, record = self.params(), self.record
         (result,) = evaluate(
             params,
@@ -232,6 +232,8 @@ class _Run:
         patience = self.config.patience
         record.stopped_early = patience is not None and record.without_gain >= patience
         self._stepped_at = time.monotonic()
+        words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
+        return f"epoch {epoch}, step {self.step}: {words}"
 
     def save(self) -> None:
         """Write the weights and the resumable state."""

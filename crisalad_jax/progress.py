@@ -1,21 +1,36 @@
 """Progress on the terminal: a bar with rate and time left, on stderr, silent when asked."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import rich.console
 import rich.progress
 
 
-@contextlib.contextmanager
-def progress_bar(
-    label: str, total: int, unit: str, *, quiet: bool, done: int = 0
-) -> Iterator[Callable[..., None]]:
-    """Yield `advance(count, note="")`; the bar shows share, rate in `unit`/s and time left.
+class Bar:
+    """A running bar."""
 
-    `done` units of `total` were done before, and do not count for the rate.
+    def __init__(self, progress: rich.progress.Progress, task: rich.progress.TaskID) -> None:
+        """See `progress_bar`."""
+        self._progress, self._task = progress, task
+
+    def advance(self, count: int, note: str = "") -> None:
+        """Move on by `count` units, and show a few words behind the bar."""
+        self._progress.update(self._task, advance=count, note=note)
+
+    def say(self, line: str) -> None:
+        """Print a line that stays, above the bar."""
+        if not self._progress.disable:
+            self._progress.console.print(line, soft_wrap=True, highlight=False)
+
+
+@contextlib.contextmanager
+def progress_bar(label: str, total: int, unit: str, *, quiet: bool, done: int = 0) -> Iterator[Bar]:
+    """Show share, rate in `unit`/s and time left of work of `total` units while the block runs.
+
+    `done` of the units were done before, and do not count for the rate.
     """
-    bar = rich.progress.Progress(
+    progress = rich.progress.Progress(
         rich.progress.TextColumn("{task.description}"),
         rich.progress.BarColumn(bar_width=28),
         rich.progress.TaskProgressColumn(),
@@ -26,13 +41,8 @@ def progress_bar(
         console=rich.console.Console(stderr=True),
         disable=quiet,
     )
-    with bar:
-        task = bar.add_task(label, total=total, completed=done, note="")
-
-        def advance(count: int, note: str = "") -> None:
-            bar.update(task, advance=count, note=note)
-
-        yield advance
+    with progress:
+        yield Bar(progress, progress.add_task(label, total=total, completed=done, note=""))
 
 
 class _RateColumn(rich.progress.ProgressColumn):
