@@ -26,7 +26,7 @@ from crisalad_jax.demo import DemoConfig, run_demo
 from crisalad_jax.descriptors import writer_for
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate, group, read_tokens
-from crisalad_jax.files import write_json
+from crisalad_jax.files import check_target, write_json
 from crisalad_jax.fit import fit, read_metrics
 from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.report import RecallRow, prediction_gallery, recall_table, training_curves
@@ -160,7 +160,9 @@ class Evaluate:
 
 
 def _evaluate(arguments: Evaluate) -> None:
-    groupings = arguments.grouping.split(",")
+    groupings = list(dict.fromkeys(arguments.grouping.split(",")))
+    if arguments.json is not None:
+        check_target(arguments.json)
     check_grouping(groupings, arguments.batch_size, arguments.seed)
     params, config, model_name = _model(
         arguments.weights, arguments.preset, arguments.image_size, arguments.seed
@@ -242,6 +244,7 @@ class Extract:
 
 def _extract(arguments: Extract) -> None:
     write = writer_for(arguments.out)
+    check_target(arguments.out)
     check_grouping([arguments.grouping], arguments.batch_size, arguments.seed)
     params, config, _ = _model(arguments.weights, "", arguments.image_size, arguments.seed)
     paths = list_images(arguments.images)
@@ -307,6 +310,7 @@ class Info:
 
 
 def _info(arguments: Info) -> None:
+    check_grouping((), arguments.batch_size, seed=0)
     if arguments.weights is not None:
         _, config = load_weights(arguments.weights)
         title = str(arguments.weights)
@@ -428,6 +432,10 @@ def _parse(kind: Any, given: list[str], options: dict[str, Any]) -> Any:
         raise InputError(f"{reason} (see {program} --help)") from stop
 
 
+# How the parts of tyro's boxes begin that say no more than the first.
+_ASIDES = ("Argument help", "Got errors", "For full")
+
+
 def _unboxed(box: str) -> str:
     """The text of one of tyro's boxes, without its frame, the helptexts and the footer."""
     sections = [[]]
@@ -439,7 +447,7 @@ def _unboxed(box: str) -> str:
         elif not row.startswith(" " * 5):
             sections[-1].append(row.strip())
     texts = [" ".join(rows) for rows in sections]
-    return "; ".join(t for t in texts if t and not t.startswith(("Argument help", "For full")))
+    return "; ".join(t for t in texts if t and not t.startswith(_ASIDES))
 
 
 def _usage() -> str:

@@ -11,12 +11,10 @@ from typing import Any
 from crisalad_jax.errors import InputError
 
 
-@contextlib.contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
-    """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any error.
+def check_target(path: str | os.PathLike[str]) -> None:
+    """Check that a file can stand at `path`, before the work whose result it is to hold.
 
-    The temporary name keeps the suffix, for writers that choose a format by it. Parent folders are
-    made as needed.
+    Parent folders are made as needed.
 
     Raises:
         InputError: the folder cannot be made, or `path` is a folder itself.
@@ -24,11 +22,24 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     path = pathlib.Path(path)
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file or nothing yet")
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path.parent}: cannot make this folder: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any error.
+
+    The temporary name keeps the suffix, for writers that choose a format by it.
+
+    Raises:
+        InputError: what `check_target` raises.
+    """
+    path = pathlib.Path(path)
+    check_target(path)
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)

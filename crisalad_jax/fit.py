@@ -171,6 +171,11 @@ class _Run:
 
     def take_step(self, batch: ImageBatch, epoch: int) -> str:
         """Train on a batch, log it, and say in a few words how it went."""
+        if not batch.valid.any():
+            raise InputError(
+                f"training: found none of the {len(batch.valid)} images of step {self.step + 1} "
+                "readable, expected at least one"
+            )
         # Before the step: after an epoch's last one its validation still has to enter the state.
         if time.monotonic() - self._saved_at > SAVE_SECONDS:
             self.save()
@@ -283,9 +288,16 @@ def _line(values: Mapping[str, float]) -> str:
 
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
-    """The lines of a metrics file; a last line that was cut off by a kill is left out."""
-    lines = path.read_text(encoding="utf-8").split("\n")
-    return [json.loads(line) for line in lines[:-1]]
+    """The lines of a metrics file; a last line that was cut off by a kill is left out.
+
+    Raises:
+        InputError: the file is missing, or a line is no JSON.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").split("\n")
+        return [json.loads(line) for line in lines[:-1]]
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read this log of a run: {error}") from error
 
 
 def _words(metrics: Mapping[str, float]) -> str:

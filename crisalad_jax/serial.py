@@ -45,6 +45,13 @@ def _exactly(value: Any, kind: type) -> Any:
     raise InputError(f"found {value!r}, expected {kind.__name__}")
 
 
+def _names(value: Any, _: type) -> tuple[str, ...]:
+    """A list of names; a string is no list of its letters."""
+    if not isinstance(value, list):
+        raise InputError(f"found {value!r}, expected a list of names")
+    return tuple(_exactly(name, str) for name in value)
+
+
 def _reason(error: BaseException, kind: type | None) -> str:
     # A configuration's own check, and what cattrs has no category for, say more than the category.
     if isinstance(error, ValueError) or type(error) is cattrs.errors.CattrsError:
@@ -55,6 +62,7 @@ def _reason(error: BaseException, kind: type | None) -> str:
 _CONVERTER = cattrs.Converter(forbid_extra_keys=True)
 for _kind in (bool, int, float, str):
     _CONVERTER.register_structure_hook(_kind, _exactly)
+_CONVERTER.register_structure_hook(tuple[str, ...], _names)
 
 
 def read_config(kind: type[_T], path: pathlib.Path) -> _T:

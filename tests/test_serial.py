@@ -55,6 +55,7 @@ def test_fields_left_out_take_their_defaults():
         ({"epochs": 0}, ["epochs", "expected more than 0"]),
         ({"seed": True}, ["True", "expected int", "config.seed"]),
         ({"patience": "x"}, ["'x'", "config.patience"]),
+        ({"cities": "Rome"}, ["'Rome'", "list of names", "config.cities"]),
         ({"loss": {"library_quirk": "no"}}, ["'no'", "expected bool", "library_quirk"]),
         ({"epochs": 0.5, "seed": "1"}, ["config.epochs", "config.seed"]),
         ([], ["list"]),
