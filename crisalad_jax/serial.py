@@ -62,7 +62,7 @@ def _reason(error: BaseException, kind: type | None) -> str:
 _CONVERTER = cattrs.Converter(forbid_extra_keys=True)
 for _kind in (bool, int, float, str):
     _CONVERTER.register_structure_hook(_kind, _exactly)
-_CONVERTER.register_structure_hook(tuple[str, ...], _names)
+_CONVERTER.register_structure_hook_func(lambda kind: kind == tuple[str, ...], _names)
 
 
 def read_config(kind: type[_T], path: pathlib.Path) -> _T:
