@@ -31,7 +31,7 @@ MODEL = dataclasses.replace(
     encoder=dataclasses.replace(CONFIG.encoder, dropout=0.0),
 )
 STEP = StepConfig(MODEL, MultiSimilarityConfig(base=0.5), OptimiserConfig(learning_rate=1e-3), 10)
-LABELS = np.array([0, 0, 1, 1, 2, 2])
+LABELS = jnp.array([0, 0, 1, 1, 2, 2])
 VALID = np.ones(6, bool)
 
 
