@@ -1,5 +1,6 @@
 """Files of weights (safetensors, configuration inside) and the state that a run resumes from."""
 
+import dataclasses
 import functools
 import json
 import os
@@ -22,6 +23,7 @@ from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import differences, from_plain, to_plain
 
 FORMAT = "crisalad-jax 1"
+"""The one key of a weight file's metadata; its value is the configuration as JSON."""
 
 
 def save_weights(path: str | os.PathLike[str], params: Crisalad, config: ModelConfig) -> None:
@@ -31,7 +33,7 @@ def save_weights(path: str | os.PathLike[str], params: Crisalad, config: ModelCo
         InputError: the folder cannot be made.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
-    metadata = {"format": FORMAT, "config": json.dumps(to_plain(config))}
+    metadata = {FORMAT: json.dumps(to_plain(config))}
     with atomic_path(path) as temporary:
         safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
 
@@ -43,8 +45,8 @@ def load_weights(
 
     Args:
         path: the file.
-        expected: if given, the configuration that the file must have, except for the image size,
-            which parameters do not depend on.
+        expected: if given, the configuration that the file must have, except for what parameters
+            do not depend on: image size, dropout, compute type.
 
     Raises:
         InputError: the file is missing, cut short or no such file; its parameters do not fit its
@@ -57,25 +59,34 @@ def load_weights(
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
+            if FORMAT not in metadata:
                 raise InputError(
-                    f"{path}: found format {metadata.get('format')!r} in its metadata, expected "
-                    f"{FORMAT!r}, written by this package"
+                    f"{path}: found metadata {sorted(metadata)}, expected {FORMAT!r}, as this "
+                    "package writes it"
                 )
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (safetensors.SafetensorError, OSError) as error:
         raise InputError(f"{path}: not a whole safetensors file: {error}") from error
     try:
-        plain = json.loads(metadata.get("config", ""))
+        plain = json.loads(metadata[FORMAT])
     except ValueError as error:
         raise InputError(f"{path}: found no configuration in its metadata: {error}") from error
     config = from_plain(ModelConfig, plain, source=f"{path} (metadata)")
     if expected is not None:
-        same_size = expected.__class__(**{**vars(config), "image_size": expected.image_size})
-        wrong = differences(same_size, expected)
+        wrong = differences(_with_free_fields_of(expected, config), expected)
         if wrong:
             raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
     return _fill(config, found, path), config
+
+
+def _with_free_fields_of(other: ModelConfig, config: ModelConfig) -> ModelConfig:
+    return dataclasses.replace(
+        config,
+        image_size=other.image_size,
+        compute_dtype=other.compute_dtype,
+        salad=dataclasses.replace(config.salad, dropout=other.salad.dropout),
+        encoder=dataclasses.replace(config.encoder, dropout=other.encoder.dropout),
+    )
 
 
 def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:

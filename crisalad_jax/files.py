@@ -12,33 +12,39 @@ from crisalad_jax.errors import InputError
 
 
 def check_target(path: str | os.PathLike[str]) -> None:
-    """Check that a file can stand at `path`, before the work whose result it is to hold.
+    """Check that a file can be made at `path`, before the work whose result it is to hold.
 
-    Parent folders are made as needed.
+    Nothing is made yet: work that fails leaves no empty folders.
 
     Raises:
-        InputError: the folder cannot be made, or `path` is a folder itself.
+        InputError: `path` is a folder itself, or its folder cannot be made or written to.
     """
     path = pathlib.Path(path)
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file or nothing yet")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot make this folder: {error.strerror}") from error
+    nearest = next(folder for folder in path.parents if folder.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        raise InputError(
+            f"{path}: cannot be made: found {nearest}, expected a folder that can be written to"
+        )
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any error.
 
-    The temporary name keeps the suffix, for writers that choose a format by it.
+    The temporary name keeps the suffix, for writers that choose a format by it. Parent folders are
+    made as needed.
 
     Raises:
         InputError: what `check_target` raises.
     """
     path = pathlib.Path(path)
     check_target(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path.parent}: cannot make this folder: {error.strerror}") from error
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         yield temporary

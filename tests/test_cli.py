@@ -401,7 +401,7 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
     weights = tmp_path / "w.safetensors"
     whole = shared / "weights.safetensors"
     arrays = safetensors.numpy.load_file(whole)
-    metadata = {"format": "crisalad-jax 1", "config": json.dumps(to_plain(MODEL))}
+    metadata = {"crisalad-jax 1": json.dumps(to_plain(MODEL))}
     if kind == "cut":
         weights.write_bytes(whole.read_bytes()[:-100])
     elif kind == "empty":
@@ -659,7 +659,7 @@ def test_an_output_that_cannot_be_written_is_named(capfd, tmp_path, shared):
     fails(
         capfd,
         *extract(shared, shared / "town", tmp_path / "file" / "d.npy"),
-        words=(f"crisalad: {tmp_path / 'file'}: cannot make this folder",),
+        words=(f"crisalad: {tmp_path / 'file' / 'd.npy'}: cannot be made",),
     )
     (tmp_path / "d.h5").mkdir()
     fails(

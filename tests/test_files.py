@@ -7,7 +7,7 @@ import pathlib
 import pytest
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, write_json
+from crisalad_jax.files import atomic_path, check_target, write_json
 
 
 def test_the_file_appears_when_it_is_whole(tmp_path: pathlib.Path):
@@ -48,11 +48,19 @@ def test_two_writers_do_not_share_a_temporary_file(tmp_path: pathlib.Path):
 def test_a_folder_that_cannot_be_made_or_is_in_the_way_is_named(tmp_path: pathlib.Path):
     (tmp_path / "file").write_text("")
     (tmp_path / "taken").mkdir()
-    with pytest.raises(InputError, match=f"^{tmp_path}/file: cannot make this folder"):
-        write_json(tmp_path / "file" / "x.json", {})
+    for path in (tmp_path / "file" / "x.json", tmp_path / "file" / "deep" / "x.json"):
+        with pytest.raises(InputError, match=f"^{path}: cannot be made: found {tmp_path}/file, "):
+            write_json(path, {})
     with pytest.raises(InputError, match=f"^{tmp_path}/taken: found a folder"):
         write_json(tmp_path / "taken", {})
     assert sorted(os.listdir(tmp_path)) == ["file", "taken"]
+
+
+def test_a_check_makes_nothing(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    for path in ("x.json", "new/x.json", tmp_path / "new" / "deep" / "x.json"):
+        check_target(path)
+    assert os.listdir(tmp_path) == []
 
 
 def test_json_is_written_whole_or_not_at_all(tmp_path: pathlib.Path):

@@ -141,15 +141,19 @@ def test_evaluation_reads_as_utm_layout_with_25_m_positives(city):
     assert sorted(claimed) == list(range(10))
 
 
-def test_queries_and_database_never_share_season_or_hour(city):
+def test_queries_and_database_never_share_a_season_and_queries_come_at_all_hours(city):
     folder = city / "test" / "images" / "test"
     notes = {
         side: [path.name.split("@")[14].split("_") for path in (folder / side).iterdir()]
         for side in ("database", "queries")
     }
-    for column in (0, 1):
-        seen = [{note[column] for note in notes[side]} for side in ("database", "queries")]
-        assert not seen[0] & seen[1]
+    seasons, hours = (
+        [{note[column] for note in notes[side]} for side in ("database", "queries")]
+        for column in (0, 1)
+    )
+    assert not seasons[0] & seasons[1]
+    assert hours[0] == {"noon"}
+    assert len(hours[1]) > 1
 
 
 def test_train_places_meet_every_season(city):
