@@ -14,6 +14,7 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.synthetic import SyntheticCityConfig, write_synthetic_city
+from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import KS, GroupingResult, evaluate
 from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.fit import fit, read_metrics
@@ -57,6 +58,10 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         InputError: `out` holds other files, or a demo of another configuration.
     """
     started = time.monotonic()
+    if out.exists() and not (out / "city").exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(
+            f"{out}: found files but no demo, expected a demo or a new or empty folder"
+        )
     city = SyntheticCityConfig(
         train_places=config.train_places, test_places=config.test_places, seed=config.seed
     )
