@@ -36,6 +36,8 @@ def save_weights(path: str | os.PathLike[str], params: Crisalad, config: ModelCo
     metadata = {FORMAT: json.dumps(to_plain(config))}
     with atomic_path(path) as temporary:
         safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
+        # The library makes files that only their owner can read.
+        temporary.chmod(0o644)
 
 
 def load_weights(
@@ -122,11 +124,18 @@ class StateStore:
     """The resumable states of a run (orbax): each step is written whole or not at all."""
 
     def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
-        """Open or make the folder; the last `keep` states stay."""
+        """Open or make the folder; the last `keep` states stay.
+
+        Raises:
+            InputError: the folder cannot be made or read.
+        """
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
         )
-        self._manager = ocp.CheckpointManager(pathlib.Path(folder).absolute(), options=options)
+        try:
+            self._manager = ocp.CheckpointManager(pathlib.Path(folder).absolute(), options=options)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot keep states here: {error.strerror}") from error
 
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
         """Write the arrays of `state` and the JSON values of `record`; an existing step stays."""
@@ -141,7 +150,7 @@ class StateStore:
         """The last state, in the structure of `template`; None if there is none.
 
         Raises:
-            InputError: the stored arrays do not fit the template.
+            InputError: the stored arrays are damaged or do not fit the template.
         """
         step = self._manager.latest_step()
         if step is None:
@@ -152,9 +161,13 @@ class StateStore:
             saved = self._manager.restore(
                 step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonRestore())
             )
-        except (ValueError, KeyError) as error:
+        except (ValueError, KeyError, OSError, RuntimeError) as error:
+            reason = " ".join(str(error).split())[:200]
+            older = [other for other in self._manager.all_steps() if other != step]
+            advice = f"; delete it to go on from step {max(older)}" if older else ""
             raise InputError(
-                f"{self._manager.directory}: the saved state is not of this run: {error}"
+                f"{self._manager.directory / str(step)}: this state is damaged or not of this run"
+                f"{advice} ({reason})"
             ) from error
         # Through numpy, for arrays that orbax has bound to a device would compile the step anew.
         leaves = [

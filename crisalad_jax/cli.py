@@ -1,6 +1,6 @@
 """The command line: parse, make a configuration, call the library.
 
-Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 1 anything else.
+Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 1 anything else.
 """
 
 import contextlib
@@ -80,7 +80,7 @@ class Train:
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; short for --model.image-size."""
+    """Height and width, multiples of 14; replaces --model.image-size after all other flags."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or skip it (masked out of attention and loss, and counted)."""
     quiet: bool = False
@@ -163,6 +163,8 @@ def _evaluate(arguments: Evaluate) -> None:
     groupings = list(dict.fromkeys(arguments.grouping.split(",")))
     if arguments.json is not None:
         check_target(arguments.json)
+    if arguments.out is not None:
+        check_target(arguments.out / "config.json")
     check_grouping(groupings, arguments.batch_size, arguments.seed)
     params, config, model_name = _model(
         arguments.weights, arguments.preset, arguments.image_size, arguments.seed
@@ -311,6 +313,8 @@ class Info:
 
 def _info(arguments: Info) -> None:
     check_grouping((), arguments.batch_size, seed=0)
+    if arguments.json is not None:
+        check_target(arguments.json)
     if arguments.weights is not None:
         _, config = load_weights(arguments.weights)
         title = str(arguments.weights)
@@ -402,6 +406,8 @@ def _train_defaults(arguments: list[str]) -> TrainConfig:
     """What the flags of `train` start from: --config or --preset, wherever they stand."""
     given = _flag(arguments, "--config")
     if given is not None:
+        if _flag(arguments, "--preset") is not None:
+            raise InputError("--preset: found beside --config, expected only one of the two")
         return read_config(TrainConfig, pathlib.Path(given))
     return recipe(_flag(arguments, "--preset") or "b14")
 

@@ -101,6 +101,15 @@ class ViTConfig:
             self.position_start != "sincos" or self.dim % 4 == 0,
             f"ViTConfig.dim: found {self.dim}, expected a multiple of 4 for a sin-cos start",
         )
+        _require(
+            self.hidden >= 1,
+            f"ViTConfig.mlp_ratio: found {self.mlp_ratio}, expected a hidden width of at least 1",
+        )
+        _require(
+            self.adapter.kind == "none" or self.adapter_dim >= 1,
+            f"AdapterConfig.bottleneck: found {self.adapter.bottleneck}, expected a width of at "
+            f"least 1 for dim {self.dim}",
+        )
         choose("ViTConfig.ffn", self.ffn, {"mlp": 0, "swiglu": 0})
         choose("ViTConfig.position_start", self.position_start, {"random": 0, "sincos": 0})
 

@@ -6,13 +6,12 @@ import math
 import pathlib
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from crisalad_jax.checkpoint import StateStore, save_weights
 from crisalad_jax.config import TrainConfig
@@ -54,7 +53,10 @@ class FitResult(NamedTuple):
 class _Record:
     """What a run remembers beside its arrays; plain values, saved with every state."""
 
-    frozen_checksum: int
+    weights_checksum: int
+    """Of all parameters before the first step."""
+    places_checksum: int
+    """Of the names of all training images and of how they make places."""
     best_recall: float | None = None
     without_gain: int = 0
     stopped_early: bool = False
@@ -153,15 +155,21 @@ class _Run:
         self.state = jax.tree.map(jnp.copy, state)
         claim_run(out, config)
         self.store = StateStore(out / "state")
-        self.record = _Record(frozen_checksum=_checksum(self._frozen))
+        self.record = _Record(
+            weights_checksum=_checksum(jax.tree.leaves(params)),
+            places_checksum=_checksum(
+                [np.frombuffer("\n".join(places.files).encode(), np.uint8), places.place_start]
+            ),
+        )
         self.step = 0
         saved = self.store.load(self.state)
         if saved is not None:
-            if saved.record["frozen_checksum"] != self.record.frozen_checksum:
-                raise InputError(
-                    f"{out}: the run started from other weights than are given now; "
-                    "expected the same, or another folder"
-                )
+            for what in ("weights", "places"):
+                if saved.record[f"{what}_checksum"] != getattr(self.record, f"{what}_checksum"):
+                    raise InputError(
+                        f"{out}: the run started from other {what} than are given now; "
+                        "expected the same, or another folder"
+                    )
             self.step, self.state, self.record = saved.step, saved.state, _Record(**saved.record)
         self._log = MetricsLog(out / "metrics.jsonl", keep_up_to=self.step)
         self._saved_at = self._stepped_at = time.monotonic()
@@ -204,7 +212,7 @@ class _Run:
         self._log.write(
             {
                 "step": self.step,
-                "epoch": epoch,
+                "epoch": epoch + 1,
                 **metrics,
                 "learning_rate": learning_rate,
                 "images_per_second": round(rate, 2),
@@ -291,11 +299,14 @@ def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
     """The lines of a metrics file; a last line that was cut off by a kill is left out.
 
     Raises:
-        InputError: the file is missing, or a line is no JSON.
+        InputError: the file is missing, or a line is no record of a step.
     """
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
-        return [json.loads(line) for line in lines[:-1]]
+        records = [json.loads(line) for line in lines[:-1]]
+        if not all(isinstance(r, dict) and type(r.get("step")) is int for r in records):
+            raise ValueError("a line has no step")
+        return records
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot read this log of a run: {error}") from error
 
@@ -304,9 +315,9 @@ def _words(metrics: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
 
 
-def _checksum(tree: PyTree) -> int:
-    """CRC of all arrays, to tell other weights from the same."""
+def _checksum(arrays: Sequence[Any]) -> int:
+    """CRC of all arrays, to tell others from the same."""
     value = 0
-    for leaf in jax.tree.leaves(tree):
+    for leaf in arrays:
         value = zlib.crc32(np.asarray(leaf).tobytes(), value)
     return value

@@ -90,7 +90,7 @@ def merge_params(trainable: PyTree, frozen: PyTree) -> Crisalad:
 
 
 def learning_rate_schedule(config: OptimiserConfig, steps: int) -> optax.Schedule:
-    """Linear warm-up from 0, then linear decay to `final_fraction` at the last of `steps`."""
+    """Linear warm-up, then linear decay that reaches `final_fraction` after the last of `steps`."""
     peak, end = config.learning_rate, config.learning_rate * config.final_fraction
     decay = optax.linear_schedule(peak, end, max(steps - config.warmup_steps, 1))
     if not config.warmup_steps:

@@ -81,12 +81,12 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     lines = metrics_of(run)
     steps = [line for line in lines if "loss" in line]
     assert [(line["step"], line["epoch"]) for line in steps] == [
-        (1, 0),
-        (2, 0),
-        (3, 1),
-        (4, 1),
-        (5, 2),
-        (6, 2),
+        (1, 1),
+        (2, 1),
+        (3, 2),
+        (4, 2),
+        (5, 3),
+        (6, 3),
     ]
     # Linear from 1e-3 to 0 over six steps; float32 keeps seven digits.
     np.testing.assert_allclose(
@@ -291,14 +291,39 @@ def test_what_does_not_fit_is_found_before_anything_is_written(tmp_path, places,
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_is_gone_on_with_only_from_the_same_frozen_weights(tmp_path, places, params):
-    config = dataclasses.replace(RECIPE, trains="adapters+head")
+@pytest.mark.parametrize("trains", ["adapters+head", "all"])
+def test_a_run_is_gone_on_with_only_from_the_same_weights(tmp_path, places, params, trains):
+    config = dataclasses.replace(RECIPE, trains=trains)
     run = crisalad_jax.fit._Run(config, places, tmp_path, params)
     run.save()
     run.store.close()
     other = jax.tree.map(lambda leaf: leaf + 1, params)
     with pytest.raises(InputError, match=f"{tmp_path}: the run started from other weights"):
         crisalad_jax.fit._Run(config, places, tmp_path, other)
+
+
+def test_a_run_is_gone_on_with_only_on_the_same_places(tmp_path, places, params):
+    run = crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
+    run.save()
+    run.store.close()
+    other = dataclasses.replace(places, files=(*places.files[:-1], "Images/Brill/another.jpg"))
+    with pytest.raises(InputError, match=f"{tmp_path}: the run started from other places"):
+        crisalad_jax.fit._Run(RECIPE, other, tmp_path, params)
+
+
+def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, places, params):
+    run = crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
+    run.save()
+    run.step = 2
+    run.save()
+    run.store.close()
+    for path in (tmp_path / "state" / "2" / "state").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[:3])
+    with pytest.raises(InputError, match=r"damaged.*delete it to go on from step 0") as error:
+        crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
+    assert str(error.value).startswith(str(tmp_path / "state" / "2"))
+    assert "\n" not in str(error.value)
 
 
 def test_a_folder_belongs_to_one_configuration(tmp_path):

@@ -137,6 +137,40 @@ def test_the_librarys_quirk_is_an_option() -> None:
     np.testing.assert_allclose(plain, by_hand, rtol=1e-6)
 
 
+def test_ties_with_the_margin_mine_nothing() -> None:
+    """Strict on both sides: similarity minus (plus) epsilon equal to the hardest other is easy."""
+    similarities = jnp.array([[1.0, 0.75, 0.5], [0.75, 1.0, 0.5], [0.5, 0.5, 1.0]])
+    labels = jnp.array([0, 0, 1])
+    tied = mine(similarities, labels, epsilon=0.25)
+    assert not tied.positives.any()
+    assert not tied.negatives.any()
+    wider = mine(similarities, labels, epsilon=0.3125)
+    assert wider.positives.sum() == 2
+    assert wider.negatives.sum() == 2
+
+
+def test_the_quirk_needs_few_pairs_on_both_sides() -> None:
+    """One positive and two negatives: anchor 0's positive at 0.6, negatives at 0.55 and 0.58."""
+    similarities = np.array(
+        [
+            [1.0, 0.60, 0.55, 0.58],
+            [0.60, 1.0, 0.10, 0.10],
+            [0.55, 0.10, 1.0, 0.30],
+            [0.58, 0.10, 0.30, 1.0],
+        ]
+    )
+    x = np.linalg.cholesky(similarities).astype(np.float32)
+    labels = np.array([0, 0, 1, 2])
+    pairs = mine(jnp.asarray(x @ x.T), jnp.asarray(labels), epsilon=0.1)
+    assert pairs.positives.sum() == 1
+    assert pairs.negatives.sum() == 2
+    config = MultiSimilarityConfig(library_quirk=True)
+    loss, _, _ = theirs(x, labels, config)
+    assert loss > 0
+    value, _ = ours(jnp.asarray(x), jnp.asarray(labels), config)
+    np.testing.assert_allclose(value, loss, rtol=1e-5)
+
+
 def test_images_that_are_not_valid_take_no_part() -> None:
     x, labels = random_batch(2)
     full = np.concatenate([x, unit(np.random.default_rng(9).standard_normal((5, 6)))])

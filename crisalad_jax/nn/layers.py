@@ -120,7 +120,7 @@ def split_key(key: PRNGKeyArray | None, count: int) -> list[PRNGKeyArray | None]
 
 
 def l2_normalise(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
-    """Scale the last axis to length 1, as torch's `F.normalize`: a shorter than 1e-12 one stays.
+    """Scale the last axis to length 1, as torch's `F.normalize`: below 1e-12 counts as 1e-12.
 
     The root is taken of a number kept from 0, so that a zero vector has gradient 0 and not NaN.
     """

@@ -87,3 +87,28 @@ def test_sequences_round_trip(global_token: bool) -> None:
     factor = 2 if global_token else 1  # left out, it comes back untouched
     np.testing.assert_array_equal(back.global_token, factor * tokens.global_token)
     np.testing.assert_array_equal(back.clusters, 2 * tokens.clusters)
+
+
+def test_dropout_stands_where_torch_has_it(monkeypatch) -> None:
+    """In each layer on attention weights, after attention, after GELU, and after linear2."""
+    import crisalad_jax.nn.attention as attention_module
+    import crisalad_jax.nn.cross_image as module
+
+    calls = []
+
+    def record(x, rate, *, key):
+        calls.append((x.shape, rate, key is not None))
+        return x
+
+    monkeypatch.setattr(module, "dropout", record)
+    monkeypatch.setattr(attention_module, "dropout", record)
+    params = init_cross_image(jax.random.key(0), DIM, CONFIG)
+    tokens = jax.random.normal(jax.random.key(1), (IMAGES, TOKENS, DIM))
+    cross_image_encoder(params, tokens, CONFIG, key=jax.random.key(2))
+    layer = [
+        ((4, IMAGES, IMAGES), 0.1, True),
+        ((IMAGES, TOKENS, DIM), 0.1, True),
+        ((IMAGES, TOKENS, 24), 0.1, True),
+        ((IMAGES, TOKENS, DIM), 0.1, True),
+    ]
+    assert calls == 2 * layer

@@ -53,3 +53,25 @@ def test_no_more_patches_than_clusters_raises(patches: int) -> None:
     params = init_salad(jax.random.key(0), 12, CONFIG)
     with pytest.raises(InputError, match=f"found {patches} patches for 3 clusters"):
         salad(params, features(patches), CONFIG, key=None)
+
+
+def test_dropout_stands_before_relu_of_the_two_local_networks(monkeypatch) -> None:
+    """The public order (linear, dropout, ReLU, linear), with a key for each network."""
+    import crisalad_jax.nn.salad as module
+
+    calls = []
+
+    def record(x, rate, *, key):
+        calls.append((rate, None if key is None else tuple(jax.random.key_data(key).tolist())))
+        assert (x < 0).any()  # before ReLU
+        return x
+
+    monkeypatch.setattr(module, "dropout", record)
+    params = init_salad(jax.random.key(0), 12, CONFIG)
+    salad(params, features(10), CONFIG, key=jax.random.key(1))
+    drawn = [key for rate, key in calls if rate == 0.5]
+    assert len(calls) == 3
+    assert len(drawn) == 2
+    assert len(set(drawn)) == 2
+    assert None not in drawn
+    assert (0.0, None) in calls  # the global token's network
