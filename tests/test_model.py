@@ -7,24 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.config import (
-    PRESETS,
-    CrossImageConfig,
-    ModelConfig,
-    SaladConfig,
-    ViTConfig,
-)
+from crisalad_jax.config import PRESETS, CrossImageConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import alone, among, describe, init_crisalad, relate, tokenise
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.pytree import named_leaves
+from tests.conftest import MODEL as CONFIG
 
-CONFIG = ModelConfig(
-    image_size=(42, 56),
-    backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),
-    salad=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
-    encoder=CrossImageConfig(heads=2, feedforward=16),
-)
 # Descriptors have entries of order 0.1; float32 sums compiled for another batch size differ by
 # some units in the last place after a few layers.
 TOLERANCE = 2e-6

@@ -22,7 +22,8 @@ from crisalad_jax.training import (
     split_params,
     train_step,
 )
-from tests.test_model import CONFIG, pictures
+from tests.conftest import MODEL as CONFIG
+from tests.test_model import pictures
 
 # No dropout, so that a step can be compared with one taken by hand.
 MODEL = dataclasses.replace(
