@@ -5,6 +5,7 @@ import functools
 import json
 import os
 import pathlib
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -24,20 +25,47 @@ from crisalad_jax.serial import differences, from_plain, to_plain
 
 FORMAT = "crisalad-jax 1"
 """The one key of a weight file's metadata; its value is the configuration as JSON."""
+EXTRA = "extra."
+"""What names of arrays begin with that are kept for the way back to a public checkpoint alone."""
 
 
-def save_weights(path: str | os.PathLike[str], params: Crisalad, config: ModelConfig) -> None:
+def save_weights(
+    path: str | os.PathLike[str],
+    params: Crisalad,
+    config: ModelConfig,
+    *,
+    extras: Mapping[str, np.ndarray] | None = None,
+) -> None:
     """Write parameters under their dotted names, and the configuration in the file's metadata.
+
+    `extras` are arrays of a public checkpoint that no description needs (see `convert`).
 
     Raises:
         InputError: the folder cannot be made.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
+    arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
     metadata = {FORMAT: json.dumps(to_plain(config))}
     with atomic_path(path) as temporary:
         safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
         # The library makes files that only their owner can read.
         temporary.chmod(0o644)
+
+
+def is_ours(path: str | os.PathLike[str]) -> bool:
+    """Whether this is a whole safetensors file that `save_weights` wrote."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            return FORMAT in (file.metadata() or {})
+    except (safetensors.SafetensorError, OSError):
+        return False
+
+
+def load_extras(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """The `extras` that `save_weights` wrote."""
+    with safetensors.safe_open(path, framework="numpy") as file:
+        names = [name for name in file.keys() if name.startswith(EXTRA)]  # noqa: SIM118
+        return {name.removeprefix(EXTRA): file.get_tensor(name) for name in names}
 
 
 def load_weights(
@@ -64,11 +92,14 @@ def load_weights(
             if FORMAT not in metadata:
                 raise InputError(
                     f"{path}: found metadata {sorted(metadata)}, expected {FORMAT!r}, as this "
-                    "package writes it"
+                    "package writes it; `crisalad convert` reads public checkpoints"
                 )
-            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            names = [name for name in file.keys() if not name.startswith(EXTRA)]  # noqa: SIM118
+            found = {name: file.get_tensor(name) for name in names}
     except (safetensors.SafetensorError, OSError) as error:
-        raise InputError(f"{path}: not a whole safetensors file: {error}") from error
+        raise InputError(
+            f"{path}: not a whole safetensors file: {error}; `crisalad convert` reads torch files"
+        ) from error
     try:
         plain = json.loads(metadata[FORMAT])
     except ValueError as error:

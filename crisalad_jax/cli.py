@@ -17,7 +17,8 @@ import rich.table
 import tyro
 
 from crisalad_jax.checkpoint import load_weights
-from crisalad_jax.config import ModelConfig, TrainConfig, check_image_size, choose, recipe
+from crisalad_jax.config import ModelConfig, TrainConfig, choose, recipe
+from crisalad_jax.convert import convert, read_backbone
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.images import list_images
@@ -28,6 +29,7 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate, group, read_tokens
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.fit import fit, read_metrics
+from crisalad_jax.layouts import LAYOUTS
 from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.report import RecallRow, prediction_gallery, recall_table, training_curves
 from crisalad_jax.serial import read_config, to_plain
@@ -74,7 +76,10 @@ class Train:
     val: pathlib.Path | None = None
     """Evaluation set for early stopping, in any layout that `evaluate` reads."""
     weights: pathlib.Path | None = None
-    """Weights to start from; none starts from random ones."""
+    """Weights of a whole model to start from; none starts from random ones."""
+    backbone: pathlib.Path | None = None
+    """Start from this backbone alone: a file of this package or a public checkpoint (DINOv2 .pth,
+    Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth)."""
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14: model and recipe that the other flags start from."""
     config: pathlib.Path | None = None
@@ -92,13 +97,11 @@ def _train(arguments: Train) -> None:
     if arguments.image_size is not None:
         model = dataclasses.replace(config.model, image_size=arguments.image_size)
         config = dataclasses.replace(config, model=model)
-    initial = None
-    if arguments.weights is not None:
-        initial, _ = load_weights(arguments.weights, expected=config.model)
-    elif config.trains != "all":
+    initial = _start(arguments, config)
+    if initial is None and config.trains != "all":
         _console.print(
-            f"Note: no --weights, so the frozen part of the model ({config.trains} trains) is "
-            "random. --trains all trains everything.",
+            "Note: no --weights or --backbone, so the frozen part of the model "
+            f"({config.trains} trains) is random. --trains all trains everything.",
             soft_wrap=True,
         )
     places = read_places(arguments.data, cities=config.cities, min_images=config.min_images)
@@ -127,6 +130,52 @@ def _train(arguments: Train) -> None:
     if result.skipped_images:
         words += f", {result.skipped_images} unreadable images skipped"
     _console.print(f"{arguments.out}: {words}; curves in {picture}", soft_wrap=True)
+
+
+def _start(arguments: Train, config: TrainConfig) -> Crisalad | None:
+    """What training starts from; None is random parameters."""
+    if arguments.weights is not None:
+        if arguments.backbone is not None:
+            raise InputError("--backbone: found beside --weights, expected only one of the two")
+        params, _ = load_weights(arguments.weights, expected=config.model)
+        return params
+    if arguments.backbone is None:
+        return None
+    fresh = init_crisalad(jax.random.key(config.seed), config.model)
+    backbone = read_backbone(arguments.backbone, config.model.backbone, fresh.backbone)
+    return dataclasses.replace(fresh, backbone=backbone)
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Convert a public torch checkpoint to a file of this package, or such a file back."""
+
+    source: tyro.conf.Positional[pathlib.Path]
+    """DINOv2 .pth, Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth, the torch
+    reference, or a file of this package."""
+    target: tyro.conf.Positional[pathlib.Path]
+    """A .safetensors file; for a source of this package, the public checkpoint to write."""
+    layout: str | None = None
+    """dinov2, huggingface, dino-salad, cricavpr or reference, for a source of this package; by
+    default the one its parts came from (huggingface if the target is a .safetensors)."""
+
+
+def _convert(arguments: Convert) -> None:
+    done = convert(arguments.source, arguments.target, arguments.layout)
+    config = done.config
+    backbone = config.backbone
+    _console.print(
+        f"{arguments.source} ({_layout_words(done.source)}) -> {arguments.target} "
+        f"({_layout_words(done.target)}): backbone of width {backbone.dim}, {backbone.depth} "
+        f"blocks, {backbone.registers} registers, adapter {backbone.adapter.kind}; aggregator "
+        f"{config.aggregator}; {config.encoder.layers} encoder layers; descriptor of "
+        f"{config.descriptor_dim} numbers",
+        soft_wrap=True,
+    )
+
+
+def _layout_words(layout: str | None) -> str:
+    return "crisalad-jax" if layout is None else LAYOUTS[layout].holds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -385,7 +434,7 @@ def _model(
 def _resized(config: ModelConfig, image_size: tuple[int, int] | None) -> ModelConfig:
     if image_size is None:
         return config
-    check_image_size(image_size, config.salad.clusters)
+    config.check_image_size(image_size)
     return dataclasses.replace(config, image_size=image_size)
 
 
@@ -396,6 +445,7 @@ def _grouping_words(groupings: Iterable[str]) -> str:
 _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "demo": (Demo, _demo),
     "train": (Train, _train),
+    "convert": (Convert, _convert),
     "evaluate": (Evaluate, _evaluate),
     "extract": (Extract, _extract),
     "info": (Info, _info),

@@ -48,20 +48,29 @@ def _require_fraction(config: object, *names: str) -> None:
         )
 
 
+ADAPTERS = ("depthwise", "multi-resolution", "mlp", "none")
+AGGREGATORS = ("salad", "gem-pyramid", "class-token")
+PYRAMID_LEVELS = (2, 3)
+"""The GeM pyramid's cuts of a side, as CricaVPR's: 4 and 9 regions."""
+
+
 @dataclasses.dataclass(frozen=True)
 class AdapterConfig:
-    """The depthwise-separable adapter beside the MLP of every block (paper section 3.2)."""
+    """The adapter beside the MLP of every block (paper section 3.2, and its Table 2's others)."""
 
-    kind: Literal["depthwise", "none"] = "depthwise"
+    kind: Literal["depthwise", "multi-resolution", "mlp", "none"] = "depthwise"
+    """The paper's depthwise-separable convolution, CricaVPR's multi-resolution one, or a plain MLP;
+    none leaves it out."""
     bottleneck: float = 0.5
     """Width of the adapter over the width of the backbone."""
     kernel_size: int = 3
+    """Side of the depthwise filter."""
     alpha: float = 0.2
     """Weight of the adapter's output (paper Eq. 2)."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        choose("AdapterConfig.kind", self.kind, {"depthwise": 0, "none": 0})
+        choose("AdapterConfig.kind", self.kind, dict.fromkeys(ADAPTERS))
         _require_positive(self, "bottleneck", "kernel_size")
         _require(
             self.kernel_size % 2 == 1,
@@ -109,6 +118,12 @@ class ViTConfig:
             self.adapter.kind == "none" or self.adapter_dim >= 1,
             f"AdapterConfig.bottleneck: found {self.adapter.bottleneck}, expected a width of at "
             f"least 1 for dim {self.dim}",
+        )
+        _require(
+            self.adapter.kind != "multi-resolution" or self.adapter_dim % 16 == 0,
+            f"AdapterConfig.bottleneck: found {self.adapter.bottleneck}, which is a width of "
+            f"{self.adapter_dim} for dim {self.dim}; expected a multiple of 16, for the branches "
+            "of a multi-resolution adapter take 1/2, 1/4 and 1/16 of it",
         )
         choose("ViTConfig.ffn", self.ffn, {"mlp": 0, "swiglu": 0})
         choose("ViTConfig.position_start", self.position_start, {"random": 0, "sincos": 0})
@@ -179,43 +194,92 @@ class CrossImageConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """CriSALAD: backbone, aggregation, cross-image encoder."""
+    """CriSALAD: backbone, aggregation, cross-image encoder. And those it is measured against:
+
+    DINO-SALAD has no adapter and no encoder; CricaVPR the multi-resolution adapter and the GeM
+    pyramid; DINOv2 by itself gives its class token.
+    """
 
     image_size: tuple[int, int] = (224, 224)
     """Height and width that images are resized to, multiples of 14."""
     normalisation: Literal["imagenet", "local-contrast"] = "imagenet"
     """What 8-bit pixels are normalised by: ImageNet or local mean and deviation."""
     backbone: ViTConfig = ViTConfig()
+    aggregator: Literal["salad", "gem-pyramid", "class-token"] = "salad"
+    """SALAD; CricaVPR's class token and generalised means over 13 regions; the class token."""
     salad: SaladConfig = SaladConfig()
     encoder: CrossImageConfig = CrossImageConfig()
-    compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the matrix products; normalisations, softmax and transport stay in float32."""
+    compute_dtype: Literal["float32", "bfloat16", "float64"] = "float32"
+    """Type of the matrix products; normalisations, softmax and transport are float32 at least.
+    float64 is for numerical studies, under JAX's 64-bit mode."""
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""
         choose(
             "ModelConfig.normalisation", self.normalisation, {"imagenet": 0, "local-contrast": 0}
         )
-        choose("ModelConfig.compute_dtype", self.compute_dtype, {"float32": 0, "bfloat16": 0})
-        check_image_size(self.image_size, self.salad.clusters)
+        choose(
+            "ModelConfig.compute_dtype",
+            self.compute_dtype,
+            {"float32": 0, "bfloat16": 0, "float64": 0},
+        )
+        choose("ModelConfig.aggregator", self.aggregator, dict.fromkeys(AGGREGATORS))
+        self.check_image_size(self.image_size)
         if self.encoder.layers:
-            width = self.salad.cluster_dim
+            width = self.token_dim
+            name = "SaladConfig.cluster_dim" if self.aggregator == "salad" else "ViTConfig.dim"
             _require(
                 width % self.encoder.heads == 0,
-                f"SaladConfig.cluster_dim: found {width}, expected a multiple of the cross-image "
-                f"encoder's {self.encoder.heads} heads",
+                f"{name}: found {width}, expected a multiple of the cross-image encoder's "
+                f"{self.encoder.heads} heads",
             )
             _require(
-                not self.encoder.global_token or self.salad.token_dim % width == 0,
+                not self.encoder.global_token or self.global_dim % width == 0,
                 f"SaladConfig.token_dim: found {self.salad.token_dim}, expected a multiple of "
                 f"cluster_dim {width} so that the global token can enter the cross-image encoder "
                 "(or CrossImageConfig.global_token False)",
             )
 
     @property
+    def global_dim(self) -> int:
+        """Width of the global token."""
+        return self.salad.token_dim if self.aggregator == "salad" else self.backbone.dim
+
+    @property
+    def token_dim(self) -> int:
+        """Width of a cluster's or region's token, and of the cross-image encoder."""
+        return self.salad.cluster_dim if self.aggregator == "salad" else self.backbone.dim
+
+    @property
+    def local_tokens(self) -> int:
+        """How many clusters or regions there are."""
+        regions = sum(level**2 for level in PYRAMID_LEVELS)
+        return {"salad": self.salad.clusters, "gem-pyramid": regions, "class-token": 0}[
+            self.aggregator
+        ]
+
+    @property
     def descriptor_dim(self) -> int:
         """Numbers in one descriptor."""
-        return self.salad.token_dim + self.salad.clusters * self.salad.cluster_dim
+        return self.global_dim + self.local_tokens * self.token_dim
+
+    def check_image_size(self, image_size: tuple[int, int]) -> None:
+        """Check that this model can describe images of this height and width.
+
+        Raises:
+            InputError: a side is no multiple of 14, or there are too few patches for the
+                aggregator.
+        """
+        if self.aggregator == "salad":
+            check_image_size(image_size, self.salad.clusters)
+            return
+        _check_sides(image_size)
+        side = PATCH_SIZE * max(PYRAMID_LEVELS)
+        _require(
+            self.aggregator != "gem-pyramid" or min(image_size) >= side,
+            f"image size: found {image_size[0]} x {image_size[1]}, expected at least {side} x "
+            f"{side}, a patch for every region of the GeM pyramid",
+        )
 
 
 def check_image_size(image_size: tuple[int, int], clusters: int) -> None:
@@ -224,12 +288,8 @@ def check_image_size(image_size: tuple[int, int], clusters: int) -> None:
     Raises:
         InputError: a side is no multiple of 14, or there are too few patches.
     """
+    _check_sides(image_size)
     height, width = image_size
-    _require(
-        height > 0 and width > 0 and height % PATCH_SIZE == 0 and width % PATCH_SIZE == 0,
-        f"image size: found {height} x {width}, expected sides that are multiples of {PATCH_SIZE} "
-        f"(nearest: {_nearest_side(height)} x {_nearest_side(width)})",
-    )
     patches = (height // PATCH_SIZE) * (width // PATCH_SIZE)
     side = next(s for s in range(1, clusters + 2) if s * s > clusters) * PATCH_SIZE
     _require(
@@ -237,6 +297,15 @@ def check_image_size(image_size: tuple[int, int], clusters: int) -> None:
         f"image size: found {height} x {width}, which is {patches} patches for {clusters} "
         "clusters; expected more patches than clusters (the smallest square that works: "
         f"{side} x {side})",
+    )
+
+
+def _check_sides(image_size: tuple[int, int]) -> None:
+    height, width = image_size
+    _require(
+        height > 0 and width > 0 and height % PATCH_SIZE == 0 and width % PATCH_SIZE == 0,
+        f"image size: found {height} x {width}, expected sides that are multiples of {PATCH_SIZE} "
+        f"(nearest: {_nearest_side(height)} x {_nearest_side(width)})",
     )
 
 

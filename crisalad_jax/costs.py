@@ -38,14 +38,14 @@ def _part_of(name: str) -> str:
     if name.startswith("encoder."):
         return "cross-image encoder"
     if name.startswith("aggregator."):
-        return "SALAD"
+        return "aggregator"
     if ".adapter." in name:
         return "adapters"
     return "backbone blocks" if name.startswith("backbone.blocks.") else "backbone embedding, norm"
 
 
 def _macs(config: ModelConfig, images: int) -> dict[str, int]:
-    backbone, salad, encoder = config.backbone, config.salad, config.encoder
+    backbone, encoder = config.backbone, config.encoder
     patches = math.prod(config.image_size) // PATCH_SIZE**2
     tokens = 1 + backbone.registers + patches
     dim, hidden, depth = backbone.dim, backbone.hidden, backbone.depth
@@ -56,19 +56,24 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
         "backbone embedding, norm": patches * 3 * PATCH_SIZE**2 * dim,
         "backbone blocks": depth * block,
         "adapters": 0,
-        "SALAD": salad.hidden * (dim + salad.token_dim)
-        + patches * salad.hidden * (2 * dim + salad.cluster_dim + salad.clusters)
-        + patches * salad.clusters * salad.cluster_dim,
+        "aggregator": _salad_macs(config, patches) if config.aggregator == "salad" else 0,
         "cross-image encoder": 0,
     }
     if backbone.adapter.kind != "none":
         costs["adapters"] = depth * adapter_macs(config)
     if encoder.layers:
-        width = salad.cluster_dim
-        pieces = salad.clusters + (salad.token_dim // width if encoder.global_token else 0)
+        width = config.token_dim
+        pieces = config.local_tokens + (config.global_dim // width if encoder.global_token else 0)
         per_token = 4 * width**2 + 2 * width * encoder.feedforward + 2 * images * width
         costs["cross-image encoder"] = encoder.layers * pieces * per_token
     return costs
+
+
+def _salad_macs(config: ModelConfig, patches: int) -> int:
+    dim, salad = config.backbone.dim, config.salad
+    networks = salad.hidden * (2 * dim + salad.cluster_dim + salad.clusters)
+    sums = salad.clusters * salad.cluster_dim
+    return salad.hidden * (dim + salad.token_dim) + patches * (networks + sums)
 
 
 def adapter_macs(config: ModelConfig) -> int:
@@ -89,4 +94,9 @@ def paper_adapter_macs(config: ModelConfig) -> int:
 
 def _convolution_macs(config: ModelConfig) -> int:
     width = config.backbone.adapter_dim
+    if config.backbone.adapter.kind == "mlp":
+        return 0
+    if config.backbone.adapter.kind == "multi-resolution":
+        half, quarter, narrow = width // 2, width // 4, width // 16
+        return width * (half + 2 * narrow) + (3**2 + 5**2) * narrow * quarter
     return config.backbone.adapter.kernel_size**2 * width + width**2

@@ -14,7 +14,7 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, alone, among, relate, tokenise
-from crisalad_jax.nn.salad import SaladTokens
+from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.retrieval import Neighbours, recalls, search
 
@@ -41,10 +41,10 @@ def check_grouping(groupings: Sequence[str], batch_size: int, seed: int) -> None
 
 
 class FolderTokens(NamedTuple):
-    """Tokens of many images on the host (see `SaladTokens`), and which images could be read."""
+    """Tokens of many images on the host (see `Tokens`), and which images could be read."""
 
-    global_tokens: Float[np.ndarray, "image token_dim"]
-    clusters: Float[np.ndarray, "image cluster cluster_dim"]
+    global_tokens: Float[np.ndarray, "image global_dim"]
+    local: Float[np.ndarray, "image token dim"]
     readable: Bool[np.ndarray, " image"]
 
 
@@ -108,8 +108,8 @@ def group(
         padded = np.resize(chosen, batch_size)
         valid = folder.readable[padded] & (np.arange(batch_size) < len(chosen))
         mask = alone(batch_size) if grouping == "single" else among(jnp.asarray(valid))
-        tokens = SaladTokens(
-            jnp.asarray(folder.global_tokens[padded]), jnp.asarray(folder.clusters[padded])
+        tokens = Tokens(
+            jnp.asarray(folder.global_tokens[padded]), jnp.asarray(folder.local[padded])
         )
         descriptors[chosen] = relate(params, tokens, config, mask=mask)[: len(chosen)]
     return descriptors

@@ -1,4 +1,7 @@
-"""CriSALAD: the composition of backbone, aggregation and cross-image encoder (paper Figure 1)."""
+"""CriSALAD: the composition of backbone, aggregation and cross-image encoder (paper Figure 1).
+
+DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
+"""
 
 import functools
 
@@ -6,19 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
 
-from crisalad_jax.config import ModelConfig, check_image_size
+from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.nn.cross_image import (
-    CrossImageEncoder,
-    as_sequence,
-    cross_image_encoder,
-    from_sequence,
-    init_cross_image,
-)
+from crisalad_jax.nn.aggregators import Aggregator, aggregate, init_aggregator, join
+from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.layers import split_key
 from crisalad_jax.nn.pixels import normalise
-from crisalad_jax.nn.salad import Salad, SaladTokens, init_salad, join, salad
-from crisalad_jax.nn.vit import ViT, init_vit, vit
+from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
+from crisalad_jax.nn.vit import ViT, grid_of, init_vit, vit
 from crisalad_jax.pytree import params
 
 Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
@@ -29,7 +27,7 @@ class Crisalad:
     """All parameters of a model."""
 
     backbone: ViT
-    aggregator: Salad
+    aggregator: Aggregator | None
     encoder: CrossImageEncoder | None
 
 
@@ -38,8 +36,8 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     backbone, aggregator, encoder = jax.random.split(key, 3)
     return Crisalad(
         backbone=init_vit(backbone, config.backbone),
-        aggregator=init_salad(aggregator, config.backbone.dim, config.salad),
-        encoder=init_cross_image(encoder, config.salad.cluster_dim, config.encoder)
+        aggregator=init_aggregator(aggregator, config),
+        encoder=init_cross_image(encoder, config.token_dim, config.encoder)
         if config.encoder.layers
         else None,
     )
@@ -80,20 +78,20 @@ def describe(
 @functools.partial(jax.jit, static_argnames="config")
 def tokenise(
     params: Crisalad, images: Images, config: ModelConfig, *, key: PRNGKeyArray | None = None
-) -> SaladTokens:
+) -> Tokens:
     """The first half of `describe`: every image's tokens, which owe nothing to other images."""
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
-    check_image_size((images.shape[1], images.shape[2]), config.salad.clusters)
+    config.check_image_size((images.shape[1], images.shape[2]))
 
     def one(
         image: UInt8[Array, "height width 3"] | Float[Array, "height width 3"],
         key: PRNGKeyArray | None,
-    ) -> SaladTokens:
+    ) -> Tokens:
         if image.dtype == jnp.uint8:
             image = normalise(image, config.normalisation)
         features = vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
-        return salad(params.aggregator, features, config.salad, key=key)
+        return aggregate(params.aggregator, features, grid_of(image), config, key=key)
 
     if key is None:
         return jax.vmap(functools.partial(one, key=None))(images)
@@ -103,7 +101,7 @@ def tokenise(
 @functools.partial(jax.jit, static_argnames="config")
 def relate(
     params: Crisalad,
-    tokens: SaladTokens,
+    tokens: Tokens,
     config: ModelConfig,
     *,
     mask: Bool[Array, "image image"] | None = None,
@@ -114,12 +112,12 @@ def relate(
     To see the same images in several groupings, `tokenise` them once.
     """
     if params.encoder is not None:
-        enter = functools.partial(as_sequence, salad=config.salad, config=config.encoder)
-        leave = functools.partial(from_sequence, salad=config.salad, config=config.encoder)
+        enter = functools.partial(as_sequence, global_token=config.encoder.global_token)
+        leave = functools.partial(from_sequence, global_token=config.encoder.global_token)
         sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
         sequence = cross_image_encoder(params.encoder, sequence, config.encoder, mask=mask, key=key)
-        tokens = jax.vmap(leave)(sequence.astype(tokens.clusters.dtype), tokens)
-    return jax.vmap(join)(tokens)
+        tokens = jax.vmap(leave)(sequence.astype(tokens.local.dtype), tokens)
+    return jax.vmap(functools.partial(join, config=config))(tokens)
 
 
 def alone(count: int) -> Bool[Array, "image image"]:

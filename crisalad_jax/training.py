@@ -19,6 +19,8 @@ from crisalad_jax.nn.vit import Block
 from crisalad_jax.pytree import named_leaves
 
 ADAPTERS_AND_HEAD, ALL = "adapters+head", "all"
+STATISTICS = (".running_mean", ".running_var")
+"""Batch-norm statistics, which never train: they are measured, not learnt."""
 _LAST_BLOCKS = re.compile(r"last-(\d+)-blocks\+head")
 
 
@@ -44,7 +46,7 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     `trains` is "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "all", or
     "last-N-blocks+head" (SALAD: the last N blocks, the final layer norm, and the head). For the
     last, the stack of blocks is cut in two, so that no gradient passes the frozen ones;
-    `merge_params` makes it one again.
+    `merge_params` makes it one again. Batch-norm statistics stay frozen in every case.
 
     Raises:
         InputError: an unknown name, or more blocks than there are.
@@ -63,7 +65,11 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
             f"trains: found {trains!r}, expected adapters+head, last-N-blocks+head or all"
         )
     names = iter(named_leaves(params))
-    chosen = jax.tree.map(lambda _: next(names).startswith(prefixes), params)
+
+    def learns(name: str) -> bool:
+        return name.startswith(prefixes) and not name.endswith(STATISTICS)
+
+    chosen = jax.tree.map(lambda _: learns(next(names)), params)
     return eqx.partition(params, chosen)
 
 

@@ -102,7 +102,7 @@ def test_one_patch_more_than_clusters_is_enough():
 @pytest.mark.parametrize(
     ("kind", "fields", "words"),
     [
-        (AdapterConfig, {"kind": "mlp"}, "AdapterConfig.kind: found 'mlp', expected one of"),
+        (AdapterConfig, {"kind": "linear"}, "AdapterConfig.kind: found 'linear', expected one of"),
         (AdapterConfig, {"kernel_size": 4}, "AdapterConfig.kernel_size: found 4, expected an odd"),
         (AdapterConfig, {"bottleneck": 0.0}, "AdapterConfig.bottleneck: found 0.0"),
         (ViTConfig, {"heads": 7}, "ViTConfig.dim: found 768, expected a multiple of the 7 heads"),

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.config import CrossImageConfig, SaladConfig
+from crisalad_jax.config import CrossImageConfig
 from crisalad_jax.nn.attention import Attention, attention
 from crisalad_jax.nn.layers import (
     LayerNorm,
@@ -23,7 +23,6 @@ from crisalad_jax.nn.layers import (
     linear,
     split_key,
 )
-from crisalad_jax.nn.salad import SaladTokens
 from crisalad_jax.pytree import params
 
 NORM_EPSILON = 1e-5
@@ -111,26 +110,3 @@ def _encoder_layer(
     hidden = dropout(gelu(linear(params.linear1, tokens)), rate, key=hidden_key)
     update = dropout(linear(params.linear2, hidden), rate, key=update_key)
     return layer_norm(params.norm2, tokens + update, epsilon=NORM_EPSILON)
-
-
-def as_sequence(
-    tokens: SaladTokens, salad: SaladConfig, config: CrossImageConfig
-) -> Float[Array, "token dim"]:
-    """Cluster tokens, behind the global token cut to their width if it takes part."""
-    if not config.global_token:
-        return tokens.clusters
-    pieces = tokens.global_token.reshape(-1, salad.cluster_dim)
-    return jnp.concatenate([pieces, tokens.clusters])
-
-
-def from_sequence(
-    sequence: Float[Array, "token dim"],
-    before: SaladTokens,
-    salad: SaladConfig,
-    config: CrossImageConfig,
-) -> SaladTokens:
-    """Undo `as_sequence`; a global token that took no part is the one from `before`."""
-    if not config.global_token:
-        return SaladTokens(before.global_token, sequence)
-    pieces = salad.token_dim // salad.cluster_dim
-    return SaladTokens(sequence[:pieces].ravel(), sequence[pieces:])

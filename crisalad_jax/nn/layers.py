@@ -33,6 +33,27 @@ class DepthwiseConv:
     bias: Float[Array, "*stack dim"]
 
 
+@params
+class Conv:
+    """A k x k convolution; torch stores `weight` as (dim_out, dim_in, k, k)."""
+
+    weight: Float[Array, "*stack k k d_in d_out"]
+    bias: Float[Array, "*stack d_out"]
+
+
+@params
+class BatchNorm:
+    """Gain and shift of a batch norm, and the statistics it normalises by.
+
+    The statistics are constants: they do not train, and no batch changes them.
+    """
+
+    weight: Float[Array, "*stack dim"]
+    bias: Float[Array, "*stack dim"]
+    running_mean: Float[Array, "*stack dim"]
+    running_var: Float[Array, "*stack dim"]
+
+
 def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
     """Start as torch's `nn.Linear` does: weight and bias uniform within 1 / sqrt(d_in)."""
     weight_key, bias_key = jax.random.split(key)
@@ -58,6 +79,22 @@ def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> Depthw
         ),
         jax.random.uniform(bias_key, (dim,), minval=-bound, maxval=bound),
     )
+
+
+def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
+    """Start as torch's `nn.Conv2d` does: uniform within 1 / sqrt(kernel_size^2 d_in)."""
+    weight_key, bias_key = jax.random.split(key)
+    bound = 1 / (kernel_size * math.sqrt(d_in))
+    shape = (kernel_size, kernel_size, d_in, d_out)
+    return Conv(
+        jax.random.uniform(weight_key, shape, minval=-bound, maxval=bound),
+        jax.random.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
+    )
+
+
+def init_batch_norm(dim: int) -> BatchNorm:
+    """Start as torch's `nn.BatchNorm2d` does: with mean 0 and variance 1, it changes nothing."""
+    return BatchNorm(jnp.ones(dim), jnp.zeros(dim), jnp.zeros(dim), jnp.ones(dim))
 
 
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
@@ -97,6 +134,27 @@ def depthwise_conv(
         for j in range(size)
     ]
     return sum(taps, start=params.bias.astype(x.dtype))
+
+
+def conv(params: Conv, x: Float[Array, "height width d_in"]) -> Float[Array, "height width d_out"]:
+    """Convolve (cross-correlate, as torch) at stride 1 with zero padding, in the type of `x`."""
+    y = jax.lax.conv_general_dilated(
+        x[None],
+        params.weight.astype(x.dtype),
+        window_strides=(1, 1),
+        padding="SAME",
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+    return y[0] + params.bias.astype(x.dtype)
+
+
+def batch_norm(
+    params: BatchNorm, x: Float[Array, "*batch dim"], *, epsilon: float
+) -> Float[Array, "*batch dim"]:
+    """Normalise by the stored statistics, as torch does in evaluation; returns the type of `x`."""
+    wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+    scale = params.weight * jax.lax.rsqrt(params.running_var + epsilon)
+    return ((wide - params.running_mean) * scale + params.bias).astype(x.dtype)
 
 
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -1,7 +1,5 @@
 """SALAD: optimal-transport aggregation of patch features (Izquierdo and Civera, CVPR 2024)."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -15,6 +13,7 @@ from crisalad_jax.nn.layers import (
     linear,
     split_key,
 )
+from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
 from crisalad_jax.pytree import params
 from crisalad_jax.sinkhorn import SinkhornResult, assign
@@ -40,13 +39,6 @@ class Salad:
     cluster_features: TwoLayer
     score: TwoLayer
     dust_bin: Float[Array, ""]
-
-
-class SaladTokens(NamedTuple):
-    """One image's tokens, each of unit length, before they are joined into a descriptor."""
-
-    global_token: Float[Array, " token_dim"]
-    clusters: Float[Array, "cluster cluster_dim"]
 
 
 def init_salad(key: PRNGKeyArray, dim: int, config: SaladConfig) -> Salad:
@@ -91,7 +83,7 @@ def transport(
 
 def salad(
     params: Salad, features: Features, config: SaladConfig, *, key: PRNGKeyArray | None
-) -> SaladTokens:
+) -> Tokens:
     """Global token and cluster tokens of one image (paper Eq. 6), each L2-normalised, in float32.
 
     `key` draws the dropout of the cluster and score networks; None means inference.
@@ -104,13 +96,11 @@ def salad(
     local = _two_layer(params.cluster_features, features.patches, config.dropout, cluster_key)
     plan = jnp.exp(transport(params, features.patches, config, key=score_key).log_plan[:, :-1])
     clusters = jnp.einsum("nm,nd->md", plan, local.astype(plan.dtype))
-    return SaladTokens(l2_normalise(global_token.astype(plan.dtype)), l2_normalise(clusters))
+    return Tokens(l2_normalise(global_token.astype(plan.dtype)), l2_normalise(clusters))
 
 
-def join(tokens: SaladTokens) -> Float[Array, " descriptor"]:
-    """One unit descriptor: the global token, then the clusters dimension by dimension.
-
-    The clusters' numbers stand in the public implementation's order: all clusters' first dimension,
-    then all clusters' second.
-    """
-    return l2_normalise(jnp.concatenate([tokens.global_token, tokens.clusters.T.ravel()]))
+def published_order(
+    clusters: Float[Array, "cluster cluster_dim"],
+) -> Float[Array, "cluster_dim cluster"]:
+    """The order of the public descriptor: all clusters' first dimension, then all their second."""
+    return clusters.T

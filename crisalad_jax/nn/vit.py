@@ -115,7 +115,7 @@ def _init_block(key: PRNGKeyArray, config: ViTConfig) -> Block:
         norm2=init_layer_norm(dim),
         mlp=mlp,
         ls2=jnp.full(dim, config.layer_scale_start, jnp.float32),
-        adapter=None if config.adapter.kind == "none" else init_adapter(adapter_key, config),
+        adapter=init_adapter(adapter_key, config),
     )
 
 

@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from crisalad_jax.config import AdapterConfig, ViTConfig
-from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
+from crisalad_jax.nn.adapter import adapter, init_adapter
+from crisalad_jax.nn.layers import Linear
+from crisalad_jax.pytree import named_leaves
 
 GRID = (3, 5)
 
@@ -48,7 +50,37 @@ def test_the_papers_adapter_has_its_parameter_count() -> None:
     assert sum(leaf.size for leaf in jax.tree.leaves(shapes)) == 741_504
 
 
-def test_untrained_adapter_adds_nothing() -> None:
-    params: Adapter = init_adapter(jax.random.key(0), ViTConfig(dim=16, heads=2))
-    tokens = jax.random.normal(jax.random.key(2), (16, 16))
-    np.testing.assert_array_equal(adapter(params, tokens, GRID), jnp.zeros((16, 16)))
+def test_cricavprs_adapter_has_its_parameter_count() -> None:
+    """761.472 K in Table 3, which counts neither the batch norms nor the convolutions' biases."""
+    config = ViTConfig(adapter=AdapterConfig(kind="multi-resolution"))
+    shapes = jax.eval_shape(lambda key: init_adapter(key, config), jax.random.key(0))
+    counted = [
+        leaf.size
+        for name, leaf in named_leaves(shapes).items()
+        if ".norm." not in name and not name.endswith("conv.bias")
+    ]
+    assert sum(counted) == 761_472
+
+
+@pytest.mark.parametrize("kind", ["depthwise", "multi-resolution", "mlp"])
+def test_an_untrained_adapter_adds_nothing(kind: str) -> None:
+    config = ViTConfig(dim=32, heads=2, adapter=AdapterConfig(kind=kind))
+    params = init_adapter(jax.random.key(0), config)
+    tokens = jax.random.normal(jax.random.key(2), (16, 32))
+    np.testing.assert_array_equal(adapter(params, tokens, GRID), jnp.zeros((16, 32)))
+
+
+def test_no_adapter_is_none() -> None:
+    config = ViTConfig(adapter=AdapterConfig(kind="none"))
+    assert init_adapter(jax.random.key(0), config) is None
+
+
+def test_an_mlp_adapter_looks_at_no_neighbour() -> None:
+    config = ViTConfig(dim=32, heads=2, adapter=AdapterConfig(kind="mlp"))
+    params = init_adapter(jax.random.key(0), config)
+    params = dataclasses.replace(params, up=Linear(jnp.ones((16, 32)), jnp.ones(32)))
+    tokens = jax.random.normal(jax.random.key(2), (16, 32))
+    hidden = np.maximum(tokens @ params.down.weight + params.down.bias, 0)
+    expected = np.broadcast_to(hidden.sum(axis=1, keepdims=True) + 1, (16, 32))
+    # A sum of 16 numbers of order 1.
+    np.testing.assert_allclose(adapter(params, tokens, GRID), expected, atol=1e-5)

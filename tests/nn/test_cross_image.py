@@ -1,4 +1,4 @@
-"""The cross-image encoder against torch.nn.TransformerEncoder with masks; its sequences."""
+"""The cross-image encoder against torch.nn.TransformerEncoder with masks, and its dropout."""
 
 import jax
 import jax.numpy as jnp
@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.config import CrossImageConfig, SaladConfig
+from crisalad_jax.config import CrossImageConfig
 from crisalad_jax.nn.cross_image import (
-    as_sequence,
     cross_image_encoder,
-    from_sequence,
     init_cross_image,
 )
-from crisalad_jax.nn.salad import SaladTokens
 
 CONFIG = CrossImageConfig(layers=2, heads=4, feedforward=24, dropout=0.1)
 IMAGES, TOKENS, DIM = 5, 3, 16
@@ -74,19 +71,6 @@ def test_dropout_is_on_with_a_key_only() -> None:
     plain = cross_image_encoder(params, tokens, CONFIG, key=None)
     dropped = cross_image_encoder(params, tokens, CONFIG, key=jax.random.key(2))
     assert not np.allclose(plain, dropped, atol=1e-3)
-
-
-@pytest.mark.parametrize("global_token", [True, False])
-def test_sequences_round_trip(global_token: bool) -> None:
-    salad = SaladConfig(clusters=3, cluster_dim=4, token_dim=8)
-    config = CrossImageConfig(global_token=global_token)
-    tokens = SaladTokens(jnp.arange(8.0), jnp.arange(12.0).reshape(3, 4))
-    sequence = as_sequence(tokens, salad, config)
-    assert sequence.shape == (5 if global_token else 3, 4)
-    back = from_sequence(2 * sequence, tokens, salad, config)
-    factor = 2 if global_token else 1  # left out, it comes back untouched
-    np.testing.assert_array_equal(back.global_token, factor * tokens.global_token)
-    np.testing.assert_array_equal(back.clusters, 2 * tokens.clusters)
 
 
 def test_dropout_stands_where_torch_has_it(monkeypatch) -> None:
