@@ -6,9 +6,10 @@ bounds, 1e-5 on outputs and 1e-4 on gradients, are ten to a hundred times float3
 the few hundred additions of these layers; a wrong constant or axis shows at 1e-2 and more.
 """
 
+import functools
 import pathlib
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,20 +19,71 @@ import pytest
 from crisalad_jax.config import (
     AdapterConfig,
     CrossImageConfig,
+    ModelConfig,
     SaladConfig,
     SinkhornConfig,
     ViTConfig,
 )
-from crisalad_jax.nn.cross_image import cross_image_encoder
+from crisalad_jax.layouts import (
+    Entry,
+    Extra,
+    adapter_lines,
+    aggregator_lines,
+    encoder_lines,
+    to_params,
+    to_state,
+)
+from crisalad_jax.model import Crisalad
+from crisalad_jax.nn.adapter import adapter, init_adapter
+from crisalad_jax.nn.aggregators import join
+from crisalad_jax.nn.cross_image import cross_image_encoder, init_cross_image
 from crisalad_jax.nn.layers import layer_norm
-from crisalad_jax.nn.salad import join, salad, transport
+from crisalad_jax.nn.salad import init_salad, salad, transport
 from crisalad_jax.nn.vit import NORM_EPSILON, Features, embed, grid_of, run_blocks
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.sinkhorn import assign
-from parity.torch_names import encoder_from_torch, salad_from_torch, vit_from_torch
 
 GOLDENS = pathlib.Path(__file__).parent / "goldens"
 OUTPUT_BOUND, GRADIENT_BOUND = 1e-5, 1e-4
+NO_GRADIENT = ("mask_token", "running_mean", "running_var")
+"""Last parts of the names of what the public models hold and do not differentiate."""
+
+State = Mapping[str, np.ndarray]
+
+
+class Names(NamedTuple):
+    """From public names to our parameters, and from our gradients to public names."""
+
+    ours: Callable[[State], Any]
+    theirs: Callable[[Any], dict[str, np.ndarray]]
+
+
+def part_names(prefix: str, lines: Iterable[Entry | Extra], template: Any) -> Names:
+    """For one part of a model, whose names lack the `prefix` that the table's have.
+
+    Of `template` only the structure counts.
+    """
+    entries = [line for line in lines if isinstance(line, Entry)]
+    structure = jax.tree.structure(template)
+    order = [f"{prefix}.{name}" for name in named_leaves(template)]
+
+    def ours(state: State) -> Any:
+        found: dict[str, np.ndarray] = {}
+        for entry in entries:
+            arrays = (state[name.removeprefix(f"{prefix}.")] for name in entry.theirs)
+            found |= zip(entry.ours, entry.form.ours(*arrays), strict=True)
+        return jax.tree.unflatten(structure, [jnp.asarray(found[name]) for name in order])
+
+    def theirs(params: Any) -> dict[str, np.ndarray]:
+        leaves = dict(zip(order, map(np.asarray, jax.tree.leaves(params)), strict=True))
+        found: dict[str, np.ndarray] = {}
+        for entry in entries:
+            arrays = entry.form.theirs(*(leaves[name] for name in entry.ours))
+            names = (name.removeprefix(f"{prefix}.") for name in entry.theirs)
+            found |= zip(names, arrays, strict=True)
+        return found
+
+    return Names(ours, theirs)
 
 
 def load(name: str) -> dict[str, np.ndarray]:
@@ -39,7 +91,7 @@ def load(name: str) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-def under(golden: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+def under(golden: State, prefix: str) -> dict[str, np.ndarray]:
     return {k.removeprefix(prefix): v for k, v in golden.items() if k.startswith(prefix)}
 
 
@@ -50,18 +102,18 @@ def relative_error(ours: Any, theirs: Any) -> float:
 
 
 def golden_loss(outputs: Any) -> jax.Array:
-    return sum(jnp.sin(3 * leaf).sum() for leaf in jax.tree.leaves(outputs))
+    return jnp.stack([jnp.sin(3 * leaf).sum() for leaf in jax.tree.leaves(outputs)]).sum()
 
 
 def check(
     function: Callable[[Any, Any], dict[str, jax.Array]],
-    golden: dict[str, np.ndarray],
-    params: Any,
+    golden: State,
+    names: Names,
     inputs: dict[str, jax.Array],
-    params_of: Callable[[dict[str, np.ndarray]], Any],
     exempt: tuple[str, ...] = (),
 ) -> None:
     """Compare outputs, loss, and the gradients to every parameter and input."""
+    params = names.ours(under(golden, "state."))
     outputs = jax.jit(function)(params, inputs)
     for name, output in outputs.items():
         assert relative_error(output, golden[f"out.{name}"]) < OUTPUT_BOUND, name
@@ -71,12 +123,11 @@ def check(
     # The loss is a sum of thousands of terms of both signs: its rounding scales with their count.
     count = sum(output.size for output in outputs.values())
     assert abs(loss - golden["loss"]) < 1e-6 * count
-    expected = named_leaves(params_of(under(golden, "grad.")))
-    actual = named_leaves(params_grad)
-    assert actual.keys() == expected.keys()
-    for name, gradient in actual.items():
-        if name not in exempt and gradient.size:
-            assert relative_error(gradient, expected[name]) < GRADIENT_BOUND, name
+    expected = under(golden, "grad.")
+    actual = names.theirs(params_grad)
+    assert {n for n in actual if n.rpartition(".")[2] not in NO_GRADIENT} == expected.keys()
+    for name in expected.keys() - set(exempt):
+        assert relative_error(actual[name], expected[name]) < GRADIENT_BOUND, name
     for name, gradient in inputs_grad.items():
         assert relative_error(gradient, golden[f"gradin.{name}"]) < GRADIENT_BOUND, name
 
@@ -94,6 +145,9 @@ def test_vit(name: str, registers: int) -> None:
         registers=registers,
         position_grid=5,
         adapter=AdapterConfig(kind="none"),
+    )
+    model = ModelConfig(
+        backbone=config, aggregator="class-token", encoder=CrossImageConfig(layers=0)
     )
 
     def one(params: Any, image: jax.Array) -> dict[str, jax.Array]:
@@ -113,42 +167,54 @@ def test_vit(name: str, registers: int) -> None:
         outputs = jax.vmap(one, in_axes=(None, 0))(params, inputs["image"])
         return {k: v for k, v in outputs.items() if f"out.{k}" in golden}
 
-    def from_torch(state: dict[str, np.ndarray]) -> Any:
-        return vit_from_torch(state, depth=2)
-
-    check(
-        function,
-        golden,
-        from_torch(under(golden, "state.")),
-        {"image": jnp.asarray(golden["in.image"])},
-        from_torch,
+    names = Names(
+        lambda state: to_params(state, model, "dinov2", source=name)[0].backbone,
+        lambda params: to_state(Crisalad(params, None, None), model, "dinov2", extras={}),
     )
+    check(function, golden, names, {"image": jnp.asarray(golden["in.image"])})
+
+
+def test_multi_resolution_adapter() -> None:
+    golden = load("multiconv_adapter")
+    # The stored one narrows 24 channels to 4, not to a sixteenth: our configuration has the names
+    # and the structure, not the widths.
+    config = ViTConfig(dim=48, heads=3, adapter=AdapterConfig("multi-resolution", bottleneck=1.0))
+    template = jax.eval_shape(functools.partial(init_adapter, config=config), jax.random.key(0))
+
+    def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return {"tokens": jax.vmap(lambda x: adapter(params, x, (5, 5)))(inputs["tokens"])}
+
+    names = part_names("adapter", adapter_lines(config, "adapter", "adapter"), template)
+    check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})
 
 
 def test_salad() -> None:
     golden = load("salad")
     config = SaladConfig(clusters=6, cluster_dim=8, token_dim=16, hidden=512)
+    model = ModelConfig(salad=config, encoder=CrossImageConfig(layers=0))
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         batch, channels = inputs["features"].shape[:2]
         patches = inputs["features"].reshape(batch, channels, -1).transpose(0, 2, 1)
 
         def one(token: jax.Array, local: jax.Array) -> jax.Array:
-            return join(salad(params, Features(token, local), config, key=None))
+            return join(salad(params, Features(token, local), config, key=None), model)
 
         return {"descriptor": jax.vmap(one)(inputs["token"], patches)}
 
-    params = salad_from_torch(under(golden, "state."))
+    template = jax.eval_shape(lambda key: init_salad(key, 48, config), jax.random.key(0))
+    names = part_names("aggregator", aggregator_lines(model), template)
     inputs = {name: jnp.asarray(golden[f"in.{name}"]) for name in ("features", "token")}
     # A constant added to a column of scores is absorbed by the column's potential: the dustbin's
     # score and the score network's last bias have no effect, their gradients are rounding noise.
-    dead = {"dust_bin": "dust_bin", "score.fc2.bias": "score.3.bias"}
-    check(function, golden, params, inputs, salad_from_torch, exempt=tuple(dead))
-    gradients = named_leaves(jax.grad(lambda p: golden_loss(function(p, inputs)))(params))
-    for ours, theirs in dead.items():
+    dead = ("dust_bin", "score.3.bias")
+    check(function, golden, names, inputs, exempt=dead)
+    params = names.ours(under(golden, "state."))
+    gradients = names.theirs(jax.grad(lambda p: golden_loss(function(p, inputs)))(params))
+    for name in dead:
         # Sums of 3 x 24 terms below 0.1 that cancel: 72 x 0.1 x float32's 6e-8.
-        assert np.abs(gradients[ours]).max() < 5e-7
-        assert np.abs(golden[f"grad.{theirs}"]).max() < 5e-7
+        assert np.abs(gradients[name]).max() < 5e-7
+        assert np.abs(golden[f"grad.{name}"]).max() < 5e-7
 
     patches = inputs["features"].reshape(3, 48, -1).transpose(0, 2, 1)
     plan = jax.vmap(lambda p: jnp.exp(transport(params, p, config, key=None).log_plan))(patches)
@@ -184,8 +250,6 @@ def test_cross_image_encoder() -> None:
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         return {"tokens": cross_image_encoder(params, inputs["tokens"], config, key=None)}
 
-    def from_torch(state: dict[str, np.ndarray]) -> Any:
-        return encoder_from_torch(state, layers=2)
-
-    inputs = {"tokens": jnp.asarray(golden["in.tokens"])}
-    check(function, golden, from_torch(under(golden, "state.")), inputs, from_torch)
+    template = jax.eval_shape(lambda key: init_cross_image(key, 16, config), jax.random.key(0))
+    names = part_names("encoder", encoder_lines(config), template)
+    check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})

@@ -1,0 +1,112 @@
+"""The adapters beside a block's MLP: the paper's (section 3.2), and its Table 2's two others.
+
+CricaVPR's names of parameters, and for the other two names in its manner.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from crisalad_jax.config import ViTConfig
+from parity.reference.layers import BatchNorm2d, Conv2d, Linear
+
+BATCH_NORM_EPSILON = 1e-3
+
+
+class MlpAdapter(nn.Module):
+    """Down, ReLU, up: no look at the neighbours at all. The up-projection starts at 0."""
+
+    def __init__(self, dim: int, width: int, *, bias: bool = True) -> None:
+        """From tokens of `dim` to `width` and back."""
+        super().__init__()
+        self.D_fc1 = Linear(dim, width, bias=bias)
+        self.D_fc2 = Linear(width, dim, bias=bias)
+        for parameter in self.D_fc2.parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+        """(batch, token, dim) to the same; the last rows x columns tokens are patches."""
+        hidden = F.relu(self.D_fc1(tokens))
+        return self.D_fc2(self.mix(hidden, grid))
+
+    def mix(self, hidden: Tensor, grid: tuple[int, int]) -> Tensor:
+        """What happens at the bottleneck: nothing here."""
+        return hidden
+
+
+def over_grid(
+    convolve: Callable[[Tensor], Tensor], hidden: Tensor, grid: tuple[int, int]
+) -> Tensor:
+    """Convolutions on the grid of patches, plus a skip: (batch, token, width) to the same.
+
+    The special tokens (class and registers) pass the convolutions as they are: with the skip they
+    count twice, as in CricaVPR.
+    """
+    special, patches = hidden.tensor_split([hidden.shape[1] - grid[0] * grid[1]], dim=1)
+    mixed = convolve(patches.mT.unflatten(-1, grid)).flatten(2).mT
+    return hidden + torch.cat([special, mixed], dim=1)
+
+
+class DepthwiseAdapter(MlpAdapter):
+    """The paper's depthwise-separable convolution; its linears carry no bias."""
+
+    def __init__(self, dim: int, width: int, kernel_size: int) -> None:
+        """The depthwise filters are `kernel_size` x `kernel_size`."""
+        super().__init__(dim, width, bias=False)
+        self.depthwise = Conv2d(width, width, kernel_size, padding="same", groups=width)
+        self.pointwise = Conv2d(width, width, 1)
+
+    def mix(self, hidden: Tensor, grid: tuple[int, int]) -> Tensor:
+        """(batch, token, width) to the same."""
+        return over_grid(self.convolve, hidden, grid)
+
+    def convolve(self, x: Tensor) -> Tensor:
+        """(batch, width, rows, columns) to the same."""
+        # No activation between the two convolutions, as in Xception.
+        return F.relu(self.pointwise(self.depthwise(x)))
+
+
+class ConvNorm(nn.Module):
+    """A convolution, batch norm and ReLU."""
+
+    def __init__(self, d_in: int, d_out: int, kernel_size: int) -> None:
+        """The padding keeps the grid."""
+        super().__init__()
+        self.conv = Conv2d(d_in, d_out, kernel_size, padding="same")
+        self.bn = BatchNorm2d(d_out, eps=BATCH_NORM_EPSILON)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(batch, d_in, rows, columns) to (batch, d_out, rows, columns)."""
+        return F.relu(self.bn(self.conv(x)))
+
+
+class MultiResolutionAdapter(MlpAdapter):
+    """CricaVPR's: convolutions of 1 x 1, 3 x 3 and 5 x 5 side by side, the last two narrowed."""
+
+    def __init__(self, dim: int, width: int) -> None:
+        """The branches give 1/2, 1/4 and 1/4 of `width`."""
+        super().__init__(dim, width)
+        narrow, quarter = width // 16, width // 4
+        self.branch1 = ConvNorm(width, width // 2, 1)
+        self.branch2 = nn.Sequential(ConvNorm(width, narrow, 1), ConvNorm(narrow, quarter, 3))
+        self.branch3 = nn.Sequential(ConvNorm(width, narrow, 1), ConvNorm(narrow, quarter, 5))
+
+    def mix(self, hidden: Tensor, grid: tuple[int, int]) -> Tensor:
+        """(batch, token, width) to the same."""
+        return over_grid(self.convolve, hidden, grid)
+
+    def convolve(self, x: Tensor) -> Tensor:
+        """(batch, width, rows, columns) to the same; the branches' channels follow each other."""
+        return torch.cat([self.branch1(x), self.branch2(x), self.branch3(x)], dim=1)
+
+
+def make_adapter(config: ViTConfig) -> MlpAdapter | None:
+    """The adapter of `config.adapter.kind`; None for "none"."""
+    dim, width = config.dim, config.adapter_dim
+    if config.adapter.kind == "depthwise":
+        return DepthwiseAdapter(dim, width, config.adapter.kernel_size)
+    if config.adapter.kind == "multi-resolution":
+        return MultiResolutionAdapter(dim, width)
+    return MlpAdapter(dim, width) if config.adapter.kind == "mlp" else None

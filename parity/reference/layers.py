@@ -1,0 +1,55 @@
+"""The small layers, each in the type of its input: torch's, whose parameters may be wider."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def widen(x: Tensor) -> Tensor:
+    """`x` in float32, or in its own type if that is wider: for norms, softmax and transport."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+class Linear(nn.Linear):
+    """Affine map of the last axis."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., d_in) to (..., d_out)."""
+        # Product and sum are rounded one by one, as in `crisalad_jax`.
+        y = F.linear(x, self.weight.to(x.dtype))
+        return y if self.bias is None else y + self.bias.to(x.dtype)
+
+
+class Conv2d(nn.Conv2d):
+    """Convolution with bias."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(batch, d_in, height, width) to (batch, d_out, height, width)."""
+        weight = self.weight.to(x.dtype)
+        y = F.conv2d(x, weight, stride=self.stride, padding=self.padding, groups=self.groups)
+        assert self.bias is not None
+        return y + self.bias.to(x.dtype)[:, None, None]
+
+
+class LayerNorm(nn.LayerNorm):
+    """Normalises the last axis, in float32 at least."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., dim) to (..., dim)."""
+        y = F.layer_norm(widen(x), self.normalized_shape, self.weight, self.bias, self.eps)
+        return y.to(x.dtype)
+
+
+class BatchNorm2d(nn.BatchNorm2d):
+    """Normalises by its stored statistics in training as well, and never updates them."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(batch, dim, height, width) to the same, in float32 at least inside."""
+        statistics = self.running_mean, self.running_var
+        y = F.batch_norm(widen(x), *statistics, self.weight, self.bias, eps=self.eps)
+        return y.to(x.dtype)
+
+
+def l2_normalise(x: Tensor) -> Tensor:
+    """Scale the last axis to length 1."""
+    return F.normalize(x, dim=-1)

@@ -1,0 +1,78 @@
+"""Multi-similarity loss with online mining (Wang et al., CVPR 2019), as used with GSV-Cities.
+
+There is no `valid` here: images that only pad a batch of `crisalad_jax` are left out instead.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from crisalad_jax.config import MultiSimilarityConfig
+from parity.reference.layers import widen
+
+
+class MinedPairs(NamedTuple):
+    """Which pairs (anchor, other) enter the loss: two (anchor, image) of bool."""
+
+    positives: Tensor
+    negatives: Tensor
+
+
+class LossResult(NamedTuple):
+    """The loss and what is logged beside it, both ()."""
+
+    loss: Tensor
+    b_acc: Tensor
+    """Share of the anchors without a mined positive."""
+
+
+def mine(similarities: Tensor, labels: Tensor, *, epsilon: float) -> MinedPairs:
+    """Pairs that violate the order within their row by less than `epsilon` of margin, strictly.
+
+    Args:
+        similarities: (anchor, image).
+        labels: (image,) of integers.
+        epsilon: the margin.
+    """
+    same = labels[:, None] == labels
+    positives = same & ~torch.eye(len(labels), dtype=torch.bool, device=labels.device)
+    negatives = ~same
+    # An anchor without positives or without negatives compares with infinity, and mines nothing.
+    hardest_negative = similarities.masked_fill(~negatives, -torch.inf).amax(1, keepdim=True)
+    hardest_positive = similarities.masked_fill(~positives, torch.inf).amin(1, keepdim=True)
+    return MinedPairs(
+        positives & (similarities - epsilon < hardest_negative),
+        negatives & (similarities + epsilon > hardest_positive),
+    )
+
+
+def multi_similarity_loss(
+    descriptors: Tensor, labels: Tensor, config: MultiSimilarityConfig
+) -> LossResult:
+    """Mean over all anchors of the loss of their mined pairs; the miner passes no gradient.
+
+    Args:
+        descriptors: (image, descriptor), unit vectors.
+        labels: (image,): the place of each image.
+        config: constants.
+    """
+    wide = widen(descriptors)
+    similarities = wide @ wide.T
+    pairs = mine(similarities.detach(), labels, epsilon=config.epsilon)
+    centred = similarities - config.base
+    per_anchor = (
+        _log1p_sum_exp(-config.alpha * centred, pairs.positives) / config.alpha
+        + _log1p_sum_exp(config.beta * centred, pairs.negatives) / config.beta
+    )
+    loss = per_anchor.mean()
+    if config.library_quirk and max(pairs.positives.sum(), pairs.negatives.sum()) <= 1:
+        loss = 0 * loss
+    return LossResult(loss, 1 - pairs.positives.any(dim=1).to(loss.dtype).mean())
+
+
+def _log1p_sum_exp(x: Tensor, where: Tensor) -> Tensor:
+    """log(1 + sum of exp(x) over the chosen), 0 where none is chosen."""
+    # A column of zeros is the 1 inside the logarithm.
+    return F.pad(x.masked_fill(~where, -torch.inf), (0, 1)).logsumexp(dim=1)

@@ -1,0 +1,54 @@
+"""SALAD: optimal-transport aggregation of patch features (Izquierdo and Civera, CVPR 2024)."""
+
+import torch
+from torch import Tensor, nn
+
+from crisalad_jax.config import SaladConfig
+from parity.reference.layers import Conv2d, Linear, l2_normalise, widen
+from parity.reference.sinkhorn import assign
+from parity.reference.tokens import Tokens
+from parity.reference.vit import Features
+
+
+class Salad(nn.Module):
+    """The three networks over features, and the dustbin's score."""
+
+    def __init__(self, dim: int, config: SaladConfig) -> None:
+        """For features of width `dim`. Torch's default start, dustbin score 1."""
+        super().__init__()
+        self.sinkhorn = config.sinkhorn
+        self.token_features = nn.Sequential(
+            Linear(dim, config.hidden),
+            nn.ReLU(),
+            Linear(config.hidden, config.token_dim),
+        )
+        self.cluster_features = _pointwise_network(dim, config.cluster_dim, config)
+        self.score = _pointwise_network(dim, config.clusters, config)
+        self.dust_bin = nn.Parameter(torch.ones(()))
+
+    def forward(self, features: Features) -> Tokens:
+        """Global and cluster tokens (paper Eq. 6), each L2-normalised, in float32 at least."""
+        global_token = widen(self.token_features(features.class_token))
+        local = widen(self.cluster_features(features.patches)).flatten(2)
+        plan = self.transport(features.patches)[:, :-1].exp()
+        clusters = torch.einsum("bkn,bdn->bkd", plan, local)
+        return Tokens(l2_normalise(global_token), l2_normalise(clusters))
+
+    def transport(self, patches: Tensor) -> Tensor:
+        """(batch, dim, rows, columns) to logarithms of the plan, (batch, cluster + 1, patch)."""
+        scores = widen(self.score(patches)).flatten(2)
+        return assign(scores, self.dust_bin, self.sinkhorn)
+
+
+def _pointwise_network(dim: int, d_out: int, config: SaladConfig) -> nn.Sequential:
+    return nn.Sequential(
+        Conv2d(dim, config.hidden, 1),
+        nn.Dropout(config.dropout),
+        nn.ReLU(),
+        Conv2d(config.hidden, d_out, 1),
+    )
+
+
+def published_order(clusters: Tensor) -> Tensor:
+    """(batch, cluster, dim) to (batch, dim, cluster): the order of the public descriptor."""
+    return clusters.mT

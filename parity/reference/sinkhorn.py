@@ -1,0 +1,38 @@
+"""Sinkhorn in the log domain, with a dustbin (Cuturi 2013; Sarlin et al. 2020; SALAD, CVPR 2024).
+
+Laid out as published, clusters in rows and patches in columns: the transpose of `crisalad_jax`.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from crisalad_jax.config import SinkhornConfig
+
+
+def assign(scores: Tensor, dust_bin: Tensor, config: SinkhornConfig) -> Tensor:
+    """SALAD's assignment of patches to clusters, as logarithms (paper Eqs. 4 and 5).
+
+    Each patch has mass 1, each cluster 1, the dustbin the rest. Few iterations leave the clusters'
+    masses inexact: the patches are scaled last.
+
+    Args:
+        scores: (batch, cluster, patch), with more patches than clusters.
+        dust_bin: () score of the dustbin, the same for every patch.
+        config: how many iterations, and the regularisation that scores are divided by.
+
+    Returns:
+        (batch, cluster + 1, patch), the dustbin last.
+    """
+    batch, clusters, patches = scores.shape
+    dust = dust_bin.to(scores.dtype).expand(batch, 1, patches)
+    kernel = torch.cat([scores, dust], dim=1) / config.epsilon
+    log_mass = kernel.new_zeros(clusters + 1, 1)
+    log_mass[-1] = math.log(patches - clusters)
+    cluster_potential = kernel.new_zeros(batch, clusters + 1, 1)
+    patch_potential = kernel.new_zeros(batch, 1, patches)
+    for _ in range(config.iterations):
+        cluster_potential = log_mass - (kernel + patch_potential).logsumexp(dim=2, keepdim=True)
+        patch_potential = -(kernel + cluster_potential).logsumexp(dim=1, keepdim=True)
+    return kernel + cluster_potential + patch_potential

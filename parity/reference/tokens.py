@@ -1,0 +1,31 @@
+"""What an aggregator makes of the images: the tokens that become descriptors."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Tokens(NamedTuple):
+    """One global token an image, and the local ones: of clusters, or of regions of a pyramid."""
+
+    global_token: Tensor
+    """(batch, global_dim)."""
+    local: Tensor
+    """(batch, token, dim)."""
+
+
+def as_sequence(tokens: Tokens, *, global_token: bool) -> Tensor:
+    """The local tokens, behind the global one cut to their width if it takes part."""
+    if not global_token:
+        return tokens.local
+    pieces = tokens.global_token.unflatten(1, (-1, tokens.local.shape[-1]))
+    return torch.cat([pieces, tokens.local], dim=1)
+
+
+def from_sequence(sequence: Tensor, before: Tokens, *, global_token: bool) -> Tokens:
+    """Undo `as_sequence`; a global token that took no part is the one from `before`."""
+    if not global_token:
+        return Tokens(before.global_token, sequence)
+    pieces = sequence.shape[1] - before.local.shape[1]
+    return Tokens(sequence[:, :pieces].flatten(1), sequence[:, pieces:])

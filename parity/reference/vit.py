@@ -1,0 +1,187 @@
+"""DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024)."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from crisalad_jax.config import PATCH_SIZE, ViTConfig
+from parity.reference.adapter import make_adapter
+from parity.reference.attention import Attention
+from parity.reference.layers import Conv2d, LayerNorm, Linear
+
+NORM_EPSILON = 1e-6
+
+
+class Features(NamedTuple):
+    """What a backbone says of the images, after its last layer norm."""
+
+    class_token: Tensor
+    """(batch, dim)."""
+    patches: Tensor
+    """(batch, dim, rows, columns)."""
+
+
+class PatchEmbed(nn.Module):
+    """A linear map of each patch, written as a convolution with as long a stride."""
+
+    def __init__(self, dim: int) -> None:
+        """From the 3 x 14 x 14 numbers of a patch to `dim`."""
+        super().__init__()
+        self.proj = Conv2d(3, dim, PATCH_SIZE, stride=PATCH_SIZE)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(batch, 3, height, width) to (batch, patch, dim), patches in row order."""
+        return self.proj(images).flatten(2).mT
+
+
+class LayerScale(nn.Module):
+    """A gain for every channel."""
+
+    def __init__(self, dim: int, start: float) -> None:
+        """All gains start at `start`."""
+        super().__init__()
+        self.gamma = nn.Parameter(torch.full((dim,), start))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., dim) to (..., dim)."""
+        return self.gamma.to(x.dtype) * x
+
+
+class Mlp(nn.Module):
+    """Feed-forward network: fc1, exact GELU, fc2."""
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        """One hidden layer of width `hidden`."""
+        super().__init__()
+        self.fc1 = Linear(dim, hidden)
+        self.fc2 = Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., dim) to (..., dim)."""
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class SwiGlu(nn.Module):
+    """Feed-forward network of ViT-g (Shazeer 2020): gate and value side by side in w12, then w3."""
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        """Gate and value are `hidden` wide each."""
+        super().__init__()
+        self.w12 = Linear(dim, 2 * hidden)
+        self.w3 = Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., dim) to (..., dim)."""
+        gate, value = self.w12(x).chunk(2, dim=-1)
+        return self.w3(F.silu(gate) * value)
+
+
+class Block(nn.Module):
+    """One block (paper Eq. 2), with LayerScale over MLP and adapter alike, as in CricaVPR."""
+
+    def __init__(self, config: ViTConfig) -> None:
+        """With the feed-forward network and the adapter that `config` names."""
+        super().__init__()
+        feed_forward = SwiGlu if config.ffn == "swiglu" else Mlp
+        self.alpha = config.adapter.alpha
+        self.norm1 = LayerNorm(config.dim, eps=NORM_EPSILON)
+        self.attn = Attention(config.dim, config.heads)
+        self.ls1 = LayerScale(config.dim, config.layer_scale_start)
+        self.norm2 = LayerNorm(config.dim, eps=NORM_EPSILON)
+        self.mlp = feed_forward(config.dim, config.hidden)
+        self.ls2 = LayerScale(config.dim, config.layer_scale_start)
+        self.adapter = make_adapter(config)
+
+    def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+        """(batch, token, dim) to the same; `grid` is the rows and columns of patches."""
+        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
+        normed = self.norm2(tokens)
+        update = self.mlp(normed)
+        if self.adapter is not None:
+            update = update + self.alpha * self.adapter(normed, grid)
+        return tokens + self.ls2(update)
+
+
+class ViT(nn.Module):
+    """The backbone. `mask_token` is DINOv2's of training: held, and never used here."""
+
+    def __init__(self, config: ViTConfig) -> None:
+        """Start as DINOv2 does before training: matrices normal of deviation 0.02, biases 0."""
+        super().__init__()
+        dim, side = config.dim, config.position_grid
+        if config.position_start == "sincos":
+            positions = _sincos_positions(side, dim)
+        else:
+            positions = 0.02 * torch.randn(side * side, dim)
+        self.cls_token = nn.Parameter(1e-6 * torch.randn(1, 1, dim))
+        self.pos_embed = nn.Parameter(torch.cat([torch.zeros(1, dim), positions])[None])
+        self.register_tokens = (
+            nn.Parameter(1e-6 * torch.randn(1, config.registers, dim)) if config.registers else None
+        )
+        self.mask_token = nn.Parameter(torch.zeros(1, dim))
+        self.patch_embed = PatchEmbed(dim)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
+        self.norm = LayerNorm(dim, eps=NORM_EPSILON)
+        for name, parameter in self.named_parameters():
+            if ".adapter." in name:
+                continue
+            if name.endswith(".bias"):
+                nn.init.zeros_(parameter)
+            elif name.endswith(".weight") and parameter.ndim > 1:
+                nn.init.trunc_normal_(parameter, std=0.02, a=-0.04, b=0.04)
+
+    def forward(self, images: Tensor) -> Features:
+        """(batch, 3, height, width) to features; the sides are multiples of 14."""
+        grid = grid_of(images)
+        tokens = self.norm(self.run_blocks(self.embed(images), grid))
+        patches = tokens[:, -grid[0] * grid[1] :]
+        return Features(tokens[:, 0], patches.mT.unflatten(-1, grid))
+
+    def embed(self, images: Tensor) -> Tensor:
+        """Class token, registers and patches with their positions; registers have none."""
+        patches = self.patch_embed(images)
+        positions = self.interpolate_positions(grid_of(images))
+        special = self.cls_token + self.pos_embed[:, :1]
+        if self.register_tokens is not None:
+            special = torch.cat([special, self.register_tokens], dim=1)
+        special = special.to(images.dtype).expand(len(images), -1, -1)
+        return torch.cat([special, patches + positions.to(images.dtype)], dim=1)
+
+    def run_blocks(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+        """All blocks in turn."""
+        for block in self.blocks:
+            tokens = block(tokens, grid)
+        return tokens
+
+    def interpolate_positions(self, grid: tuple[int, int]) -> Tensor:
+        """Position embeddings of a grid, (1, rows x columns, dim), resized as DINOv2 does.
+
+        Models without registers are resized by the scale (size + 0.1) / side, those with registers
+        to the exact size and antialiased. A grid as stored is left as it is.
+        """
+        stored = self.pos_embed[:, 1:]
+        side = round(stored.shape[1] ** 0.5)
+        if grid == (side, side):
+            return stored
+        image = stored.mT.unflatten(-1, (side, side))
+        if self.register_tokens is None:
+            scale = [(size + 0.1) / side for size in grid]
+            resized = F.interpolate(image, scale_factor=scale, mode="bicubic")
+        else:
+            resized = F.interpolate(image, size=grid, mode="bicubic", antialias=True)
+        return resized.flatten(2).mT
+
+
+def grid_of(images: Tensor) -> tuple[int, int]:
+    """Rows and columns of patches."""
+    return images.shape[-2] // PATCH_SIZE, images.shape[-1] // PATCH_SIZE
+
+
+def _sincos_positions(side: int, dim: int) -> Tensor:
+    """Fixed 2-D sine-cosine codes (MoCo v3's), half the width for rows and half for columns."""
+    frequencies = 1e4 ** -(torch.arange(dim // 4) / (dim // 4))
+    angles = torch.outer(torch.arange(side), frequencies)
+    code = torch.cat([angles.sin(), angles.cos()], dim=1)
+    return torch.cat([code.repeat_interleave(side, dim=0), code.repeat(side, 1)], dim=1)
