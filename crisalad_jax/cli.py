@@ -150,10 +150,10 @@ def _start(arguments: Train, config: TrainConfig) -> Crisalad | None:
 class Convert:
     """Convert a public torch checkpoint to a file of this package, or such a file back."""
 
-    source: tyro.conf.Positional[pathlib.Path]
+    source: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC")]
     """DINOv2 .pth, Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth, the torch
     reference, or a file of this package."""
-    target: tyro.conf.Positional[pathlib.Path]
+    target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST")]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
     layout: str | None = None
     """dinov2, huggingface, dino-salad, cricavpr or reference, for a source of this package; by

@@ -15,17 +15,28 @@ import numpy as np
 import PIL.Image
 import pytest
 import safetensors.numpy
+import torch
 
 import crisalad_jax.cli
 from crisalad_jax.checkpoint import load_weights, save_weights
 from crisalad_jax.cli import main
-from crisalad_jax.config import TrainConfig
+from crisalad_jax.config import (
+    AdapterConfig,
+    CrossImageConfig,
+    ModelConfig,
+    TrainConfig,
+    ViTConfig,
+)
+from crisalad_jax.convert import read_checkpoint
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import list_images, read_image, resize_image
 from crisalad_jax.evaluation import evaluate
+from crisalad_jax.files import write_json
+from crisalad_jax.layouts import public_shapes
 from crisalad_jax.model import Crisalad, describe
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import read_config, to_plain
+from tests.checkpoints import random_state, save
 from tests.conftest import (
     BATCH,
     IMAGES_PER_PLACE,
@@ -93,7 +104,9 @@ def test_help_lists_every_command_and_flag(capfd):
         assert f"{command} {kind.__doc__}" in out
         help_text = succeeds(capfd, command, "--help")
         for field in dataclasses.fields(kind):
-            if field.name != "settings":
+            if field.name in ("source", "target"):
+                assert {"source": "SRC", "target": "DST"}[field.name] in help_text
+            elif field.name != "settings":
                 assert f"--{field.name.replace('_', '-')}" in help_text
     for flag in (
         "--model.backbone.adapter.kind",
@@ -111,7 +124,10 @@ def test_no_command_prints_the_usage(capfd):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("tran --data d --out o", "command: found 'tran', expected one of demo, evaluate, extract"),
+        (
+            "tran --data d --out o",
+            "command: found 'tran', expected one of convert, demo, evaluate, ext",
+        ),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
         ("train --data d --out o --preset b16", "preset: found 'b16'"),
         ("evaluate --data d --preset b16", "preset: found 'b16'"),
@@ -432,6 +448,78 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
     ):
         fails(capfd, *arguments, *start, words=(f"crisalad: {weights}: ",))
     assert files_in(tmp_path) == before
+
+
+# convert, and a backbone to start from
+
+
+BACKBONE = ModelConfig(
+    aggregator="class-token",
+    backbone=ViTConfig(
+        dim=64, depth=2, heads=1, position_grid=3, adapter=AdapterConfig(kind="none")
+    ),
+    encoder=CrossImageConfig(layers=0),
+)
+
+
+@pytest.fixture
+def public(tmp_path) -> pathlib.Path:
+    """A DINOv2 checkpoint of two blocks of width 64."""
+    return save(tmp_path / "dinov2.pth", random_state(public_shapes(BACKBONE, "dinov2")))
+
+
+def test_convert_says_what_it_found(capfd, tmp_path, public):
+    ours, back = tmp_path / "w.safetensors", tmp_path / "back.pth"
+    out = succeeds(capfd, "convert", public, ours)
+    assert f"{public} (DINOv2 .pth) -> {ours} (crisalad-jax): backbone of width 64, 2 blocks" in out
+    assert "descriptor of 64 numbers" in out
+    assert load_weights(ours)[1] == BACKBONE
+    out = succeeds(capfd, "convert", ours, back)
+    assert f"(crisalad-jax) -> {back} (DINOv2 .pth)" in out
+    assert back.read_bytes() == public.read_bytes()
+    succeeds(capfd, "convert", ours, back, "--layout", "reference")
+    assert torch.load(back).keys() == {"state_dict", "config"}
+
+
+def test_convert_refuses_in_one_line(capfd, tmp_path, public):
+    for arguments, words in (
+        ((public, tmp_path / "x.pth"), ("x.pth: found suffix '.pth', expected .safetensors",)),
+        ((tmp_path / "none", tmp_path / "x.safetensors"), ("none: found no such file",)),
+        ((public, tmp_path / "x.safetensors", "--layout", "timm"), ("layout: found 'timm'",)),
+        ((public,), ("DST",)),
+    ):
+        fails(capfd, "convert", *arguments, words=words)
+    assert files_in(tmp_path) == {"dinov2.pth"}
+
+
+def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
+    model = dataclasses.replace(
+        RECIPE.model, backbone=dataclasses.replace(BACKBONE.backbone, adapter=AdapterConfig())
+    )
+    recipe = dataclasses.replace(RECIPE, model=model, trains="adapters+head", epochs=1)
+    write_json(tmp_path / "recipe.json", to_plain(recipe))
+    arguments = (
+        *("train", "--config", tmp_path / "recipe.json", "--backbone", public),
+        *("--data", shared / "city", "--quiet"),
+    )
+    fails(
+        capfd,
+        *(*arguments, "--out", tmp_path / "r", "--weights", public),
+        words=("--backbone: found beside --weights",),
+    )
+    fails(
+        capfd,
+        *(*arguments, "--out", tmp_path / "r", "--model.backbone.depth", 3),
+        words=(f"{public}: this backbone is of another size: depth: found 2, expected 3",),
+    )
+    assert not (tmp_path / "r").exists()
+    succeeds(capfd, *arguments, "--out", tmp_path / "run")
+    trained, _ = load_weights(tmp_path / "run" / "last.safetensors")
+    found = named_leaves(trained.backbone)
+    # The frozen part is the file's to the bit; the adapters have moved from their start at 0.
+    for name, leaf in named_leaves(read_checkpoint(public).params.backbone).items():
+        np.testing.assert_array_equal(found[name], leaf)
+    assert np.abs(found["blocks.adapter.up.weight"]).max() > 0
 
 
 # evaluate

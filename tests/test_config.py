@@ -114,6 +114,27 @@ def test_one_patch_more_than_clusters_is_enough():
             {"dim": 6, "heads": 1, "position_start": "sincos"},
             "ViTConfig.dim: found 6, expected a multiple of 4",
         ),
+        (
+            ViTConfig,
+            {
+                "dim": 96,
+                "heads": 2,
+                "adapter": AdapterConfig(kind="multi-resolution", bottleneck=0.25),
+            },
+            "bottleneck: found 0.25, which is a width of 24 for dim 96; expected a multiple of 16",
+        ),
+        (ModelConfig, {"aggregator": "netvlad"}, "ModelConfig.aggregator: found 'netvlad'"),
+        (
+            ModelConfig,
+            {"aggregator": "gem-pyramid", "image_size": (28, 56)},
+            "found 28 x 56, expected at least 42 x 42, a patch for every region",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": "gem-pyramid", "encoder": CrossImageConfig(heads=5)},
+            "ViTConfig.dim: found 768, expected a multiple of the cross-image encoder's 5 heads",
+        ),
+        (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (SinkhornConfig, {"epsilon": -1.0}, "SinkhornConfig.epsilon: found -1.0"),
         (SinkhornConfig, {"epsilon": float("nan")}, "SinkhornConfig.epsilon: found nan"),

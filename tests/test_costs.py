@@ -13,16 +13,30 @@ from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.model import alone, describe, init_crisalad
 
 
+def with_adapter(kind: str) -> ModelConfig:
+    backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=AdapterConfig(kind=kind))
+    return dataclasses.replace(PRESETS["b14"], backbone=backbone)
+
+
 def test_table_3() -> None:
     assert paper_adapter_macs(PRESETS["b14"]) == 39_223_296
     costs = {cost.part: cost for cost in part_costs(PRESETS["b14"])}
     assert costs["adapters"].parameters == 12 * 741_504
+    assert paper_adapter_macs(with_adapter("multi-resolution")) == 44_236_800
 
 
 def test_one_adapter_by_hand() -> None:
     """257 tokens down and up, 256 patches through 9 taps and a 384 x 384 product."""
     by_hand = 257 * 768 * 384 * 2 + 256 * (9 * 384 + 384 * 384)
     assert adapter_macs(PRESETS["b14"]) == by_hand == 190_218_240
+
+
+def test_the_other_adapters_by_hand() -> None:
+    """CricaVPR's branches: 384 -> 192, and twice 384 -> 24 and then 3 x 3 or 5 x 5 to 96."""
+    linears = 257 * 768 * 384 * 2
+    branches = 384 * 192 + 2 * 384 * 24 + (9 + 25) * 24 * 96
+    assert adapter_macs(with_adapter("multi-resolution")) == linears + 256 * branches
+    assert adapter_macs(with_adapter("mlp")) == linears
 
 
 def test_parameters_of_the_public_backbone() -> None:
@@ -70,8 +84,13 @@ SMALL = ModelConfig(
             ),
             encoder=CrossImageConfig(layers=0),
         ),
+        dataclasses.replace(
+            SMALL,
+            aggregator="gem-pyramid",
+            backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="mlp")),
+        ),
     ],
-    ids=["adapters, encoder", "swiglu, registers, neither"],
+    ids=["adapters, encoder", "swiglu, registers, neither", "pyramid, mlp"],
 )
 def test_count_equals_the_programs_products(config: ModelConfig) -> None:
     images = 3
@@ -89,7 +108,7 @@ def test_count_equals_the_programs_products(config: ModelConfig) -> None:
         rows * grid * grid * dim + rows * grid * columns * dim,
     }
     taps = 0
-    if config.backbone.adapter.kind != "none":
+    if config.backbone.adapter.kind == "depthwise":
         taps = config.backbone.depth * rows * columns * 9 * config.backbone.adapter_dim
     ours = images * (sum(cost.macs for cost in part_costs(config, images=images)) - taps)
     assert counted - ours in orders

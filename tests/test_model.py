@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.config import PRESETS, CrossImageConfig
+from crisalad_jax.config import PRESETS, AdapterConfig, CrossImageConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import alone, among, describe, init_crisalad, relate, tokenise
 from crisalad_jax.nn.pixels import normalise
@@ -57,6 +57,29 @@ def test_every_preset_composes(preset: str) -> None:
     params = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
     images = jax.ShapeDtypeStruct((1, 224, 308, 3), jnp.uint8)
     assert jax.eval_shape(lambda p, x: describe(p, x, config), params, images).shape == (1, 8448)
+
+
+@pytest.mark.parametrize(
+    ("aggregator", "kind", "layers", "width"),
+    [
+        ("gem-pyramid", "multi-resolution", 2, 14 * 768),  # CricaVPR
+        ("salad", "none", 0, 8448),  # DINO-SALAD
+        ("class-token", "none", 0, 768),  # DINOv2
+        ("class-token", "mlp", 1, 768),
+    ],
+)
+def test_the_other_models_compose(aggregator: str, kind: str, layers: int, width: int) -> None:
+    config = dataclasses.replace(
+        PRESETS["b14"],
+        aggregator=aggregator,
+        backbone=dataclasses.replace(PRESETS["b14"].backbone, adapter=AdapterConfig(kind=kind)),
+        encoder=CrossImageConfig(layers=layers),
+    )
+    params = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
+    images = jax.ShapeDtypeStruct((2, 322, 308, 3), jnp.uint8)
+    found = jax.eval_shape(lambda p, x: describe(p, x, config), params, images)
+    assert (found.shape, found.dtype) == ((2, width), jnp.float32)
+    assert config.descriptor_dim == width
 
 
 def test_padding_images_change_nothing(params) -> None:

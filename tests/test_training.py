@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.config import MultiSimilarityConfig, OptimiserConfig
+from crisalad_jax.config import AdapterConfig, MultiSimilarityConfig, OptimiserConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.losses import multi_similarity_loss
 from crisalad_jax.model import describe, init_crisalad
@@ -44,6 +44,17 @@ def params():
 def fresh(params):
     """A copy, since a step takes over the buffers of its state."""
     return jax.tree.map(jnp.copy, params)
+
+
+@pytest.mark.parametrize("trains", ["adapters+head", "last-1-blocks+head", "all"])
+def test_batch_norm_statistics_never_train(trains: str) -> None:
+    adapter = AdapterConfig(kind="multi-resolution")
+    config = dataclasses.replace(
+        MODEL, backbone=dataclasses.replace(MODEL.backbone, adapter=adapter)
+    )
+    names = named_leaves(split_params(init_crisalad(jax.random.key(0), config), trains)[0])
+    assert any(".adapter.branch1.norm.weight" in name for name in names)
+    assert not any("running" in name for name in names)
 
 
 @pytest.mark.parametrize(
