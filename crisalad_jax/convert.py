@@ -109,7 +109,7 @@ def _torch(purpose: str) -> Any:
         import torch
     except ImportError as error:
         raise InputError(
-            f"to {purpose} torch is needed and not installed: pip install 'crisalad-jax[convert]'"
+            f"to {purpose} torch is needed and not installed: pip install torch"
         ) from error
     return torch
 

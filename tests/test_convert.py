@@ -341,5 +341,5 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
 def test_without_torch_its_files_ask_for_it(tmp_path: pathlib.Path, monkeypatch) -> None:
     source = written(tmp_path, "dinov2")
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(InputError, match=r"torch is needed and not installed: .*\[convert\]"):
+    with pytest.raises(InputError, match=r"torch is needed and not installed"):
         read_checkpoint(source)
