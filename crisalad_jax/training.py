@@ -100,12 +100,17 @@ def learning_rate_schedule(config: OptimiserConfig, steps: int) -> optax.Schedul
     peak, end = config.learning_rate, config.learning_rate * config.final_fraction
     decay = optax.linear_schedule(peak, end, max(steps - config.warmup_steps, 1))
     if not config.warmup_steps:
-        return decay
+        return _of_real_steps(decay)
     # The first step of a warm-up of n is 1 / n of the peak, not a step of length 0.
     warmup = optax.linear_schedule(
         peak / config.warmup_steps, peak, max(config.warmup_steps - 1, 1)
     )
-    return optax.join_schedules([warmup, decay], [config.warmup_steps])
+    return _of_real_steps(optax.join_schedules([warmup, decay], [config.warmup_steps]))
+
+
+def _of_real_steps(schedule: optax.Schedule) -> optax.Schedule:
+    # A quotient of optax's int32 count is float32, in JAX's 64-bit mode too.
+    return lambda count: schedule(jnp.asarray(count, float))
 
 
 def make_optimiser(config: OptimiserConfig, steps: int) -> optax.GradientTransformation:

@@ -23,7 +23,8 @@ def normalise(image: UInt8[Array, "height width 3"], how: str) -> Float[Array, "
         InputError: no such normalisation.
     """
     ways = {"imagenet": _imagenet, "local-contrast": _local_contrast}
-    return choose("normalisation", how, ways)(image.astype(jnp.float32) / 255)
+    # JAX's own type of real numbers: float32, and float64 in its 64-bit mode.
+    return choose("normalisation", how, ways)(image.astype(float) / 255)
 
 
 def _imagenet(image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
@@ -45,4 +46,4 @@ def _local_contrast(image: Float[Array, "height width 3"]) -> Float[Array, "heig
 def _box(side: int) -> np.ndarray:
     """(side, side) averaging matrix; at the border the mean is of what is left of the box."""
     near = np.abs(np.arange(side)[:, None] - np.arange(side)) <= LOCAL_WINDOW // 2
-    return (near / near.sum(axis=1, keepdims=True)).astype(np.float32)
+    return near / near.sum(axis=1, keepdims=True)

@@ -1,0 +1,102 @@
+"""`python -m parity`: compare every layer and whole training runs with the torch reference.
+
+Exit codes: 0 all within their tolerances, 1 a row missed, 2 bad arguments.
+"""
+
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Callable, Sequence
+
+import rich.console
+import tyro
+
+from crisalad_jax.config import choose
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import check_target
+from crisalad_jax.progress import progress_bar
+from parity.cases import checks
+from parity.compare import PRECISIONS, Row
+from parity.full_size import full_size_checks
+from parity.report import terminal_table, verdict, write_report
+
+
+@dataclasses.dataclass(frozen=True)
+class Parity:
+    """Compare crisalad_jax with its torch reference: a table of errors, tolerances and verdicts."""
+
+    precision: str = ",".join(PRECISIONS)
+    """Precisions, separated by commas."""
+    full_size: bool = False
+    """Also ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308: up to 4 GB."""
+    only: str = ""
+    """Only layers whose name contains this, in upper or lower case."""
+    seed: int = 0
+    """Draws weights and inputs."""
+    out: pathlib.Path = pathlib.Path("parity-report")
+    """Folder for parity.json and parity.md."""
+
+
+Work = dict[tuple[str, str], Callable[[], list[Row]]]
+
+
+def _plan(arguments: Parity) -> Work:
+    """What to do, by precision and name.
+
+    Raises:
+        InputError: no such precision, a negative seed, nothing of this name, or a folder that
+            cannot be made.
+    """
+    if arguments.seed < 0:
+        raise InputError(f"--seed: found {arguments.seed}, expected at least 0")
+    check_target(arguments.out / "parity.json")
+    check_target(arguments.out / "parity.md")
+    work: Work = {}
+    for precision in arguments.precision.split(","):
+        choose("--precision", precision, dict.fromkeys(PRECISIONS))
+        found = checks(precision, arguments.seed)
+        if arguments.full_size:
+            found |= full_size_checks(precision, arguments.seed)
+        for name, check in found.items():
+            if arguments.only.lower() in name.lower():
+                work[precision, name] = check
+    if not work:
+        raise InputError(f"--only: found {arguments.only!r}, which is in the name of no layer")
+    return work
+
+
+def _run(work: Work) -> list[Row]:
+    rows: list[Row] = []
+    with progress_bar("parity", len(work), "checks", quiet=False) as bar:
+        for precision, name in list(work):
+            bar.advance(0, f"{precision}: {name}")
+            # Popped, so that the weights of a full size are gone before the next precision's come.
+            rows += work.pop((precision, name))()
+            bar.advance(1)
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    try:
+        settings = tyro.cli(Parity, prog="python -m parity", args=arguments)
+    except SystemExit as stop:  # 2 after a complaint, 0 after --help
+        return int(stop.code or 0)
+    try:
+        work = _plan(settings)
+    except InputError as error:
+        print("parity:", error, file=sys.stderr)
+        return 2
+    rows = _run(work)
+    console = rich.console.Console(width=None if sys.stdout.isatty() else 200)
+    for precision in dict.fromkeys(row.precision for row in rows):
+        console.print(terminal_table(rows, precision))
+    shown = {"precision": settings.precision, "seed": settings.seed}
+    shown |= {"only": settings.only} if settings.only else {}
+    write_report(settings.out, rows, shown)
+    console.print(f"{verdict(rows)}. Written to {settings.out}: parity.md, parity.json")
+    return 0 if all(row.passed for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,247 @@
+"""What is compared: one list of layers, whole models and training runs, all of them tiny."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from crisalad_jax.config import (
+    AdapterConfig,
+    CrossImageConfig,
+    ModelConfig,
+    SaladConfig,
+    SinkhornConfig,
+    ViTConfig,
+)
+from parity.cases import parts
+from parity.cases.case import Case, Draw, check_case
+from parity.cases.run import Run, check_run
+from parity.compare import Row
+
+BATCH = 4
+PATCHES = parts.GRID[0] * parts.GRID[1]
+SIZE = (14 * parts.GRID[0], 14 * parts.GRID[1])
+
+
+def _model(
+    kind: Any = "none", *, encoder: int = 0, aggregator: Any = "salad", **backbone: Any
+) -> ModelConfig:
+    # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
+    bottleneck = 2.0 if kind == "multi-resolution" else 0.5
+    return ModelConfig(
+        image_size=SIZE,
+        backbone=ViTConfig(
+            dim=32,
+            depth=2,
+            heads=2,
+            position_grid=4,
+            adapter=AdapterConfig(kind, bottleneck),
+            **backbone,
+        ),
+        aggregator=aggregator,
+        salad=SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0),
+        encoder=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
+    )
+
+
+def _transport(iterations: int, epsilon: float) -> ModelConfig:
+    model = _model()
+    sinkhorn = SinkhornConfig(iterations, epsilon)
+    return dataclasses.replace(model, salad=dataclasses.replace(model.salad, sinkhorn=sinkhorn))
+
+
+PLAIN = _model()
+REGISTERS = _model(registers=3)
+CRISALAD = _model("depthwise", encoder=1)
+CRISALAD_REGISTERS = _model("depthwise", encoder=1, registers=3, ffn="swiglu")
+DINO_SALAD = _model()
+CRICAVPR = _model("multi-resolution", encoder=1, aggregator="gem-pyramid")
+TWO_LAYERS = _model(encoder=2)
+CLASS_TOKEN = _model(aggregator="class-token")
+
+
+def normal(*shape: int, scale: float = 1.0) -> Draw:
+    """Draws normal numbers."""
+    return lambda rng: rng.normal(scale=scale, size=shape).astype(np.float32)
+
+
+def unit(*shape: int) -> Draw:
+    """Draws vectors of length 1 that resemble each other, as descriptors do."""
+
+    def draw(rng: np.random.Generator) -> np.ndarray:
+        vectors = 1 + rng.normal(size=shape)
+        return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
+
+    return draw
+
+
+def pixels(*shape: int) -> Draw:
+    """Draws bytes."""
+    return lambda rng: rng.integers(0, 256, shape, dtype=np.uint8)
+
+
+def similarities(count: int) -> Draw:
+    """Draws inner products of such vectors."""
+
+    def draw(rng: np.random.Generator) -> np.ndarray:
+        vectors = unit(count, 8)(rng)
+        return vectors @ vectors.T
+
+    return draw
+
+
+def among(valid: int) -> Draw:
+    """The mask under which the first few images look at each other, others at themselves only."""
+    first = np.arange(BATCH) < valid
+    return constant(first[:, None] & first | np.eye(BATCH, dtype=bool))
+
+
+def earlier() -> Draw:
+    """The mask under which an image looks at itself and those before it: not symmetric."""
+    return constant(np.tri(BATCH, dtype=bool))
+
+
+def constant(array: object) -> Draw:
+    """Draws nothing."""
+    return lambda _: np.asarray(array)
+
+
+IMAGES = {"images": normal(BATCH, *SIZE, 3)}
+# Of little variance, so that an epsilon inside a layer norm shows.
+TOKENS = {"tokens": normal(BATCH, 1 + PATCHES, 32, scale=0.05)}
+REGISTER_TOKENS = {"tokens": normal(BATCH, 4 + PATCHES, 32, scale=0.05)}
+FEATURES = {"class_token": normal(BATCH, 32), "patches": normal(BATCH, PATCHES, 32)}
+SCORES = {"scores": normal(BATCH, PATCHES, 5), "dustbin": constant(np.float32(1.3))}
+SEQUENCES = {"tokens": unit(BATCH, 7, 16)}
+LABELS = constant(np.array([0, 0, 0, 1, 1, 1, 2, 2, 2, 3], np.int32))
+DESCRIPTORS = {"descriptors": unit(10, 24), "labels": LABELS}
+
+
+def _position_cases() -> list[Case]:
+    grids = {
+        "as stored": (4, 4),
+        "square, up": (7, 7),
+        "square, down": (3, 3),
+        "not square": (3, 6),
+        "not square, up": (5, 9),
+        "not square, down": (2, 3),
+    }
+    return [
+        Case(f"positions{kind}: {name}", model, parts.positions(grid), bfloat16=False)
+        for kind, model in (("", PLAIN), (" with registers", REGISTERS))
+        for name, grid in grids.items()
+    ]
+
+
+def _sinkhorn_cases() -> list[Case]:
+    # The published 3 and 1.0; to convergence at 100; and at epsilon 0.1 nearly a choice.
+    settings = [(1, 1.0), (3, 1.0), (10, 1.0), (100, 1.0), (3, 0.1), (3, 0.5), (3, 2.0), (10, 0.1)]
+    return [
+        Case(
+            f"Sinkhorn: {iterations} iterations, epsilon {epsilon}",
+            _transport(iterations, epsilon),
+            parts.SINKHORN,
+            SCORES,
+            bfloat16=False,
+        )
+        for iterations, epsilon in settings
+    ]
+
+
+CASES: tuple[Case, ...] = (
+    Case(
+        "pixels to numbers",
+        PLAIN,
+        parts.PIXELS,
+        {"images": pixels(BATCH, *SIZE, 3)},
+        bfloat16=False,
+    ),
+    Case("patch embedding", PLAIN, parts.EMBED, IMAGES),
+    Case("patch embedding with registers", REGISTERS, parts.EMBED, IMAGES),
+    *_position_cases(),
+    Case("attention", PLAIN, parts.ATTENTION, TOKENS),
+    Case("MLP", PLAIN, parts.FEED_FORWARD, TOKENS),
+    Case("SwiGLU", _model(ffn="swiglu"), parts.FEED_FORWARD, TOKENS),
+    Case("block, no adapter", PLAIN, parts.BLOCK, TOKENS),
+    *(
+        Case(
+            f"block, {kind} adapter",
+            _model(kind, registers=registers),
+            parts.BLOCK,
+            tokens,
+            smooth=False,
+        )
+        for kind, registers, tokens in (
+            ("depthwise", 3, REGISTER_TOKENS),
+            ("multi-resolution", 0, TOKENS),
+            ("mlp", 0, TOKENS),
+        )
+    ),
+    *_sinkhorn_cases(),
+    Case("SALAD", PLAIN, parts.AGGREGATE, FEATURES, smooth=False),
+    Case("GeM pyramid", CRICAVPR, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
+    Case("cross-image encoder", TWO_LAYERS, parts.ENCODER, SEQUENCES),
+    Case(
+        "cross-image encoder, masked",
+        TWO_LAYERS,
+        parts.ENCODER,
+        SEQUENCES | {"mask": earlier()},
+    ),
+    Case(
+        "miner",
+        PLAIN,
+        parts.MINER,
+        {"similarities": similarities(10), "labels": LABELS},
+        bfloat16=False,
+        exact=True,
+    ),
+    Case("loss", PLAIN, parts.LOSS_PART, DESCRIPTORS, bfloat16=False),
+    Case(
+        "loss, padded batch",
+        PLAIN,
+        parts.LOSS_PART,
+        DESCRIPTORS | {"valid": constant(np.arange(10) < 8)},
+        bfloat16=False,
+    ),
+    *(
+        Case(
+            name,
+            model,
+            parts.DESCRIPTOR,
+            inputs,
+            forward="descriptor",
+            smooth=model.aggregator == "class-token",
+        )
+        for name, model, inputs in (
+            ("CriSALAD", CRISALAD, IMAGES),
+            (
+                "CriSALAD, registers, SwiGLU, masked",
+                CRISALAD_REGISTERS,
+                IMAGES | {"mask": among(3)},
+            ),
+            ("DINO-SALAD", DINO_SALAD, IMAGES),
+            ("CricaVPR", CRICAVPR, IMAGES),
+            ("class token", CLASS_TOKEN, IMAGES),
+        )
+    ),
+)
+
+RUNS: tuple[Run, ...] = (
+    Run("training CriSALAD's adapters and head", CRISALAD, "adapters+head"),
+    Run("training CriSALAD's last block and head", CRISALAD, "last-1-blocks+head"),
+    Run("training all of CriSALAD", CRISALAD, "all"),
+    Run("training CricaVPR's adapters and head", CRICAVPR, "adapters+head"),
+)
+
+
+def checks(precision: str, seed: int) -> dict[str, Callable[[], list[Row]]]:
+    """Everything to do in one precision, by name, in the table's order."""
+
+    def of_case(case: Case) -> Callable[[], list[Row]]:
+        return lambda: check_case(case, precision, seed)
+
+    def of_run(run: Run) -> Callable[[], list[Row]]:
+        return lambda: check_run(run, precision, seed)
+
+    return {case.name: of_case(case) for case in CASES} | {run.name: of_run(run) for run in RUNS}

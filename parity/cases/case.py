@@ -1,0 +1,359 @@
+"""What is compared in a case: outputs, the gradient of everything, and a step of AdamW.
+
+Both sides hold the same float32 numbers and compute in the same precision. bfloat16 is compared
+with the reference in float64 too: ours may stray no further from it than torch does.
+"""
+
+import dataclasses
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import torch
+
+from crisalad_jax.config import ModelConfig, OptimiserConfig
+from crisalad_jax.layouts import to_params, to_state
+from crisalad_jax.model import Crisalad
+from crisalad_jax.training import make_optimiser
+from parity.cases.parts import Part
+from parity.cases.weights import random_state
+from parity.compare import (
+    AFTER,
+    EXACT,
+    OWN_STEP,
+    STEP,
+    TOLERANCES,
+    Arrays,
+    Row,
+    as_double,
+    compare,
+    compare_truth,
+    relative_error,
+)
+from parity.reference.model import Crisalad as TorchCrisalad
+
+LAYOUT = "reference"
+STEPS = 20
+ONE_STEP = OptimiserConfig(learning_rate=1e-2)
+"""A step so long that the rounding of the parameter it is added to is small beside it."""
+SLOPE = 1e-4
+"""Size of the gradients that flow into a case: small, so that AdamW's epsilon of 1e-8 counts."""
+
+Draw = Callable[[np.random.Generator], np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A layer, or a whole model's descriptor."""
+
+    name: str
+    model: ModelConfig
+    part: Part
+    inputs: Mapping[str, Draw] = dataclasses.field(default_factory=dict)
+    """How each input is drawn. Real numbers take the precision's type, and have gradients."""
+    forward: str = "layer"
+    """Which tolerance holds for the outputs: "layer" or "descriptor"."""
+    bfloat16: bool = True
+    """False for what is float32 at least in every model."""
+    smooth: bool = True
+    """False where a rectifier or clamp may fall to either side in low precision."""
+    exact: bool = False
+    """The outputs are choices, without gradients: they must be the same."""
+
+
+class Pass(NamedTuple):
+    """Outputs, and the gradients of the sum of outputs times slopes."""
+
+    outputs: Arrays
+    parameters: Arrays
+    """By the reference's names; only those that the case uses."""
+    inputs: Arrays
+
+
+def check_case(case: Case, precision: str, seed: int) -> list[Row]:
+    """All rows of a case; none where the precision says nothing new."""
+    if precision == "bfloat16" and not case.bfloat16:
+        return []
+    tolerances = TOLERANCES[precision]
+    rng = random(case.name, seed)
+    model = build(case.model, precision, rng)
+    inputs = {name: draw(rng) for name, draw in case.inputs.items()}
+    if precision == "bfloat16":
+        # Already rounded, so that the float64 reference sees the same inputs.
+        inputs = {name: _rounded(array) for name, array in inputs.items()}
+
+    def slope(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        return random(f"{case.name}: {name}", seed).normal(scale=SLOPE, size=shape)
+
+    theirs = _their_pass(case, model, inputs, slope)
+    with jax.enable_x64(precision == "float64"):
+        ours = _our_pass(case, model, inputs, slope)
+        if case.exact:
+            return [compare(case.name, "choices", precision, ours.outputs, theirs.outputs, EXACT)]
+        forward = tolerances[case.forward]
+        rows = [compare(case.name, "forward", precision, ours.outputs, theirs.outputs, forward)]
+        our_gradients, their_gradients = _gradients(ours, theirs)
+        noise = cancelling(their_gradients)
+        if their_gradients:
+            tolerance = tolerances["gradients" if case.smooth else "gradients, kinks"]
+            pair = our_gradients, their_gradients
+            rows.append(compare(case.name, "gradients", precision, *pair, tolerance, noise=noise))
+        if theirs.parameters:
+            steps = _check_step(case, precision, model, ours.parameters, theirs.parameters)
+            # Past a kink the gradients of bfloat16 are too far apart for steps along their signs.
+            rows += steps if case.smooth or precision != "bfloat16" else steps[:1]
+    if precision == "bfloat16":
+        exact = build(case.model, "float64", random(case.name, seed))
+        truth = _their_pass(case, exact, inputs, slope)
+        rows = _with_truth(case, rows, ours, theirs, truth)
+    return rows
+
+
+def _with_truth(case: Case, rows: list[Row], ours: Pass, theirs: Pass, truth: Pass) -> list[Row]:
+    """Rows of bfloat16, and those of both sides' errors from the reference in float64."""
+    precision = "bfloat16"
+    pair = ours.outputs, theirs.outputs
+    added = [compare_truth(case.name, "forward, from float64", precision, *pair, truth.outputs)]
+    mine, other = _gradients(ours, theirs)
+    true, _ = _gradients(truth, truth)
+    if case.smooth:
+        told = {name: array for name, array in true.items() if name not in cancelling(true)}
+        where = case.name, "gradients, from float64", precision
+        added.append(compare_truth(*where, mine, other, told))
+
+    def noted(row: Row) -> Row:
+        if row.quantity != "gradients" or row.worst not in true:
+            return row
+        error = relative_error(other[row.worst], true[row.worst])
+        return dataclasses.replace(row, note=f"torch's own is {error:.1e} from float64's")
+
+    return [*map(noted, rows), *added]
+
+
+def random(name: str, seed: int) -> np.random.Generator:
+    """Random numbers of one case, whichever others run."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def build(config: ModelConfig, precision: str, rng: np.random.Generator) -> TorchCrisalad:
+    """The reference with random weights: float32 numbers, in float64 where that is asked."""
+    model = TorchCrisalad(dataclasses.replace(config, compute_dtype=precision))
+    shapes = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
+    state = random_state(shapes, rng)
+    model.load_state_dict({name: torch.from_numpy(array) for name, array in state.items()})
+    return (model.double() if precision == "float64" else model).eval()
+
+
+def convert(model: TorchCrisalad) -> tuple[Crisalad, dict[str, np.ndarray]]:
+    """Our parameters of a reference model, in arrays of their own, and the extras beside them."""
+    state = {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
+    params, extras = to_params(state, model.config, LAYOUT, source="the torch reference")
+    return jax.tree.map(jnp.array, params), extras
+
+
+def split(arrays: Arrays) -> dict[str, np.ndarray]:
+    """Joined arrays cut into the parts that have errors of their own.
+
+    Queries, keys and values; the class token's position and those of the patches.
+    """
+    parts: dict[str, np.ndarray] = {}
+    for name, array in arrays.items():
+        if name.endswith(("qkv.weight", "qkv.bias", "in_proj_weight", "in_proj_bias")):
+            thirds = np.split(array, 3)
+            parts |= {f"{name}[{x}]": y for x, y in zip(("q", "k", "v"), thirds, strict=True)}
+        elif name.endswith("pos_embed"):
+            parts |= {f"{name}[class]": array[:, :1], f"{name}[grid]": array[:, 1:]}
+        else:
+            parts[name] = array
+    return parts
+
+
+def cancelling(names: Mapping[str, Any]) -> dict[str, str]:
+    """Those whose gradient is 0 but for rounding, each with one that tells its terms' size.
+
+    A constant added to a column of scores is absorbed by the column's potential in the transport:
+    so are the dustbin's score and the score network's last bias. A constant added to a row of
+    attention scores is absorbed by the softmax: so is the bias of the keys.
+    """
+    partners = {
+        "aggregator.dust_bin": "aggregator.score.3.weight",
+        "aggregator.score.3.bias": "aggregator.score.3.weight",
+        "dustbin": "scores",
+    }
+    found = {name: partner for name, partner in partners.items() if name in names}
+    for ending in ("qkv.bias[k]", "in_proj_bias[k]"):
+        partner = ending.replace("bias", "weight")
+        found |= {n: n.removesuffix(ending) + partner for n in names if n.endswith(ending)}
+    return found
+
+
+def _rounded(array: np.ndarray) -> np.ndarray:
+    if not np.issubdtype(array.dtype, np.floating):
+        return array
+    return torch.from_numpy(array).bfloat16().float().numpy()
+
+
+def _gradients(ours: Pass, theirs: Pass) -> tuple[Arrays, Arrays]:
+    """Gradients of all that either side uses; 0 where the other does not."""
+    mine, other = ({**split(x.parameters), **x.inputs} for x in (ours, theirs))
+    names = {**other, **mine}
+
+    def filled(side: Arrays) -> Arrays:
+        return {name: side.get(name, np.zeros_like(array)) for name, array in names.items()}
+
+    return filled(mine), filled(other)
+
+
+Slope = Callable[[str, tuple[int, ...]], np.ndarray]
+
+
+def _their_pass(
+    case: Case, model: TorchCrisalad, inputs: Mapping[str, np.ndarray], slope: Slope
+) -> Pass:
+    dtype = model.compute_dtype
+    tensors = {name: torch.from_numpy(array) for name, array in inputs.items()}
+    reals = {
+        name: tensor.to(dtype, copy=True).requires_grad_()
+        for name, tensor in tensors.items()
+        if tensor.is_floating_point()
+    }
+    outputs = case.part.theirs(model, tensors | reals, model.config)
+    wide = torch.promote_types(dtype, torch.float32)
+    terms = [
+        (output.to(wide) * torch.from_numpy(slope(name, tuple(output.shape))).to(wide)).sum()
+        for name, output in outputs.items()
+        if output.requires_grad
+    ]
+    by_name = {name: as_double(output) for name, output in outputs.items()}
+    if not terms:
+        return Pass(by_name, {}, {})
+    parameters = dict(model.named_parameters())
+    leaves = [*parameters.values(), *reals.values()]
+    gradients = torch.autograd.grad(torch.stack(terms).sum(), leaves, allow_unused=True)
+    found = [None if gradient is None else as_double(gradient) for gradient in gradients]
+    used = zip(parameters, found, strict=False)
+    return Pass(
+        by_name,
+        {name: gradient for name, gradient in used if gradient is not None and gradient.any()},
+        {
+            name: gradient
+            for name, gradient in zip(reals, found[len(parameters) :], strict=True)
+            if gradient is not None
+        },
+    )
+
+
+def _our_pass(
+    case: Case, model: TorchCrisalad, inputs: Mapping[str, np.ndarray], slope: Slope
+) -> Pass:
+    params, _ = convert(model)
+    config = model.config
+    reals = {
+        name: jnp.asarray(array, config.compute_dtype)
+        for name, array in inputs.items()
+        if np.issubdtype(array.dtype, np.floating)
+    }
+    constants = {name: jnp.asarray(x) for name, x in inputs.items() if name not in reals}
+    wide = jnp.promote_types(config.compute_dtype, jnp.float32)
+
+    def total(params: Crisalad, reals: Mapping[str, jax.Array]) -> tuple[jax.Array, Any]:
+        outputs = case.part.ours(params, {**constants, **reals}, config)
+        terms = [
+            (output.astype(wide) * jnp.asarray(slope(name, output.shape), wide)).sum()
+            for name, output in outputs.items()
+        ]
+        return sum(terms, jnp.zeros((), wide)), outputs
+
+    gradient = jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))
+    (_, outputs), (of_params, of_reals) = gradient(params, reals)
+    by_name = to_state(jax.tree.map(as_double, of_params), config, LAYOUT, {})
+    learnt = dict(model.named_parameters())
+    return Pass(
+        {name: as_double(output) for name, output in outputs.items()},
+        # A gradient of exactly 0 is of a parameter that the case does not use.
+        {name: array for name, array in by_name.items() if name in learnt and array.any()},
+        {name: as_double(array) for name, array in of_reals.items()},
+    )
+
+
+def _check_step(
+    case: Case,
+    precision: str,
+    model: TorchCrisalad,
+    our_gradients: Arrays,
+    their_gradients: Arrays,
+) -> list[Row]:
+    """One step from the same start: both sides along the reference's gradient, then each its own.
+
+    AdamW's first step is the sign of the gradient, whatever its size. Where a gradient is rounding
+    noise, the two sides' own signs have nothing to do with each other: such elements are left out
+    of the row of the steps along own gradients, and counted in its note.
+    """
+    names = [name for name in their_gradients if name in our_gradients]
+    start = {name: model.get_parameter(name).detach().numpy() for name in names}
+    optimiser = make_optimiser(ONE_STEP, STEPS)
+
+    @jax.jit
+    def step(params: jax.Array, gradient: jax.Array) -> jax.Array:
+        update, _ = optimiser.update(gradient, optimiser.init(params), params)
+        return jnp.asarray(optax.apply_updates(params, update))
+
+    def after(gradients: Arrays) -> dict[str, np.ndarray]:
+        # All arrays joined to one: the step is of each element, and one array compiles faster.
+        joined = np.concatenate([start[name].ravel() for name in names])
+        along = np.concatenate([gradients[name].ravel() for name in names]).astype(joined.dtype)
+        sizes = np.cumsum([start[name].size for name in names])[:-1]
+        pieces = np.split(as_double(step(joined, along)), sizes)
+        return split({n: x.reshape(start[n].shape) for n, x in zip(names, pieces, strict=True)})
+
+    origin = split({name: as_double(array) for name, array in start.items()})
+    theirs = _their_step(start, their_gradients)
+    same, own = after(their_gradients), after(our_gradients)
+    mine, other = split(our_gradients), split(their_gradients)
+    # An array without gradient, such as positions that a case does not use, would only decay.
+    compared = [name for name in theirs.keys() - cancelling(theirs).keys() if other[name].any()]
+    tolerances = TOLERANCES[precision]
+    floor = tolerances["gradients" if case.smooth else "gradients, kinks"].value
+    told = {name: _told(mine[name], other[name], floor) for name in compared}
+    elements, kept = sum(x.size for x in told.values()), sum(int(x.sum()) for x in told.values())
+    note = (
+        f"{elements - kept} of {elements} elements left out: gradients below {floor:.0e} of their "
+        "array's root mean square"
+    )
+
+    def moved(state: Arrays, where: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        return {name: np.where(where[name], state[name] - origin[name], 0) for name in compared}
+
+    everywhere = dict.fromkeys(compared, True)
+    rows = (
+        (STEP, moved(same, everywhere), moved(theirs, everywhere), ""),
+        (OWN_STEP, moved(own, told), moved(theirs, told), note),
+        (AFTER, *({n: x[n] for n in compared} for x in (own, theirs)), ""),
+    )
+    return [
+        compare(case.name, name, precision, ours, theirs, tolerances[name], note=note)
+        for name, ours, theirs, note in rows
+    ]
+
+
+def _their_step(start: Arrays, gradients: Arrays) -> dict[str, np.ndarray]:
+    leaves = {name: torch.from_numpy(array).clone() for name, array in start.items()}
+    for name, leaf in leaves.items():
+        leaf.grad = torch.from_numpy(gradients[name]).to(leaf.dtype)
+    torch.optim.AdamW(
+        leaves.values(),
+        lr=ONE_STEP.learning_rate,
+        betas=(ONE_STEP.b1, ONE_STEP.b2),
+        weight_decay=ONE_STEP.weight_decay,
+    ).step()
+    return split({name: as_double(leaf) for name, leaf in leaves.items()})
+
+
+def _told(ours: np.ndarray, theirs: np.ndarray, floor: float) -> np.ndarray:
+    """Where a gradient stands above rounding, or is 0 on both sides."""
+    size = np.abs(theirs)
+    return (size > floor * np.sqrt(np.mean(size**2))) | ((size == 0) & (ours == 0))

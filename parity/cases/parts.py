@@ -1,0 +1,188 @@
+"""Every layer as a pair of functions, ours and the torch reference's, from inputs to outputs.
+
+Inputs and outputs are dictionaries by name, in our layout: batch first, channels last. The first
+argument is the whole model on either side, so that the gradient of every parameter is at hand.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import torch
+from torch import Tensor
+
+from crisalad_jax.config import ModelConfig, MultiSimilarityConfig
+from crisalad_jax.losses import mine, multi_similarity_loss
+from crisalad_jax.model import Crisalad, describe
+from crisalad_jax.nn.aggregators import aggregate
+from crisalad_jax.nn.attention import attention
+from crisalad_jax.nn.cross_image import cross_image_encoder
+from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN, normalise
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.vit import Block, Features, block, embed, feed_forward, interpolate_positions
+from crisalad_jax.sinkhorn import assign
+from parity.reference import losses as torch_losses
+from parity.reference import sinkhorn as torch_sinkhorn
+from parity.reference.model import Crisalad as TorchCrisalad
+from parity.reference.tokens import Tokens as TorchTokens
+from parity.reference.vit import Features as TorchFeatures
+
+GRID = (3, 4)
+"""Rows and columns of patches wherever a case needs a grid: not square, so axes cannot be mixed."""
+LOSS = MultiSimilarityConfig(base=0.5)
+
+Inputs = Mapping[str, Any]
+
+
+class Part(NamedTuple):
+    """The same computation twice: (whole model, inputs, config) to outputs."""
+
+    ours: Callable[[Crisalad, Inputs, ModelConfig], dict[str, jax.Array]]
+    theirs: Callable[[TorchCrisalad, Inputs, ModelConfig], dict[str, Tensor]]
+
+
+def _last_block(params: Crisalad) -> Block:
+    return jax.tree.map(lambda x: x[-1], params.backbone.blocks)
+
+
+def _channels_first(images: Tensor) -> Tensor:
+    return images.permute(0, 3, 1, 2)
+
+
+def _our_pixels(_: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    return {"images": jax.vmap(lambda image: normalise(image, config.normalisation))(x["images"])}
+
+
+def _their_pixels(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[str, Tensor]:
+    return {"images": torch_normalise(x["images"], model.backbone.cls_token.dtype)}
+
+
+def torch_normalise(images: Tensor, dtype: torch.dtype) -> Tensor:
+    """8-bit (..., 3) as torchvision's `to_tensor` and `normalize` do, the channels left last."""
+    mean, deviation = (torch.tensor(x, dtype=dtype) for x in (IMAGENET_MEAN, IMAGENET_DEVIATION))
+    return (images.to(dtype) / 255 - mean) / deviation
+
+
+PIXELS = Part(_our_pixels, _their_pixels)
+
+
+def _our_embed(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    one = jax.vmap(lambda image: embed(params.backbone, image, config.backbone))
+    return {"tokens": one(x["images"])}
+
+
+EMBED = Part(
+    _our_embed,
+    lambda model, x, _: {"tokens": model.backbone.embed(_channels_first(x["images"]))},
+)
+
+
+def positions(grid: tuple[int, int]) -> Part:
+    """Position embeddings resized to a grid of patches."""
+
+    def ours(params: Crisalad, _: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+        resized = interpolate_positions(params.backbone.pos_embed, grid, config.backbone)
+        return {"positions": resized}
+
+    def theirs(model: TorchCrisalad, _: Inputs, __: ModelConfig) -> dict[str, Tensor]:
+        return {"positions": model.backbone.interpolate_positions(grid)[0].unflatten(0, grid)}
+
+    return Part(ours, theirs)
+
+
+def _our_attention(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    weights, heads = _last_block(params).attn, config.backbone.heads
+    return {"tokens": jax.vmap(lambda t: attention(weights, t, heads, key=None))(x["tokens"])}
+
+
+ATTENTION = Part(
+    _our_attention, lambda model, x, _: {"tokens": model.backbone.blocks[-1].attn(x["tokens"])}
+)
+
+FEED_FORWARD = Part(
+    lambda params, x, _: {"tokens": feed_forward(_last_block(params).mlp, x["tokens"])},
+    lambda model, x, _: {"tokens": model.backbone.blocks[-1].mlp(x["tokens"])},
+)
+
+
+def _our_block(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    weights = _last_block(params)
+    return {"tokens": jax.vmap(lambda t: block(weights, t, GRID, config.backbone))(x["tokens"])}
+
+
+BLOCK = Part(
+    _our_block, lambda model, x, _: {"tokens": model.backbone.blocks[-1](x["tokens"], GRID)}
+)
+
+
+def _our_aggregate(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    def one(class_token: jax.Array, patches: jax.Array) -> Tokens:
+        features = Features(class_token, patches)
+        return aggregate(params.aggregator, features, GRID, config, key=None)
+
+    return jax.vmap(one)(x["class_token"], x["patches"])._asdict()
+
+
+def _their_aggregate(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[str, Tensor]:
+    patches = x["patches"].mT.unflatten(-1, GRID)
+    tokens: TorchTokens = model.aggregate(TorchFeatures(x["class_token"], patches))
+    return tokens._asdict()
+
+
+AGGREGATE = Part(_our_aggregate, _their_aggregate)
+
+
+def _their_sinkhorn(_: TorchCrisalad, x: Inputs, config: ModelConfig) -> dict[str, Tensor]:
+    log_plan = torch_sinkhorn.assign(x["scores"].mT, x["dustbin"], config.salad.sinkhorn)
+    return {"log_plan": log_plan.mT}
+
+
+SINKHORN = Part(
+    lambda _, x, config: {
+        "log_plan": assign(x["scores"], x["dustbin"], config.salad.sinkhorn).log_plan
+    },
+    _their_sinkhorn,
+)
+
+
+def _our_encoder(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    assert params.encoder is not None
+    mask = x.get("mask")
+    tokens = cross_image_encoder(params.encoder, x["tokens"], config.encoder, mask=mask, key=None)
+    return {"tokens": tokens}
+
+
+ENCODER = Part(
+    _our_encoder, lambda model, x, _: {"tokens": model.encoder(x["tokens"], x.get("mask"))}
+)
+
+MINER = Part(
+    lambda _, x, __: mine(x["similarities"], x["labels"], epsilon=LOSS.epsilon)._asdict(),
+    lambda _, x, __: torch_losses.mine(
+        x["similarities"], x["labels"], epsilon=LOSS.epsilon
+    )._asdict(),
+)
+
+
+def _our_loss(_: Crisalad, x: Inputs, __: ModelConfig) -> dict[str, jax.Array]:
+    valid = x.get("valid")
+    return multi_similarity_loss(x["descriptors"], x["labels"], LOSS, valid=valid)._asdict()
+
+
+def _their_loss(_: TorchCrisalad, x: Inputs, __: ModelConfig) -> dict[str, Tensor]:
+    valid = x.get("valid", torch.ones_like(x["labels"], dtype=torch.bool))
+    found = torch_losses.multi_similarity_loss(x["descriptors"][valid], x["labels"][valid], LOSS)
+    return found._asdict()
+
+
+LOSS_PART = Part(_our_loss, _their_loss)
+
+
+def _our_descriptor(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    return {"descriptors": describe(params, x["images"], config, mask=x.get("mask"))}
+
+
+DESCRIPTOR = Part(
+    _our_descriptor,
+    lambda model, x, _: {"descriptors": model(_channels_first(x["images"]), x.get("mask"))},
+)

@@ -1,0 +1,34 @@
+"""Random weights far from every symmetric start, under the torch reference's names.
+
+Gains away from 1, biases away from 0, up-projections away from 0, batch statistics like those of a
+trained model: a layer that drops or confuses any of them gives other numbers.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+
+def random_state(
+    shapes: Mapping[str, tuple[int, ...]], rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """An array for every name, in float32; counts of batches in int64."""
+    return {name: _array(name, shape, rng) for name, shape in shapes.items()}
+
+
+def _array(name: str, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    leaf = name.rpartition(".")[2]
+    if leaf == "num_batches_tracked":
+        return np.full(shape, 7, np.int64)
+    if leaf == "running_var":
+        # From batch norm's epsilon of 1e-3 to 1: the epsilon counts.
+        array = 10 ** rng.uniform(-3, 0, shape)
+    elif leaf == "p":
+        array = rng.uniform(2, 4, shape)
+    elif leaf == "gamma" or (leaf == "weight" and len(shape) == 1):
+        array = rng.uniform(0.5, 1.5, shape)
+    elif leaf in ("weight", "in_proj_weight"):
+        array = rng.normal(size=shape) / np.sqrt(np.prod(shape[1:]))
+    else:  # biases, tokens, positions, running means, the dustbin's score
+        array = rng.normal(scale=0.2, size=shape)
+    return array.astype(np.float32)

@@ -1,0 +1,218 @@
+"""Errors between two implementations, the tolerances they are held to and why, rows of the table.
+
+The error of an array is the norm of the difference over the norm of the reference's array. A row
+shows the array with the largest error of those that it covers, so every one of them is held to it.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+Arrays = Mapping[str, np.ndarray]
+PRECISIONS = ("float32", "bfloat16", "float64")
+
+
+class Tolerance(NamedTuple):
+    """The largest relative error that passes."""
+
+    value: float
+    why: str
+
+
+TRUTH_FACTOR = 1.5
+"""How much further from float64 our bfloat16 may be than torch's."""
+
+EXACT = Tolerance(0.0, "choices, not numbers: every mined pair is the same")
+FROZEN = Tolerance(0.0, "no step touches what is frozen, batch norm's statistics among it")
+
+STEP, OWN_STEP, AFTER = (
+    "AdamW step, same gradient",
+    "AdamW step, own gradient",
+    "parameters after it",
+)
+
+TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
+    "float32": {
+        "layer": Tolerance(2e-6, "30 roundings of 6e-8; three times the largest measured, 7e-7"),
+        "descriptor": Tolerance(1.5e-6, "two blocks and a head; three times the measured 5e-7"),
+        "full size": Tolerance(1.5e-6, "twelve blocks and a head; three times the measured 5e-7"),
+        "gradients": Tolerance(
+            2.5e-5, "three times the measured 9e-6, of arrays whose terms nearly cancel"
+        ),
+        "gradients, kinks": Tolerance(
+            1e-4, "three times the measured 4e-5, of GeM's exponent: one number, terms that cancel"
+        ),
+        STEP: Tolerance(
+            7e-5,
+            "three times the measured 2e-5: a parameter of size 3 rounds by 2e-7 after a step of "
+            "1e-2, and optax's 1 - 0.999^1 in float32 is 1e-5 off",
+        ),
+        OWN_STEP: Tolerance(
+            3e-4, "a step's slope is 1 / epsilon at a gradient of 0; three times the measured 9e-5"
+        ),
+        AFTER: Tolerance(
+            1.5e-4, "all elements: one sign in thousands may differ; three times the measured 5e-5"
+        ),
+        "losses": Tolerance(1.5e-5, "three times the measured 5e-6, over 20 steps"),
+        "trained": Tolerance(
+            1e-4, "steps along other signs remain in the parameters; four times the measured 2.5e-5"
+        ),
+    },
+    "bfloat16": {
+        "layer": Tolerance(4e-2, "ten roundings of 4e-3; three times the measured 1.5e-2"),
+        "descriptor": Tolerance(3.5e-2, "the same; three times the measured 1.2e-2"),
+        "full size": Tolerance(2.5e-2, "twelve blocks; three times the measured 8e-3"),
+        "gradients": Tolerance(8e-2, "twenty roundings of 4e-3; three times the measured 2.8e-2"),
+        "gradients, kinks": Tolerance(
+            7e-1,
+            "a ReLU whose input rounds to the other side of 0 switches a path on one side only: "
+            "0.4 is measured, and 0.3 between torch's own gradients and float64's",
+        ),
+        STEP: Tolerance(7e-5, "as in float32: parameters and gradients are float32"),
+        OWN_STEP: Tolerance(5e-2, "one sign in 2000 may differ; three times the measured 1.4e-2"),
+        AFTER: Tolerance(
+            1e-1,
+            "all elements: a sign that differs is a step of 2e-2, beside weights of some 4e-2; "
+            "three times the measured 3e-2",
+        ),
+        "losses": Tolerance(1e-1, "a pair more or less is mined; three times the measured 3.4e-2"),
+        "trained": Tolerance(7e-2, "20 steps along other signs; three times the measured 2.3e-2"),
+    },
+    "float64": {
+        "layer": Tolerance(1e-14, "50 roundings of 1e-16, as in float32; measured 3e-15"),
+        "descriptor": Tolerance(1e-14, "the same; measured 8e-16"),
+        "full size": Tolerance(1e-14, "the same; measured 1.4e-15"),
+        "gradients": Tolerance(1e-13, "as in float32; measured 2e-14"),
+        "gradients, kinks": Tolerance(1e-13, "the same; measured 2e-14"),
+        STEP: Tolerance(2e-13, "the parameter's rounding over the step of 1e-2; measured 5e-14"),
+        OWN_STEP: Tolerance(1e-12, "as in float32; measured 3e-13"),
+        AFTER: Tolerance(1e-13, "no sign differs any more; measured 2e-14"),
+        "losses": Tolerance(1e-14, "no more than one pass's rounding; measured 5e-16"),
+        "trained": Tolerance(1e-12, "no sign differs any more; measured 2e-14"),
+    },
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One line of the table: what was compared, its worst array, and the verdict."""
+
+    case: str
+    quantity: str
+    precision: str
+    worst: str
+    """Name of the array with the largest relative error, under the torch reference's names."""
+    shape: tuple[int, ...]
+    max_abs: float
+    relative: float
+    tolerance: float
+    why: str
+    arrays: int
+    """How many arrays the row covers."""
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is a number and within the tolerance."""
+        return self.relative <= self.tolerance
+
+
+def as_double(array: object) -> np.ndarray:
+    """A copy in float64 of an array of numbers or truth values, of either library."""
+    if isinstance(array, torch.Tensor):  # numpy has no bfloat16 of torch's
+        array = array.detach().double().numpy()
+    return np.array(array, np.float64)
+
+
+def relative_error(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Norm of the difference over the norm of `theirs`; infinite where it is no number.
+
+    Two arrays of zeros agree. Anything else against zeros does not.
+    """
+    difference, norm = np.linalg.norm(ours - theirs), np.linalg.norm(theirs)
+    if difference == 0:
+        return 0.0
+    error = difference / norm if norm else math.inf
+    return float(error) if math.isfinite(error) else math.inf
+
+
+def compare(
+    case: str,
+    quantity: str,
+    precision: str,
+    ours: Arrays,
+    theirs: Arrays,
+    tolerance: Tolerance,
+    *,
+    noise: Mapping[str, str] | None = None,
+    note: str = "",
+) -> Row:
+    """The row of the worst of several arrays.
+
+    `noise` names arrays that are 0 but for rounding, each with an array that tells the size of
+    the terms that cancel: the error is then what either side has in place of 0, over that norm.
+    An array that only one side has, or that differs in shape, is an infinite error.
+    """
+    noise = noise or {}
+    rows = []
+    for name in {**theirs, **ours}:
+        if name not in ours or name not in theirs or ours[name].shape != theirs[name].shape:
+            known = theirs if name in theirs else ours
+            rows.append((math.inf, math.inf, f"{name} (on one side only)", known[name].shape))
+            continue
+        mine, other = as_double(ours[name]), as_double(theirs[name])
+        error = relative_error(mine, other)
+        if name in noise:
+            scale = np.linalg.norm(as_double(theirs[noise[name]]))
+            error = float(max(np.linalg.norm(mine), np.linalg.norm(other)) / scale)
+        error = error if math.isfinite(error) else math.inf
+        rows.append((error, float(np.abs(mine - other).max(initial=0.0)), name, mine.shape))
+    if not rows:
+        raise ValueError(f"{case}, {quantity}: nothing to compare")
+    relative, max_abs, worst, shape = max(rows)
+    return Row(
+        case=case,
+        quantity=quantity,
+        precision=precision,
+        worst=worst,
+        shape=shape,
+        max_abs=max_abs,
+        relative=relative,
+        tolerance=tolerance.value,
+        why=tolerance.why,
+        arrays=len(rows),
+        note=note,
+    )
+
+
+def compare_truth(
+    case: str,
+    quantity: str,
+    precision: str,
+    ours: Arrays,
+    theirs: Arrays,
+    truth: Arrays,
+) -> Row:
+    """The row of our error from a truth, all arrays of it joined to one, against torch's own."""
+
+    def joined(side: Arrays) -> np.ndarray:
+        return np.concatenate([as_double(side[name]).ravel() for name in truth])
+
+    mine, other, true = joined(ours), joined(theirs), joined(truth)
+    allowed = TRUTH_FACTOR * relative_error(other, true)
+    return Row(
+        case=case,
+        quantity=quantity,
+        precision=precision,
+        worst="all together",
+        shape=true.shape,
+        max_abs=float(np.abs(mine - true).max(initial=0.0)),
+        relative=relative_error(mine, true),
+        tolerance=allowed,
+        why=f"{TRUTH_FACTOR} times torch's own error: as many roundings of the same size",
+        arrays=len(truth),
+    )

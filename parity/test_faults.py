@@ -1,0 +1,216 @@
+"""Deliberate faults on our side: the check that `python -m parity` runs must miss each of them."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import crisalad_jax.nn.adapter
+import crisalad_jax.nn.cross_image
+import crisalad_jax.nn.vit
+import parity.cases.case
+import parity.cases.parts
+from crisalad_jax.nn import vit
+from parity.cases import checks
+from parity.compare import OWN_STEP, STEP
+
+Patch = pytest.MonkeyPatch
+FORWARD = {"forward"}
+
+
+@pytest.fixture(autouse=True)
+def fresh_constants() -> Iterator[None]:
+    """Constants that are kept would not know of a fault; nor, later, of its end."""
+    vit._bicubic_weights.cache_clear()
+    yield
+    vit._bicubic_weights.cache_clear()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def hasty_programs() -> Iterator[None]:
+    """A fault is not of rounding: programs that compile faster show it as well."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
+def fresh_programs() -> Iterator[None]:
+    """Nor would the programs of functions that are compiled by themselves, such as `train_step`."""
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+def missed(name: str) -> set[str]:
+    return {row.quantity for row in checks("float32", 0)[name]() if not row.passed}
+
+
+def swap(first: str, second: str) -> Callable[[Patch], None]:
+    """Confuse two arrays of the state while it is converted."""
+
+    def fault(patch: Patch) -> None:
+        right = parity.cases.case.to_params
+
+        def wrong(state: dict[str, np.ndarray], *rest: Any, **more: Any) -> Any:
+            swapped = {**state, first: state[second], second: state[first]}
+            return right(swapped, *rest, **more)
+
+        patch.setattr(parity.cases.case, "to_params", wrong)
+
+    return fault
+
+
+def replace(module: Any, name: str, make: Callable[[Any], Any]) -> Callable[[Patch], None]:
+    """Put `make(what it is)` in the place of a function or constant."""
+    return lambda patch: patch.setattr(module, name, make(getattr(module, name)))
+
+
+def _without_layer_scale(block: Any) -> Any:
+    def wrong(params: vit.Block, *rest: Any) -> Any:
+        ones = jnp.ones_like(params.ls1)
+        return block(dataclasses.replace(params, ls1=ones, ls2=ones), *rest)
+
+    return wrong
+
+
+def _special_tokens_once(adapter: Any) -> Any:
+    def wrong(params: Any, tokens: Any, grid: tuple[int, int]) -> Any:
+        # Without bias, half of what counts twice is what counts once.
+        special = tokens.shape[0] - grid[0] * grid[1]
+        return adapter(params, tokens, grid).at[:special].multiply(0.5)
+
+    return wrong
+
+
+def _an_iteration_short(assign: Any) -> Any:
+    def wrong(scores: Any, dustbin: Any, config: Any) -> Any:
+        short = dataclasses.replace(config, iterations=config.iterations - 1)
+        return assign(scores, dustbin, short)
+
+    return wrong
+
+
+def _constant_first_layer(feed_forward: Any) -> Any:
+    def wrong(params: vit.Mlp, x: Any) -> Any:
+        constant = jax.lax.stop_gradient(params.fc1)
+        return feed_forward(dataclasses.replace(params, fc1=constant), x)
+
+    return wrong
+
+
+def _transposed_mask(encoder: Any) -> Any:
+    def wrong(*args: Any, mask: Any, **more: Any) -> Any:
+        return encoder(*args, mask=mask.T, **more)
+
+    return wrong
+
+
+PARTS, VIT = parity.cases.parts, crisalad_jax.nn.vit
+FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
+    "blocks swapped": (
+        "attention",
+        FORWARD,
+        swap("backbone.blocks.0.attn.proj.weight", "backbone.blocks.1.attn.proj.weight"),
+    ),
+    "norms swapped": (
+        "block, no adapter",
+        FORWARD,
+        swap("backbone.blocks.1.norm1.weight", "backbone.blocks.1.norm2.weight"),
+    ),
+    "networks of SALAD swapped": (
+        "SALAD",
+        FORWARD,
+        swap("aggregator.cluster_features.0.weight", "aggregator.score.0.weight"),
+    ),
+    "statistics swapped": (
+        "block, multi-resolution adapter",
+        FORWARD,
+        swap(
+            "backbone.blocks.1.adapter.branch1.bn.weight",
+            "backbone.blocks.1.adapter.branch1.bn.running_var",
+        ),
+    ),
+    "epsilon of the backbone's norms": (
+        "block, no adapter",
+        FORWARD,
+        replace(VIT, "NORM_EPSILON", lambda _: 1e-5),
+    ),
+    "epsilon of the encoder's norms": (
+        "cross-image encoder",
+        FORWARD,
+        replace(crisalad_jax.nn.cross_image, "NORM_EPSILON", lambda _: 1e-6),
+    ),
+    "epsilon of batch norm": (
+        "block, multi-resolution adapter",
+        FORWARD,
+        replace(crisalad_jax.nn.adapter, "BATCH_NORM_EPSILON", lambda _: 1e-5),
+    ),
+    "tanh GELU": (
+        "MLP",
+        FORWARD,
+        replace(VIT, "gelu", lambda _: functools.partial(jax.nn.gelu, approximate=True)),
+    ),
+    "no LayerScale": ("block, no adapter", FORWARD, replace(PARTS, "block", _without_layer_scale)),
+    "special tokens count once": (
+        "block, depthwise adapter",
+        FORWARD,
+        replace(VIT, "adapter", _special_tokens_once),
+    ),
+    "bicubic with a = -0.5": (
+        "positions: square, up",
+        FORWARD,
+        replace(VIT, "_cubic", lambda cubic: lambda x, _: cubic(x, -0.5)),
+    ),
+    "an iteration of Sinkhorn short": (
+        "Sinkhorn: 3 iterations, epsilon 1.0",
+        FORWARD,
+        replace(PARTS, "assign", _an_iteration_short),
+    ),
+    "mask transposed": (
+        "cross-image encoder, masked",
+        FORWARD,
+        replace(PARTS, "cross_image_encoder", _transposed_mask),
+    ),
+    "margin of the miner": (
+        "miner",
+        {"choices"},
+        replace(PARTS, "mine", lambda mine: lambda *x, epsilon: mine(*x, epsilon=2 * epsilon)),
+    ),
+    "a weight without gradient": (
+        "MLP",
+        {"gradients"},
+        replace(PARTS, "feed_forward", _constant_first_layer),
+    ),
+    "epsilon of Adam": (
+        "attention",
+        {STEP, OWN_STEP},
+        replace(optax, "adamw", lambda adamw: functools.partial(adamw, eps=1e-7)),
+    ),
+    "no weight decay": (
+        "attention",
+        {STEP, OWN_STEP},
+        replace(
+            optax, "adamw", lambda adamw: lambda *x, **more: adamw(*x, **more | {"weight_decay": 0})
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_misses(fault: str, monkeypatch: Patch) -> None:
+    name, quantities, plant = FAULTS[fault]
+    plant(monkeypatch)
+    assert quantities <= missed(name)
+
+
+@pytest.mark.usefixtures("fresh_programs")
+def test_a_learning_rate_that_does_not_decay_misses(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(optax, "linear_schedule", lambda peak, *_: lambda _: peak)
+    assert {"losses", "parameters at the end"} <= missed("training CriSALAD's adapters and head")
