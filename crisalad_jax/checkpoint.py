@@ -164,7 +164,14 @@ class StateStore:
             max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
         )
         try:
-            self._manager = ocp.CheckpointManager(pathlib.Path(folder).absolute(), options=options)
+            self._manager = ocp.CheckpointManager(
+                pathlib.Path(folder).absolute(),
+                options=options,
+                item_handlers={
+                    "state": ocp.StandardCheckpointHandler(),
+                    "record": ocp.JsonCheckpointHandler(),
+                },
+            )
         except OSError as error:
             raise InputError(f"{folder}: cannot keep states here: {error.strerror}") from error
 
@@ -186,13 +193,21 @@ class StateStore:
         step = self._manager.latest_step()
         if step is None:
             return None
-        wanted = _stored(template)
-        arrays = ocp.args.StandardRestore(jax.tree.map(ocp.utils.to_shape_dtype_struct, wanted))
+        wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _stored(template))
         try:
+            # Before any array is read: orbax reads all at once, and every misfit is an exception
+            # in a thread of its own.
+            found = self._manager.item_metadata(step)["state"].tree
+            misfits = _misfits(wanted, found)
+            if misfits:
+                raise ValueError(misfits)
             saved = self._manager.restore(
-                step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonRestore())
+                step,
+                args=ocp.args.Composite(
+                    state=ocp.args.StandardRestore(wanted), record=ocp.args.JsonRestore()
+                ),
             )
-        except (ValueError, KeyError, OSError, RuntimeError) as error:
+        except Exception as error:  # whatever a damaged file makes orbax and its threads raise
             reason = " ".join(str(error).split())[:200]
             older = [other for other in self._manager.all_steps() if other != step]
             advice = f"; delete it to go on from step {max(older)}" if older else ""
@@ -217,3 +232,17 @@ class StateStore:
 def _stored(state: PyTree) -> dict[str, Any]:
     """Leaves by name, without the empty ones (absent registers), which orbax refuses."""
     return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}
+
+
+def _misfits(wanted: dict[str, jax.ShapeDtypeStruct], found: dict[str, Any]) -> str:
+    """What keeps the stored arrays from being the wanted ones; empty if nothing does."""
+    differing = sorted(
+        name
+        for name in wanted.keys() | found.keys()
+        if name not in wanted or name not in found or wanted[name].shape != found[name].shape
+    )
+    if not differing:
+        return ""
+    first = differing[0]
+    shapes = [tree[first].shape if first in tree else "none" for tree in (found, wanted)]
+    return f"{len(differing)} arrays differ, as {first}: found {shapes[0]}, expected {shapes[1]}"

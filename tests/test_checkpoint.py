@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import re
 import struct
 
 import jax
@@ -187,9 +188,29 @@ def test_a_state_survives_bit_for_bit_and_the_last_ones_stay(tmp_path, state):
 def test_a_state_of_another_model_is_refused(tmp_path, state):
     store = StateStore(tmp_path / "state")
     store.save(1, state, {})
-    other = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, 2), leaf.dtype), state)
+    leaves, structure = jax.tree.flatten(state)
+    largest = max(range(len(leaves)), key=lambda i: leaves[i].size)
+    shape = leaves[largest].shape
+    leaves[largest] = jnp.zeros((*shape, 2))
+    words = re.escape(f"found {shape}, expected {(*shape, 2)}")
     with pytest.raises(
-        InputError, match=f"{tmp_path}/state/[0-9]+: this state is damaged or not of this run"
+        InputError,
+        match=f"^{tmp_path}/state/1: this state is damaged or not of this run .*{words}",
     ):
-        store.load(other)
+        store.load(jax.tree.unflatten(structure, leaves))
+    store.close()
+
+
+def test_a_damaged_state_is_refused_and_the_older_one_named(tmp_path, state):
+    store = StateStore(tmp_path / "state")
+    store.save(1, state, {})
+    store.save(2, state, {})
+    files = [file for file in (tmp_path / "state" / "2" / "state").rglob("*") if file.is_file()]
+    largest = max(files, key=lambda file: file.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[:100])
+    with pytest.raises(
+        InputError,
+        match=f"^{tmp_path}/state/2: this state is damaged .*; delete it to go on from step 1",
+    ):
+        store.load(state)
     store.close()
