@@ -6,6 +6,7 @@ import os
 import pathlib
 import pickle
 import re
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -62,6 +63,12 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
     layout = "reference"
     if config is None:
         layout, config = infer(state, source=str(path))
+    elif config.backbone.depth + config.encoder.layers > len(state):
+        # Said before a table of names is made for a depth that any text may claim.
+        raise InputError(
+            f"{path}: found {len(state)} tensors, expected those of {config.backbone.depth} "
+            f"blocks and {config.encoder.layers} encoder layers, as its configuration says"
+        )
     state = {name: _float32(name, array, path) for name, array in state.items()}
     params, extras = to_params(state, config, layout, source=str(path))
     return Checkpoint(jax.tree.map(jnp.asarray, params), config, extras, layout)
@@ -77,7 +84,9 @@ def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
 def _read_torch(path: pathlib.Path) -> Any:
     torch = _torch(f"read {path}")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of deprecated ways to write what is refused below
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         # Torch's message is a page of advice on how to run the code all the same.
         found = re.search(r"GLOBAL ([\w.]+)", str(error)) or re.search(
@@ -92,16 +101,18 @@ def _read_torch(path: pathlib.Path) -> Any:
         reason = str(error).split("\n")[0][:200] or type(error).__name__
         raise InputError(f"{path}: not a whole torch checkpoint: {reason}") from error
 
-    def arrays(value: Any) -> Any:
+    def arrays(value: Any, name: object) -> Any:
         if isinstance(value, Mapping):
-            return {key: arrays(item) for key, item in value.items()}
+            return {key: arrays(item, key) for key, item in value.items()}
         if not isinstance(value, torch.Tensor):
             return value
-        value = value.detach()
         half = value.dtype in (torch.float16, torch.bfloat16)
-        return (value.float() if half else value).numpy()
+        try:
+            return (value.float() if half else value).detach().numpy()
+        except (TypeError, RuntimeError) as error:  # sparse, quantised, eight bits, without data
+            raise InputError(f"{path}: {name} is no plain tensor: {error}") from error
 
-    return arrays(content)
+    return arrays(content, "its content")
 
 
 def _torch(purpose: str) -> Any:
@@ -126,10 +137,13 @@ def _unwrap(content: Any, path: pathlib.Path) -> tuple[State, ModelConfig | None
             content = content[key]
             break
     if not isinstance(content, Mapping) or not content:
-        raise InputError(
-            f"{path}: found {type(content).__name__}, expected a dictionary of tensors by name"
-        )
-    strange = [str(name) for name, value in content.items() if not isinstance(value, np.ndarray)]
+        found = "nothing" if isinstance(content, Mapping) else type(content).__name__
+        raise InputError(f"{path}: found {found}, expected a dictionary of tensors by name")
+    strange = [
+        str(name)
+        for name, value in content.items()
+        if not isinstance(name, str) or not isinstance(value, np.ndarray)
+    ]
     if strange:
         raise InputError(
             f"{path}: found {', '.join(sorted(strange))}, expected nothing but tensors by name"
@@ -142,7 +156,7 @@ def _unwrap(content: Any, path: pathlib.Path) -> tuple[State, ModelConfig | None
 def _json(text: str, path: pathlib.Path) -> Any:
     try:
         return json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: found no configuration under 'config': {error}") from error
 
 

@@ -388,13 +388,19 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
     Raises:
         InputError: naming `source`, if the names are of no layout or the widths of no model.
     """
-    layout = _layout_of(state, source)
+    try:
+        return _infer(state)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+
+
+def _infer(state: State) -> tuple[str, ModelConfig]:
+    layout = _layout_of(state)
     if layout == "huggingface":
-        backbone = _hugging_face_config(_Reader(state, source))
-        return layout, _whole(source, backbone=backbone, aggregator="class-token", layers=0)
-    read = _Reader(state, source, LAYOUTS[layout].backbone)
-    backbone = _vit_config(read)
-    head = _Reader(state, source)
+        backbone = _hugging_face_config(_Reader(state))
+        return layout, _whole(backbone=backbone, aggregator="class-token", layers=0)
+    backbone = _vit_config(_Reader(state, LAYOUTS[layout].backbone))
+    head = _Reader(state)
     if "aggregator.dust_bin" in state:
         salad = SaladConfig(
             clusters=head.size("aggregator.score.3.weight", 0),
@@ -408,7 +414,6 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
         aggregator = "gem-pyramid" if "aggregation.1.p" in state else "class-token"
     layers = head.count("encoder.layers.")
     return layout, _whole(
-        source,
         backbone=backbone,
         aggregator=aggregator,
         salad=salad,
@@ -418,7 +423,7 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
     )
 
 
-def _layout_of(state: State, source: str) -> str:
+def _layout_of(state: State) -> str:
     if "embeddings.cls_token" in state or "embeddings.position_embeddings" in state:
         return "huggingface"
     for layout in ("dino-salad", "cricavpr", "dinov2"):
@@ -428,7 +433,7 @@ def _layout_of(state: State, source: str) -> str:
             return "reference" if reference else layout
     names = ", ".join(sorted(state)[:3]) or "none"
     raise InputError(
-        f"{source}: found no checkpoint that we know (its first names: {names}); expected "
+        f"found no checkpoint that we know (its first names: {names}); expected "
         f"{', '.join(layout.holds for layout in LAYOUTS.values())}"
     )
 
@@ -437,18 +442,16 @@ class _Reader(NamedTuple):
     """Shapes of a state under a prefix, with one clear error where a name is missing."""
 
     state: State
-    source: str
     prefix: str = ""
 
     def size(self, name: str, axis: int) -> int:
         name = self.prefix + name
         if name not in self.state:
-            raise InputError(f"{self.source}: found no {name}, expected it beside the others")
+            raise InputError(f"found no {name}, expected it beside the others")
         shape = self.state[name].shape
         if len(shape) <= axis or not shape[axis]:
             raise InputError(
-                f"{self.source}: {name} found of shape {shape}, expected more than {axis} axes, "
-                "none of them empty"
+                f"{name} found of shape {shape}, expected more than {axis} axes, none of them empty"
             )
         return shape[axis]
 
@@ -478,7 +481,6 @@ def _vit_config(read: _Reader) -> ViTConfig:
         side = read.size("blocks.0.adapter.depthwise.weight", 2)
         adapter = dataclasses.replace(adapter, kernel_size=side)
     return _backbone(
-        read.source,
         dim=width,
         depth=read.count("blocks."),
         hidden=read.size("blocks.0.mlp.w3.weight" if gated else "blocks.0.mlp.fc1.weight", gated),
@@ -494,7 +496,6 @@ def _hugging_face_config(read: _Reader) -> ViTConfig:
     gated = read.has(f"{block}weights_in.weight")
     registers = f"{above}register_tokens"
     return _backbone(
-        read.source,
         dim=read.size(f"{above}cls_token", 2),
         depth=read.count("encoder.layer."),
         hidden=read.size(f"{block}{'weights_out' if gated else 'fc1'}.weight", gated),
@@ -506,7 +507,6 @@ def _hugging_face_config(read: _Reader) -> ViTConfig:
 
 
 def _backbone(
-    source: str,
     *,
     dim: int,
     depth: int,
@@ -517,13 +517,11 @@ def _backbone(
     adapter: AdapterConfig,
 ) -> ViTConfig:
     side = _side(positions - 1)
-    if side**2 != positions - 1:
-        raise InputError(
-            f"{source}: found {positions} position embeddings, expected 1 and a square number"
-        )
+    if side**2 != positions - 1 or not side:
+        raise InputError(f"found {positions} position embeddings, expected 1 and a square number")
     if dim % HEAD_WIDTH:
         raise InputError(
-            f"{source}: found a backbone of width {dim}, expected a multiple of {HEAD_WIDTH}: "
+            f"found a backbone of width {dim}, expected a multiple of {HEAD_WIDTH}: "
             "DINOv2's heads have that width, and no shape tells another"
         )
     # The configuration knows the ratio: of SwiGLU's two thirds, 4 where they are DINOv2's.
@@ -541,13 +539,10 @@ def _backbone(
         )
         if config.hidden == hidden:
             return config
-    raise InputError(
-        f"{source}: found a feed-forward width of {hidden}, expected a multiple of 8 for SwiGLU"
-    )
+    raise InputError(f"found a feed-forward width of {hidden}, expected a multiple of 8 for SwiGLU")
 
 
 def _whole(
-    source: str,
     *,
     backbone: ViTConfig,
     aggregator: Any,
@@ -559,13 +554,10 @@ def _whole(
     encoder = CrossImageConfig(layers=layers, heads=ENCODER_HEADS)
     if feedforward is not None:
         encoder = dataclasses.replace(encoder, feedforward=feedforward)
-    try:
-        return ModelConfig(
-            image_size=image_size,
-            backbone=backbone,
-            aggregator=aggregator,
-            salad=salad or SaladConfig(),
-            encoder=encoder,
-        )
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from error
+    return ModelConfig(
+        image_size=image_size,
+        backbone=backbone,
+        aggregator=aggregator,
+        salad=salad or SaladConfig(),
+        encoder=encoder,
+    )

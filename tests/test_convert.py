@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import json
 import os
 import pathlib
 import sys
@@ -269,8 +270,25 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         torch.save(state | {"norm.bias": state["norm.bias"].double()}, path)
     elif kind == "nan":
         torch.save(state | {"norm.bias": state["norm.bias"] * float("nan")}, path)
+    elif kind == "sparse":
+        torch.save(state | {"norm.bias": state["norm.bias"].to_sparse()}, path)
+    elif kind == "eight bits":
+        torch.save(state | {"norm.bias": state["norm.bias"].to(torch.float8_e4m3fn)}, path)
+    elif kind == "no data":
+        torch.save(state | {"norm.bias": state["norm.bias"].to("meta")}, path)
+    elif kind == "a number for a name":
+        torch.save({**state, 3: torch.zeros(3)}, path)
+    elif kind == "one position":
+        torch.save(state | {"pos_embed": torch.zeros(1, 1, 64)}, path)
+    elif kind == "a depth for an age":
+        config = json.dumps({"backbone": {"depth": 10**9}})
+        torch.save({"state_dict": state, "config": config}, path)
+    elif kind == "a deep configuration":
+        torch.save({"state_dict": state, "config": "[" * 10**5}, path)
     elif kind == "some with module.":
-        torch.save({("module." if "norm" in k else "") + k: v for k, v in state.items()}, path)
+        torch.save(
+            {("module." if k.startswith("norm.") else "") + k: v for k, v in state.items()}, path
+        )
     elif kind == "extra and missing":
         torch.save({k.replace("norm.bias", "norm.shift"): v for k, v in state.items()}, path)
     elif kind == "safetensors of another model":
@@ -295,11 +313,19 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         ("no tensor", "found epoch, expected nothing but tensors by name"),
         ("double", "norm.bias found float64, expected float32, float16 or bfloat16"),
         ("nan", "norm.bias holds NaN or infinity"),
-        ("some with module.", "module.norm.bias unknown.*; norm.bias missing|norm.bias missing.*"),
+        ("sparse", "norm.bias is no plain tensor: .*Sparse"),
+        ("eight bits", "norm.bias is no plain tensor: .*Float8"),
+        ("no data", "norm.bias is no plain tensor: .*meta"),
+        ("a number for a name", "found 3, expected nothing but tensors by name"),
+        ("one position", "found 1 position embeddings, expected 1 and a square number"),
+        ("a depth for an age", "found 35 tensors, expected those of 1000000000 blocks"),
+        ("a deep configuration", "found no configuration under 'config'"),
         (
-            "extra and missing",
-            "blocks.1.norm.*|norm.bias missing; norm.shift unknown",
+            "some with module.",
+            "2 blocks: module.norm.bias unknown; module.norm.weight unknown; norm.bias missing; "
+            "norm.weight missing$",
         ),
+        ("extra and missing", "2 blocks: norm.bias missing; norm.shift unknown$"),
         ("safetensors of another model", "found no checkpoint that we know .*conv1.weight"),
         ("safetensors cut", "not a whole safetensors file"),
     ],
