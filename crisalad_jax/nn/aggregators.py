@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import PYRAMID_LEVELS, ModelConfig
-from crisalad_jax.nn.layers import l2_normalise
+from crisalad_jax.nn.layers import l2_normalise, widen
 from crisalad_jax.nn.salad import Salad, init_salad, published_order, salad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
@@ -50,8 +50,7 @@ def aggregate(
     """
     if isinstance(params, Salad):
         return salad(params, features, config.salad, key=key)
-    wide = jnp.promote_types(features.patches.dtype, jnp.float32)
-    class_token, patches = features.class_token.astype(wide), features.patches.astype(wide)
+    class_token, patches = widen(features.class_token), widen(features.patches)
     if params is None:
         return Tokens(class_token, patches[:0])
     return Tokens(class_token, gem_pyramid(params, patches, grid))

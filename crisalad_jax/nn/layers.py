@@ -97,17 +97,27 @@ def init_batch_norm(dim: int) -> BatchNorm:
     return BatchNorm(jnp.ones(dim), jnp.zeros(dim), jnp.zeros(dim), jnp.ones(dim))
 
 
+def widen(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """`x` in float32 at least.
+
+    Elementwise work on bfloat16 is done wide and rounded once. What a parameter is broadcast over
+    must be wide above all: its gradient is a sum over all tokens and images, and hardware with
+    bfloat16 arithmetic of its own would add them up in 8 bits.
+    """
+    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
+
+
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
     """Affine map of the last axis, in the type of `x`."""
     y = x @ params.weight.astype(x.dtype)
-    return y if params.bias is None else y + params.bias.astype(x.dtype)
+    return y if params.bias is None else (widen(y) + params.bias).astype(x.dtype)
 
 
 def layer_norm(
     params: LayerNorm, x: Float[Array, "*batch dim"], *, epsilon: float
 ) -> Float[Array, "*batch dim"]:
     """Normalise the last axis to mean 0 and variance 1, in float32, and return the type of `x`."""
-    wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+    wide = widen(x)
     mean = wide.mean(axis=-1, keepdims=True)
     centred = wide - mean
     variance = jnp.square(centred).mean(axis=-1, keepdims=True)
@@ -125,15 +135,14 @@ def depthwise_conv(
     """
     size = params.weight.shape[0]
     height, width, _ = x.shape
-    weight = params.weight.astype(x.dtype)
     margin = size // 2
-    padded = jnp.pad(x, ((margin, margin), (margin, margin), (0, 0)))
+    padded = widen(jnp.pad(x, ((margin, margin), (margin, margin), (0, 0))))
     taps = [
-        padded[i : i + height, j : j + width] * weight[i, j]
+        padded[i : i + height, j : j + width] * params.weight[i, j]
         for i in range(size)
         for j in range(size)
     ]
-    return sum(taps, start=params.bias.astype(x.dtype))
+    return sum(taps, start=params.bias).astype(x.dtype)
 
 
 def conv(params: Conv, x: Float[Array, "height width d_in"]) -> Float[Array, "height width d_out"]:
@@ -145,21 +154,22 @@ def conv(params: Conv, x: Float[Array, "height width d_in"]) -> Float[Array, "he
         padding="SAME",
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
     )
-    return y[0] + params.bias.astype(x.dtype)
+    return (widen(y[0]) + params.bias).astype(x.dtype)
 
 
 def batch_norm(
     params: BatchNorm, x: Float[Array, "*batch dim"], *, epsilon: float
 ) -> Float[Array, "*batch dim"]:
     """Normalise by the stored statistics, as torch does in evaluation; returns the type of `x`."""
-    wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+    wide = widen(x)
     scale = params.weight * jax.lax.rsqrt(params.running_var + epsilon)
     return ((wide - params.running_mean) * scale + params.bias).astype(x.dtype)
 
 
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Exact GELU. The erf form: `jax.nn.gelu`'s erfc form takes twice as long on a CPU."""
-    return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
+    wide = widen(x)
+    return (0.5 * wide * (1 + jax.lax.erf(wide * math.sqrt(0.5)))).astype(x.dtype)
 
 
 def dropout(

@@ -12,6 +12,7 @@ from crisalad_jax.nn.layers import (
     l2_normalise,
     linear,
     split_key,
+    widen,
 )
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
@@ -77,8 +78,7 @@ def transport(
         InputError: no more patches than clusters.
     """
     scores = _two_layer(params.score, patches, config.dropout, key)
-    wide = jnp.promote_types(scores.dtype, jnp.float32)
-    return assign(scores.astype(wide), params.dust_bin, config.sinkhorn)
+    return assign(widen(scores), params.dust_bin, config.sinkhorn)
 
 
 def salad(

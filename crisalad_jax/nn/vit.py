@@ -15,7 +15,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from crisalad_jax.config import PATCH_SIZE, ViTConfig
 from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
 from crisalad_jax.nn.attention import Attention, attention
-from crisalad_jax.nn.layers import LayerNorm, Linear, gelu, init_layer_norm, layer_norm, linear
+from crisalad_jax.nn.layers import (
+    LayerNorm,
+    Linear,
+    gelu,
+    init_layer_norm,
+    layer_norm,
+    linear,
+    widen,
+)
 from crisalad_jax.pytree import params
 
 NORM_EPSILON = 1e-6
@@ -150,13 +158,8 @@ def embed(
     patches = linear(params.patch_embed, pixels.reshape(rows * columns, -1))
     positions = interpolate_positions(params.pos_embed, (rows, columns), config)
     class_token = (params.cls_token + params.pos_embed_cls)[None]
-    return jnp.concatenate(
-        [
-            class_token.astype(image.dtype),
-            params.register_tokens.astype(image.dtype),
-            patches + positions.reshape(rows * columns, -1).astype(image.dtype),
-        ]
-    )
+    placed = widen(patches) + positions.reshape(rows * columns, -1)
+    return jnp.concatenate([class_token, params.register_tokens, placed]).astype(image.dtype)
 
 
 def run_blocks(
@@ -181,12 +184,12 @@ def block(
     """One block (paper Eq. 2), with LayerScale over MLP and adapter alike, as in CricaVPR."""
     normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
     attended = attention(params.attn, normed, config.heads, key=None)
-    tokens = tokens + params.ls1.astype(tokens.dtype) * attended
+    tokens = (widen(tokens) + params.ls1 * widen(attended)).astype(tokens.dtype)
     normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
     update = feed_forward(params.mlp, normed)
     if params.adapter is not None:
         update = update + config.adapter.alpha * adapter(params.adapter, normed, grid)
-    return tokens + params.ls2.astype(tokens.dtype) * update
+    return (widen(tokens) + params.ls2 * widen(update)).astype(tokens.dtype)
 
 
 def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:

@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from crisalad_jax.nn.layers import (
+    Conv,
     DepthwiseConv,
     LayerNorm,
     Linear,
+    conv,
     depthwise_conv,
     dropout,
     gelu,
@@ -36,6 +38,36 @@ def test_linear_equals_torch() -> None:
     np.testing.assert_allclose(ours, expected, atol=2e-6)
     without = linear(Linear(jnp.asarray(weight), None), jnp.asarray(x))
     np.testing.assert_allclose(without, expected.numpy() - bias, atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", ["linear", "conv", "depthwise"])
+def test_bias_gradients_of_bfloat16_are_summed_in_float32(kind: str) -> None:
+    x = jnp.asarray(normal(0, 8, 16, 16, 4)).astype(jnp.bfloat16)
+    towards = jnp.asarray(np.random.default_rng(1).uniform(1, 2, x.shape)).astype(jnp.bfloat16)
+
+    def apply(bias: jax.Array, image: jax.Array) -> jax.Array:
+        if kind == "linear":
+            return linear(Linear(jnp.eye(4), bias), image)
+        if kind == "conv":
+            return conv(Conv(jnp.ones((3, 3, 4, 4)), bias), image)
+        return depthwise_conv(DepthwiseConv(jnp.ones((3, 3, 4)), bias), image)
+
+    def total(bias: jax.Array) -> jax.Array:
+        y = jax.vmap(apply, in_axes=(None, 0))(bias, x)
+        return (y * towards).astype(jnp.float32).sum()
+
+    expected = np.asarray(towards, np.float64).sum((0, 1, 2))
+    # 2048 numbers added in float32. Where a processor adds bfloat16 by itself, 10 % were lost.
+    np.testing.assert_allclose(jax.grad(total)(jnp.zeros(4)), expected, rtol=1e-5)
+
+
+def test_gelu_of_bfloat16_is_computed_in_float32() -> None:
+    x = torch.linspace(-4, 4, 401).bfloat16()
+    expected = torch.nn.functional.gelu(x.double()).numpy()
+    ours = gelu(jnp.asarray(x.float().numpy()).astype(jnp.bfloat16))
+    assert ours.dtype == jnp.bfloat16
+    # One rounding to 8 bits, 2^-9, and float32's of 1 + erf where that is 3e-5 (at -4).
+    np.testing.assert_allclose(np.asarray(ours, np.float64), expected, rtol=5e-3)
 
 
 def test_layer_norm_equals_torch() -> None:
