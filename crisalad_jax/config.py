@@ -8,7 +8,7 @@ a comment says otherwise.
 import dataclasses
 import re
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from crisalad_jax.errors import InputError
 
@@ -37,6 +37,14 @@ def _require_positive(config: object, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
         _require(value > 0, f"{type(config).__name__}.{name}: found {value}, expected more than 0")
+
+
+def _require_choice(config: object, *names: str) -> None:
+    """Fields annotated `Literal` hold one of its values."""
+    hints = get_type_hints(type(config))
+    for name in names:
+        choices = dict.fromkeys(get_args(hints[name]))
+        choose(f"{type(config).__name__}.{name}", getattr(config, name), choices)
 
 
 def _require_fraction(config: object, *names: str) -> None:
@@ -142,15 +150,100 @@ class ViTConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SinkhornConfig:
-    """How the transport is solved; by default as SALAD was published."""
+    """How the transport is solved; by default as SALAD was published. See `docs/sinkhorn.md`."""
 
-    iterations: int = 3
+    method: Literal["sinkhorn", "newton", "softmax", "dual-softmax"] = "sinkhorn"
+    """Alternating projections; Newton on the semi-dual; or baselines that transport nothing."""
+    dustbin: Literal["none", "column", "row and column", "token", "mass"] = "column"
+    """What takes the patches that belong nowhere: nothing; a column of one learnt score (as
+    published, which changes nothing); the same beside a row of it (SuperGlue); a score that the
+    network gives each patch; or a column of learnt mass."""
     epsilon: float = 1.0
     """Entropic regularisation: scores are divided by it."""
+    iterations: int = 3
+    """How many; with a tolerance, at most how many."""
+    tolerance: float | None = None
+    """Stop where no potential changes more, which is the relative marginal error; float32 may
+    never get below 1e-5."""
+    must_converge: bool = False
+    """Raise where the tolerance is not met, in place of only saying so in the result."""
+    domain: Literal["scaling", "log"] = "scaling"
+    """Scaling takes exponentials once; scores too far apart fall back to the log domain."""
+    relaxation: float = 1.0
+    """Each half step goes so many times as far; above 1 speeds up slow convergence."""
+    anderson: int = 0
+    """Anderson acceleration over so many past steps; 0 for none."""
+    row_tau: float = 1.0
+    """Below 1, rows' masses are not fixed but drawn to their marginals by a Kullback-Leibler
+    penalty of epsilon * tau / (1 - tau)."""
+    column_tau: float = 1.0
+    """The same for columns."""
+    gradient: Literal["unrolled", "implicit", "optimistix", "stop"] = "unrolled"
+    """Through the iterations; by the converged plan's conditions, in closed form; by optimistix's
+    fixed point and adjoint; or potentials taken for constants."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the ranges, and that the parts go together."""
+        _require_choice(self, "method", "dustbin", "domain", "gradient")
         _require_positive(self, "iterations", "epsilon")
+        if self.tolerance is not None:
+            _require_positive(self, "tolerance")
+        for name in ("row_tau", "column_tau"):
+            value = getattr(self, name)
+            _require(
+                0 < value <= 1,
+                f"SinkhornConfig.{name}: found {value}, expected more than 0 and at most 1",
+            )
+        _require(
+            0 < self.relaxation < 2,
+            f"SinkhornConfig.relaxation: found {self.relaxation}, expected between 0 and 2",
+        )
+        _require(
+            self.anderson == 0 or self.anderson >= 2,
+            f"SinkhornConfig.anderson: found {self.anderson}, expected 0 or at least 2",
+        )
+        self._check_pairs()
+
+    def _check_pairs(self) -> None:
+        converges = self.gradient in ("implicit", "optimistix")
+        _require(
+            not converges or self.tolerance is not None,
+            f"SinkhornConfig.gradient: found {self.gradient!r} with a fixed number of iterations, "
+            "expected a tolerance: it is the gradient of the converged plan",
+        )
+        _require(
+            self.gradient != "unrolled" or self.tolerance is None,
+            "SinkhornConfig.gradient: found 'unrolled' with a tolerance, expected 'implicit', "
+            "'optimistix' or 'stop': a loop of unknown length cannot be unrolled",
+        )
+        _require(
+            not self.must_converge or self.tolerance is not None,
+            "SinkhornConfig.must_converge: found no tolerance to converge to",
+        )
+        plain = self.relaxation == 1 and not self.anderson
+        if self.method == "newton":
+            _require(
+                self.balanced and plain and self.gradient in ("implicit", "stop"),
+                "SinkhornConfig.method: found 'newton' with relaxation, acceleration, relaxed "
+                f"marginals or gradient {self.gradient!r}, expected none of these and gradient "
+                "'implicit' or 'stop'",
+            )
+        if self.method in ("softmax", "dual-softmax"):
+            _require(
+                self.balanced and plain and self.tolerance is None,
+                f"SinkhornConfig.method: found {self.method!r} with a tolerance, relaxation, "
+                "acceleration or relaxed marginals, expected none: it does not iterate",
+            )
+        _require(
+            self.gradient != "optimistix" or not self.anderson,
+            "SinkhornConfig.anderson: found with gradient 'optimistix', expected 0: give "
+            "`sinkhorn` a solver that accelerates",
+        )
+
+    @property
+    def balanced(self) -> bool:
+        """Whether both sides meet their marginals exactly at convergence."""
+        return self.row_tau == self.column_tau == 1
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,36 +1,643 @@
-"""Entropic optimal transport for aggregation: Sinkhorn in the log domain, with a dustbin.
+"""Entropic optimal transport for aggregation: every variant behind one function.
 
-The iteration is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR
+The problem is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR
 2024) took from SuperGlue (Sarlin et al., CVPR 2020). Arrays are laid out (..., N, K): N rows
 (patches), K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
+`docs/sinkhorn.md` has the equations, the variants and how they compare.
 """
 
+import functools
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.errors import InputError
+from crisalad_jax.pytree import params
+
+GIBBS_FLOOR = math.exp(-60)
+"""Where scores in a row are further apart, over epsilon, the scaling domain does not do.
+
+Above it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
+exp(-87), is no part of such a sum's last place."""
+FALLBACK_BATCH = 4
+"""So many problems at a time are differentiated where the scaling domain would not do: memory for
+a fallback is set aside whether or not it is taken."""
+UNROLLED = 8
+"""Up to so many iterations are written out for the compiler; more are a scan."""
+
+
+class Potentials(NamedTuple):
+    """The dual variables over epsilon: the plan is exp(kernel + row + column)."""
+
+    row: Float[Array, "*batch rows"]
+    column: Float[Array, "*batch columns"]
 
 
 class SinkhornResult(NamedTuple):
     """A transport plan and how well it meets its marginals."""
 
     log_plan: Float[Array, "*batch rows columns"]
+    potentials: Potentials
+    """Those of balanced transport are known up to a constant: the columns' mean is 0."""
     row_error: Float[Array, "*batch"]
     """Largest difference between a row's mass and its marginal, relative to the marginal."""
     column_error: Float[Array, "*batch"]
     """The same for columns. Rows are updated last, so this is the error that iterations lower."""
+    iterations: Int[Array, "*batch"]
+    converged: Bool[Array, "*batch"]
+    """Whether the tolerance was met. Without one: whether the potentials are finite."""
+
+
+@params
+class Problem:
+    """What a step sees: the scores over epsilon, and the marginals."""
+
+    kernel: Float[Array, "*batch rows columns"]
+    log_mu: Float[Array, "*batch rows"]
+    log_nu: Float[Array, "*batch columns"]
+    row_max: Float[Array, "*batch rows"] | None = None
+    gibbs: Float[Array, "*batch rows columns"] | None = None
+    """exp(kernel - row_max) in the scaling domain; None in the log domain."""
+
+    def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
+        """Logarithm of each row's sum of exp(kernel + column)."""
+        if self.gibbs is None:
+            return _log_sum(self.kernel, column, -1)
+        return self.row_max + _products("...nk,...k->...n", self.gibbs, column)
+
+    def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
+        """Logarithm of each column's sum of exp(kernel + row)."""
+        if self.gibbs is None:
+            return _log_sum(self.kernel, row, -2)
+        return _products("...nk,...n->...k", self.gibbs, row + self.row_max)
+
+
+@params
+class _PlainProblem(Problem):
+    """In the log domain, by functions that forward mode can differentiate too."""
+
+    def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
+        return jax.nn.logsumexp(self.kernel + column[..., None, :], axis=-1)
+
+    def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
+        return jax.nn.logsumexp(self.kernel + row[..., :, None], axis=-2)
+
+
+Step = Callable[[Problem, Potentials], Potentials]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _log_sum(kernel: Array, potential: Array, axis: int) -> Array:
+    """Logarithm of the sums of exp(kernel + potential) over the axis that the potential has.
+
+    Differentiating keeps what goes in and comes out, where `logsumexp` would keep a matrix.
+    """
+    return jax.nn.logsumexp(kernel + _along(potential, axis), axis=axis)
+
+
+def _log_sum_forward(kernel: Array, potential: Array, axis: int) -> tuple[Array, Any]:
+    out = _log_sum(kernel, potential, axis)
+    return out, (kernel, potential, out)
+
+
+def _log_sum_backward(axis: int, kept: Any, towards: Array) -> tuple[Array, Array]:
+    kernel, potential, out = kept
+    shares = jnp.exp(kernel + _along(potential, axis) - jnp.expand_dims(out, axis))
+    shares = shares * jnp.expand_dims(towards, axis)
+    return shares, shares.sum(axis=-3 - axis)
+
+
+_log_sum.defvjp(_log_sum_forward, _log_sum_backward)
+
+
+def _along(potential: Array, axis: int) -> Array:
+    return jnp.expand_dims(potential, -3 - axis)
+
+
+def _products(equation: str, gibbs: Array, potential: Array) -> Array:
+    """Logarithm of the products of `gibbs` with exp(potential)."""
+    top = jax.lax.stop_gradient(potential.max(axis=-1, keepdims=True))
+    # HIGHEST: in the tensor cores' default of 10 bits the iteration does not converge.
+    sums = jnp.einsum(
+        equation, gibbs, jnp.exp(potential - top), precision=jax.lax.Precision.HIGHEST
+    )
+    return jnp.log(sums) + top
+
+
+def sinkhorn_step(
+    problem: Problem,
+    potentials: Potentials,
+    *,
+    relaxation: float = 1.0,
+    row_tau: float = 1.0,
+    column_tau: float = 1.0,
+) -> Potentials:
+    """Meet the columns' marginals, then the rows': one published iteration (paper Eq. 5).
+
+    `relaxation` of w goes w times as far (Thibault et al., Algorithms 2021). A `tau` below 1
+    relaxes the marginals of a side to a Kullback-Leibler penalty of weight
+    epsilon * tau / (1 - tau) (Chizat et al., Math. Comp. 2018).
+    """
+    column = column_tau * (problem.log_nu - problem.over_rows(potentials.row))
+    column = _relaxed(potentials.column, column, relaxation)
+    row = row_tau * (problem.log_mu - problem.over_columns(column))
+    return Potentials(_relaxed(potentials.row, row, relaxation), column)
+
+
+def _relaxed(old: Array, new: Array, relaxation: float) -> Array:
+    return new if relaxation == 1 else old + relaxation * (new - old)
+
+
+def newton_step(problem: Problem, potentials: Potentials) -> Potentials:
+    """Newton's method on the semi-dual, a concave function of the column potentials alone.
+
+    With the rows' marginals always met (Brauer et al., 2017), the Hessian is a weighted graph
+    Laplacian between columns. Of full and shortened steps, and of Sinkhorn's own, the one that
+    leaves the smallest marginal error is taken, so that the error never grows.
+    """
+    column = potentials.column
+    row = problem.log_mu - problem.over_columns(column)
+    log_plan = _log_plan(problem.kernel, Potentials(row, column))
+    over_rows = problem.over_rows(row)
+    gradient = jnp.exp(problem.log_nu) - jnp.exp(over_rows + column)
+    shares = jnp.exp(log_plan - problem.log_mu[..., None])
+    step = _solve_columns(jnp.exp(log_plan), shares, gradient, 1.0, 1.0)
+    lengths = jnp.array([1.0, 0.5, 0.25, 0.0625], step.dtype)
+    tries = column + lengths.reshape(-1, *[1] * step.ndim) * step
+    tries = jnp.concatenate([tries, (problem.log_nu - over_rows)[None]])
+
+    def left(one: Array) -> Array:
+        masses = problem.over_rows(problem.log_mu - problem.over_columns(one)) + one
+        return jnp.abs(jnp.exp(masses) - jnp.exp(problem.log_nu)).sum(axis=-1)
+
+    errors = jax.lax.map(left, tries)
+    best = jnp.argmin(jnp.where(jnp.isnan(errors), jnp.inf, errors), axis=0)
+    column = jnp.take_along_axis(tries, best[None, ..., None], axis=0)[0]
+    return Potentials(problem.log_mu - problem.over_columns(column), column)
+
+
+def _solve_columns(
+    plan: Array, shares: Array, target: Array, row_tau: float, column_tau: float
+) -> Array:
+    """The columns' part of the linear system of the optimality conditions.
+
+    `plan` has the masses and `shares` each row's masses over their sum. The matrix is
+    diag(masses / column_tau) - row_tau * shares^T plan, written as a Laplacian, which loses no
+    digits to cancellation. Where both sides are balanced the last column's unknown is 0.
+    """
+    masses = plan.sum(axis=-2)
+    weights = jnp.einsum("...nk,...nl->...kl", shares, plan, precision=jax.lax.Precision.HIGHEST)
+    weights = row_tau * weights * (1 - jnp.eye(masses.shape[-1], dtype=plan.dtype))
+    slack = 1 / column_tau - row_tau
+    # What keeps clusters that share no row from dividing by zero.
+    slack += 8 * jnp.finfo(plan.dtype).eps
+    diagonal = weights.sum(axis=-1) + masses * slack
+    if row_tau == column_tau == 1:
+        diagonal = diagonal.at[..., -1].add(masses[..., -1])
+    matrix = diagonal[..., None] * jnp.eye(masses.shape[-1], dtype=plan.dtype) - weights
+    factor = jax.scipy.linalg.cho_factor(matrix)
+    return jax.scipy.linalg.cho_solve(factor, target[..., None])[..., 0]
+
+
+def _log_plan(kernel: Array, potentials: Potentials) -> Array:
+    return kernel + potentials.row[..., :, None] + potentials.column[..., None, :]
+
+
+class _Progress(NamedTuple):
+    """An iteration in flight, for every problem of the batch."""
+
+    potentials: Potentials
+    memory: "_Memory | None"
+    iterations: Int[Array, "*batch"]
+    change: Float[Array, "*batch"]
+
+
+class _Memory(NamedTuple):
+    """What Anderson acceleration keeps: the last images of the step, and how far they moved."""
+
+    start: Potentials
+    images: Float[Array, "*batch memory size"]
+    moves: Float[Array, "*batch memory size"]
+
+
+def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
+    """From zero potentials, a fixed number of steps or until none changes more than the tolerance.
+
+    A problem that has converged stays as it is: what comes out owes nothing to its batch.
+    """
+    zeros = Potentials(jnp.zeros_like(problem.log_mu), jnp.zeros_like(problem.log_nu))
+    batch, dtype = problem.kernel.shape[:-2], problem.kernel.dtype
+    memory = None
+    if config.anderson:
+        size = problem.kernel.shape[-2] + problem.kernel.shape[-1]
+        empty = jnp.zeros((*batch, config.anderson, size), dtype)
+        memory = _Memory(zeros, empty, empty)
+    at = _Progress(zeros, memory, jnp.zeros(batch, jnp.int32), jnp.full(batch, jnp.inf, dtype))
+
+    def advance(at: _Progress) -> _Progress:
+        start = at.potentials if at.memory is None else at.memory.start
+        moved = step(problem, start)
+        change = _distance(moved, start, config)
+        memory = None if at.memory is None else _accelerate(at.memory, moved, at.iterations.max())
+        if config.tolerance is None:
+            return _Progress(moved, memory, at.iterations + 1, change)
+        active = at.change > config.tolerance
+        kept = [
+            jnp.where(active[..., None], new, old)
+            for new, old in zip(moved, at.potentials, strict=True)
+        ]
+        return _Progress(
+            Potentials(*kept), memory, at.iterations + active, jnp.where(active, change, at.change)
+        )
+
+    if config.tolerance is not None:
+
+        def unfinished(at: _Progress) -> Bool[Array, ""]:
+            return ((at.change > config.tolerance) & (at.iterations < config.iterations)).any()
+
+        return jax.lax.while_loop(unfinished, advance, at)
+    if problem.gibbs is not None and config.iterations <= UNROLLED:
+        for _ in range(config.iterations):
+            at = advance(at)
+        return at
+    return jax.lax.scan(lambda at, _: (advance(at), None), at, length=config.iterations)[0]
+
+
+def _distance(new: Potentials, old: Potentials, config: SinkhornConfig) -> Array:
+    """Largest change of a potential: of a balanced step, the relative error it mended."""
+    change = Potentials(new.row - old.row, new.column - old.column)
+    if config.balanced:
+        change = _centre(change)
+    return jnp.maximum(jnp.abs(change.row).max(axis=-1), jnp.abs(change.column).max(axis=-1))
+
+
+def _centre(potentials: Potentials) -> Potentials:
+    shift = potentials.column.mean(axis=-1, keepdims=True)
+    return Potentials(potentials.row + shift, potentials.column - shift)
+
+
+def _accelerate(memory: _Memory, moved: Potentials, count: Int[Array, ""]) -> _Memory:
+    """Anderson's (J. ACM 1965) next start: the mixture of past images whose moves cancel best."""
+    flat = functools.partial(jnp.concatenate, axis=-1)
+    image = flat(moved)
+    slots = memory.images.shape[-2]
+    here = (jnp.arange(slots) == count % slots)[:, None]
+    images = jnp.where(here, image[..., None, :], memory.images)
+    moves = jnp.where(here, (image - flat(memory.start))[..., None, :], memory.moves)
+    gram = jnp.einsum("...ik,...jk->...ij", moves, moves, precision=jax.lax.Precision.HIGHEST)
+    filled = (jnp.arange(slots) <= count).astype(gram.dtype)
+    scale = jnp.trace(gram, axis1=-2, axis2=-1)[..., None, None]
+    scale = jnp.maximum(scale, jnp.finfo(gram.dtype).tiny)
+    # Empty slots get a weight of 0: their rows and columns are those of the identity.
+    ridge = jnp.finfo(gram.dtype).eps * jnp.eye(slots, dtype=gram.dtype)
+    gram = gram / scale + ridge + jnp.diag(1 - filled)
+    weights = jnp.linalg.solve(
+        gram, jnp.broadcast_to(filled, (*image.shape[:-1], slots))[..., None]
+    )
+    weights = weights[..., 0] * filled
+    weights = weights / weights.sum(axis=-1, keepdims=True)
+    mixed = jnp.einsum("...i,...ik->...k", weights, images, precision=jax.lax.Precision.HIGHEST)
+    mixed = jnp.where(jnp.isfinite(mixed).all(axis=-1, keepdims=True), mixed, image)
+    rows = moved.row.shape[-1]
+    return _Memory(Potentials(mixed[..., :rows], mixed[..., rows:]), images, moves)
+
+
+class _Solution(NamedTuple):
+    potentials: Potentials
+    iterations: Int[Array, "*batch"]
+    converged: Bool[Array, "*batch"]
+
+
+class _Scaled(NamedTuple):
+    """The scores of the scaling domain, and whether they are close enough to one another for it."""
+
+    fits: Bool[Array, ""]
+    row_max: Float[Array, "*batch rows"]
+    gibbs: Float[Array, "*batch rows columns"]
+
+
+def _scale(kernel: Array, config: SinkhornConfig) -> _Scaled | None:
+    if config.domain == "log":
+        return None
+    row_max = jax.lax.stop_gradient(kernel.max(axis=-1))
+    # With a floor under it, all that is computed of it is finite, needed or not.
+    gibbs = jnp.maximum(jnp.exp(kernel - row_max[..., None]), GIBBS_FLOOR)
+    return _Scaled(gibbs.min() > GIBBS_FLOOR, row_max, gibbs)
+
+
+def _solve(
+    kernel: Array,
+    log_mu: Array,
+    log_nu: Array,
+    scaled: _Scaled | None,
+    step: Step,
+    config: SinkhornConfig,
+) -> _Solution:
+    """Iterate in the configured domain; scaling falls back where the scores are too far apart."""
+
+    def solve(problem: Problem) -> _Solution:
+        return _finish(_iterate(problem, step, config), config)
+
+    logarithmic = Problem(kernel, log_mu, log_nu)
+    if scaled is None:
+        return solve(logarithmic)
+    scaling = Problem(kernel, log_mu, log_nu, scaled.row_max, scaled.gibbs)
+    return jax.lax.cond(scaled.fits, lambda: solve(scaling), lambda: solve(logarithmic))
+
+
+def _finish(at: _Progress, config: SinkhornConfig) -> _Solution:
+    finite = jnp.isfinite(at.change)
+    met = finite if config.tolerance is None else at.change <= config.tolerance
+    return _Solution(at.potentials, at.iterations, met)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5))
+def _unrolled(
+    kernel: Array,
+    log_mu: Array,
+    log_nu: Array,
+    scaled: _Scaled | None,
+    step: Step,
+    config: SinkhornConfig,
+) -> _Solution:
+    """The solution, differentiated through its iterations, which are done again for that.
+
+    By itself JAX would keep what either domain needs for its gradient: many matrices.
+    """
+    return _solve(kernel, log_mu, log_nu, scaled, step, config)
+
+
+def _unrolled_forward(
+    kernel: Array,
+    log_mu: Array,
+    log_nu: Array,
+    scaled: _Scaled | None,
+    step: Step,
+    config: SinkhornConfig,
+) -> tuple[_Solution, Any]:
+    inputs = (kernel, log_mu, log_nu)
+    if scaled is None:
+        solution, pull = _pull(Problem, inputs, step, config)
+        return solution, (inputs, None, pull)
+
+    def start(gibbs: Array, log_mu: Array, log_nu: Array) -> Problem:
+        return Problem(kernel, log_mu, log_nu, scaled.row_max, gibbs)
+
+    found, pull = _pull(start, (scaled.gibbs, log_mu, log_nu), step, config)
+    solution = jax.lax.cond(scaled.fits, lambda: found, lambda: _solve(*inputs, None, step, config))
+    return solution, (inputs, scaled, pull)
+
+
+def _pull(
+    start: Callable[..., Problem], inputs: tuple[Array, ...], step: Step, config: SinkhornConfig
+) -> tuple[_Solution, Any]:
+    """The iterations, and the function that takes their gradient back to the inputs."""
+
+    def solve(*inputs: Array) -> tuple[Potentials, _Solution]:
+        solution = _finish(_iterate(start(*inputs), step, config), config)
+        return solution.potentials, solution
+
+    _, pull, solution = jax.vjp(solve, *inputs, has_aux=True)
+    return solution, pull
+
+
+def _unrolled_backward(
+    step: Step, config: SinkhornConfig, kept: Any, towards: _Solution
+) -> tuple[Array, Array, Array, None]:
+    inputs, scaled, pull = kept
+    if scaled is None:
+        return *pull(towards.potentials), None
+
+    def scaling() -> tuple[Array, ...]:
+        gibbs, *marginals = pull(towards.potentials)
+        return scaled.gibbs * gibbs, *marginals
+
+    def logarithmic() -> tuple[Array, ...]:
+        def one(at: tuple[tuple[Array, ...], Potentials]) -> tuple[Array, ...]:
+            return _pull(Problem, at[0], step, config)[1](at[1])
+
+        everything = (inputs, towards.potentials)
+        batch = inputs[0].shape[:-2]
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), everything)
+        out = jax.lax.map(one, flat, batch_size=FALLBACK_BATCH)
+        return tuple(x.reshape(*batch, *x.shape[1:]) for x in out)
+
+    return *jax.lax.cond(scaled.fits, scaling, logarithmic), None
+
+
+_unrolled.defvjp(_unrolled_forward, _unrolled_backward)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _implicit(
+    kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
+) -> _Solution:
+    """The solution, differentiated by the optimality conditions: no iteration is remembered."""
+    return _solve(kernel, log_mu, log_nu, _scale(kernel, config), step, config)
+
+
+def _implicit_forward(
+    kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
+) -> tuple[_Solution, tuple[Array, Potentials]]:
+    # Through the rule itself, so that it may be differentiated again.
+    solution = _implicit(kernel, log_mu, log_nu, step, config)
+    return solution, (kernel, solution.potentials)
+
+
+def _implicit_backward(
+    step: Step, config: SinkhornConfig, kept: tuple[Array, Potentials], towards: _Solution
+) -> tuple[Array, Array, Array]:
+    """Solve the transposed linearised conditions (see docs/sinkhorn.md, "Implicit gradient")."""
+    kernel, potentials = kept
+    log_plan = _log_plan(kernel, potentials)
+    plan = jnp.exp(log_plan)
+    shares = jax.nn.softmax(log_plan, axis=-1)
+    product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+    row, column = towards.potentials
+    target = column - config.row_tau * product("...nk,...n->...k", shares, row)
+    along_column = _solve_columns(plan, shares, target, config.row_tau, config.column_tau)
+    if config.balanced:
+        # Where the masses' totals change alone, rows are met and columns follow, as in iterations.
+        masses = plan.sum(axis=-2)
+        shift = (masses * along_column).sum(axis=-1) / masses.sum(axis=-1)
+        along_column = along_column - shift[..., None]
+    along_row = config.row_tau * (row - product("...nk,...k->...n", plan, along_column))
+    kernel_bar = -(shares * along_row[..., :, None] + plan * along_column[..., None, :])
+    return kernel_bar, along_row, plan.sum(axis=-2) * along_column
+
+
+_implicit.defvjp(_implicit_forward, _implicit_backward)
+
+
+def _by_optimistix(
+    kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig, solver: Any
+) -> _Solution:
+    """A fixed point by any solver of optimistix, differentiated by its implicit adjoint."""
+    import lineax
+    import optimistix
+
+    if solver is None:
+        solver = optimistix.FixedPointIteration(rtol=config.tolerance, atol=config.tolerance)
+
+    def one(kernel: Array, log_mu: Array, log_nu: Array) -> _Solution:
+        def again(potentials: Potentials, problem: Problem) -> Potentials:
+            moved = step(problem, potentials)
+            # Centred, for a fixed point that is unique.
+            return _centre(moved) if config.balanced else moved
+
+        start = Potentials(jnp.zeros_like(log_mu), jnp.zeros_like(log_nu))
+        found = optimistix.fixed_point(
+            again,
+            solver,
+            start,
+            args=_PlainProblem(kernel, log_mu, log_nu),
+            max_steps=config.iterations,
+            adjoint=optimistix.ImplicitAdjoint(lineax.AutoLinearSolver(well_posed=True)),
+            throw=False,
+        )
+        return _Solution(
+            found.value,
+            jnp.asarray(found.stats["num_steps"], jnp.int32),
+            found.result == optimistix.RESULTS.successful,
+        )
+
+    for _ in kernel.shape[:-2]:
+        one = jax.vmap(one)
+    return one(kernel, log_mu, log_nu)
+
+
+def sinkhorn(
+    scores: Float[Array, "*batch rows columns"],
+    log_mu: Float[Array, "*#batch rows"],
+    log_nu: Float[Array, "*#batch columns"],
+    *,
+    epsilon: float | Float[Array, ""] = 1.0,
+    config: SinkhornConfig = SinkhornConfig(),
+    step: Step | None = None,
+    solver: Any = None,
+) -> SinkhornResult:
+    """Transport plan of largest <plan, scores> + epsilon * entropy for the given marginals (Eq. 5).
+
+    By default the published algorithm: three times the two projections, columns first and rows
+    last, from zero potentials. `epsilon` is an argument of its own, not read from `config`, so that
+    it may be traced or learnt. Scores of half precision are widened to float32.
+
+    Args:
+        scores: finite; what a row gains by going to a column.
+        log_mu: logarithms of the rows' masses.
+        log_nu: logarithms of the columns' masses; for balanced transport they sum to the same.
+        epsilon: entropic regularisation, above 0.
+        config: the variant, static.
+        step: in place of the built-in step. Iteration, tolerance, acceleration and diagnostics
+            work as before; its gradient is "unrolled", "optimistix" or "stop".
+        solver: an optimistix solver, where `config.gradient` is "optimistix".
+
+    Raises:
+        InputError: shapes that do not fit, a step or solver that the configuration has no use for;
+            and where values are known (outside of `jit`): scores that are not finite, masses that
+            sum to different totals, an epsilon of 0 or less.
+        RuntimeError: `config.must_converge`, and a tolerance was not met.
+    """
+    _check(scores, log_mu, log_nu, epsilon, config, step, solver)
+    return _sinkhorn(scores, log_mu, log_nu, epsilon, config, step, solver)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "step", "solver"))
+def _sinkhorn(
+    scores: Array,
+    log_mu: Array,
+    log_nu: Array,
+    epsilon: float | Array,
+    config: SinkhornConfig,
+    step: Step | None,
+    solver: Any,
+) -> SinkhornResult:
+    wide = jnp.promote_types(scores.dtype, jnp.float32)
+    kernel = scores.astype(wide) / jnp.asarray(epsilon, wide)
+    batch = kernel.shape[:-2]
+    log_mu = jnp.broadcast_to(log_mu.astype(wide), (*batch, kernel.shape[-2]))
+    log_nu = jnp.broadcast_to(log_nu.astype(wide), (*batch, kernel.shape[-1]))
+    if config.method in ("softmax", "dual-softmax"):
+        return _softmax(kernel, log_mu, log_nu, config)
+    if step is None and config.method == "newton":
+        step = newton_step
+    elif step is None:
+        step = functools.partial(
+            sinkhorn_step,
+            relaxation=config.relaxation,
+            row_tau=config.row_tau,
+            column_tau=config.column_tau,
+        )
+    if config.gradient == "implicit":
+        solution = _implicit(kernel, log_mu, log_nu, step, config)
+    elif config.gradient == "optimistix":
+        solution = _by_optimistix(kernel, log_mu, log_nu, step, config, solver)
+    elif config.gradient == "stop":
+        fixed = jax.lax.stop_gradient(kernel)
+        marginals = jax.lax.stop_gradient((log_mu, log_nu))
+        solution = _solve(fixed, *marginals, _scale(fixed, config), step, config)
+    else:
+        scaled = _scale(kernel, config)
+        solution = _unrolled(kernel, log_mu, log_nu, scaled, step, config)
+    potentials = solution.potentials
+    if config.must_converge:
+        import equinox
+
+        potentials = equinox.error_if(
+            potentials,
+            ~solution.converged.all(),
+            f"Sinkhorn: no convergence to {config.tolerance} in {config.iterations} iterations",
+        )
+    log_plan = _log_plan(kernel, potentials)
+    if config.balanced:
+        potentials = _centre(potentials)
+    errors = marginal_error(log_plan, log_mu, log_nu)
+    return SinkhornResult(log_plan, potentials, *errors, solution.iterations, solution.converged)
+
+
+def _softmax(kernel: Array, log_mu: Array, log_nu: Array, config: SinkhornConfig) -> SinkhornResult:
+    """The baselines that transport nothing: rows shared out, or rows' times columns' shares."""
+    row, column = -jax.nn.logsumexp(kernel, axis=-1), jnp.zeros_like(log_nu)
+    log_plan = kernel + row[..., None] + log_mu[..., None]
+    if config.method == "dual-softmax":
+        column = -jax.nn.logsumexp(kernel, axis=-2)
+        log_plan = 2 * kernel + row[..., None] + column[..., None, :]
+    else:
+        row = row + log_mu
+    batch = kernel.shape[:-2]
+    return SinkhornResult(
+        log_plan,
+        Potentials(row, column),
+        *marginal_error(log_plan, log_mu, log_nu),
+        jnp.zeros(batch, jnp.int32),
+        jnp.isfinite(row).all(axis=-1),
+    )
+
+
+def marginal_error(
+    log_plan: Float[Array, "*batch rows columns"],
+    log_mu: Float[Array, "*#batch rows"],
+    log_nu: Float[Array, "*#batch columns"],
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """Largest relative error of the row masses and of the column masses of a plan."""
+    rows = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-1) - log_mu)
+    columns = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-2) - log_nu)
+    return jnp.abs(rows).max(axis=-1), jnp.abs(columns).max(axis=-1)
 
 
 def append_dustbin(
-    scores: Float[Array, "*batch rows clusters"], dustbin: Float[Array, ""]
+    scores: Float[Array, "*batch rows clusters"],
+    dustbin: Float[Array, ""] | Float[Array, "*batch rows"],
 ) -> Float[Array, "*batch rows clusters+1"]:
-    """Append a column that holds the dustbin's score (paper Eq. 4)."""
-    column = jnp.broadcast_to(dustbin.astype(scores.dtype), (*scores.shape[:-1], 1))
+    """Append a column of the dustbin's score, one for all rows (paper Eq. 4) or one a row."""
+    column = dustbin.astype(scores.dtype)
+    column = jnp.broadcast_to(column[..., None] if column.ndim else column, (*scores.shape[:-1], 1))
     return jnp.concatenate([scores, column], axis=-1)
 
 
@@ -52,51 +659,101 @@ def log_marginals(
     return log_mu, log_nu
 
 
-def marginal_error(
-    log_plan: Float[Array, "*batch rows columns"],
-    log_mu: Float[Array, "*#batch rows"],
-    log_nu: Float[Array, "*#batch columns"],
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Largest relative error of the row masses and of the column masses of a plan."""
-    rows = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-1) - log_mu)
-    columns = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-2) - log_nu)
-    return jnp.abs(rows).max(axis=-1), jnp.abs(columns).max(axis=-1)
-
-
-def sinkhorn(
-    scores: Float[Array, "*batch rows columns"],
-    log_mu: Float[Array, "*#batch rows"],
-    log_nu: Float[Array, "*#batch columns"],
-    *,
-    epsilon: float | Float[Array, ""] = 1.0,
-    config: SinkhornConfig = SinkhornConfig(),
-) -> SinkhornResult:
-    """Transport plan of largest <plan, scores> + epsilon * entropy for the given marginals (Eq. 5).
-
-    Alternates the two projections `config.iterations` times, columns first and rows last, from zero
-    potentials: the published algorithm, so that few iterations give the published plan. `epsilon`
-    is an argument of its own, not read from `config`, so that it may be traced or learnt.
-    """
-    kernel = scores / epsilon
-    row_potential = jnp.zeros_like(kernel[..., :, 0])
-    column_potential = jnp.zeros_like(kernel[..., 0, :])
-    for _ in range(config.iterations):
-        column_potential = log_nu - jax.nn.logsumexp(kernel + row_potential[..., None], axis=-2)
-        row_potential = log_mu - jax.nn.logsumexp(kernel + column_potential[..., None, :], axis=-1)
-    log_plan = kernel + row_potential[..., None] + column_potential[..., None, :]
-    return SinkhornResult(log_plan, *marginal_error(log_plan, log_mu, log_nu))
-
-
 def assign(
     scores: Float[Array, "*batch patches clusters"],
-    dustbin: Float[Array, ""],
+    dustbin: Float[Array, ""] | Float[Array, "*batch patches"] | None,
     config: SinkhornConfig = SinkhornConfig(),
 ) -> SinkhornResult:
-    """SALAD's assignment of patches to clusters, the dustbin in the last column.
+    """Assignment of patches to clusters as `config.dustbin` says, a dustbin in the last column.
+
+    Args:
+        scores: of each patch for each cluster.
+        dustbin: "column", "row and column": the score of one; "token": a score a patch; "mass": the
+            logit of the dustbin's share of all mass, the rest being shared by the clusters alike;
+            "none": None, and the patches' mass is shared by the clusters alike.
+        config: the variant.
 
     Raises:
-        InputError: no more patches than clusters.
+        InputError: no more patches than clusters, where the dustbin's mass is their difference; or
+            a dustbin of another shape than the variant's.
     """
-    log_mu, log_nu = log_marginals(*scores.shape[-2:], dtype=scores.dtype)
+    kind = config.dustbin
+    rows, clusters = scores.shape[-2:]
+    wanted = {"none": None, "token": scores.shape[:-1]}.get(kind, ())
+    found = None if dustbin is None else dustbin.shape
+    if found != wanted:
+        raise InputError(f"dustbin: found shape {found}, expected {wanted} for {kind!r}")
+    scores = scores.astype(jnp.promote_types(scores.dtype, jnp.float32))
+    log_mu = jnp.zeros(rows, scores.dtype)
+    if dustbin is None:
+        log_nu = jnp.full(clusters, math.log(rows / clusters), scores.dtype)
+        return sinkhorn(scores, log_mu, log_nu, epsilon=config.epsilon, config=config)
+    if kind == "mass":
+        share = jax.nn.log_sigmoid(jnp.stack([-dustbin, dustbin])).astype(scores.dtype)
+        share = share + math.log(rows)
+        log_nu = jnp.append(jnp.broadcast_to(share[0] - math.log(clusters), clusters), share[1])
+        full = append_dustbin(scores, jnp.zeros_like(dustbin))
+        return sinkhorn(full, log_mu, log_nu, epsilon=config.epsilon, config=config)
     full = append_dustbin(scores, dustbin)
-    return sinkhorn(full, log_mu, log_nu, epsilon=config.epsilon, config=config)
+    if kind != "row and column":
+        log_mu, log_nu = log_marginals(rows, clusters, scores.dtype)
+        return sinkhorn(full, log_mu, log_nu, epsilon=config.epsilon, config=config)
+    last = jnp.broadcast_to(dustbin.astype(full.dtype), (*full.shape[:-2], 1, clusters + 1))
+    full = jnp.concatenate([full, last], axis=-2)
+    log_mu = jnp.append(log_mu, math.log(clusters))
+    log_nu = jnp.zeros(clusters + 1, scores.dtype).at[-1].set(math.log(rows))
+    result = sinkhorn(full, log_mu, log_nu, epsilon=config.epsilon, config=config)
+    return result._replace(log_plan=result.log_plan[..., :-1, :])
+
+
+def _check(
+    scores: Array,
+    log_mu: Array,
+    log_nu: Array,
+    epsilon: float | Array,
+    config: SinkhornConfig,
+    step: Step | None,
+    solver: Any,
+) -> None:
+    if scores.ndim < 2 or log_mu.shape[-1:] != scores.shape[-2:-1]:
+        raise InputError(
+            f"sinkhorn: found scores of shape {scores.shape} and log_mu of {log_mu.shape}, "
+            "expected (..., rows, columns) and (..., rows)"
+        )
+    if log_nu.shape[-1:] != scores.shape[-1:]:
+        raise InputError(
+            f"sinkhorn: found scores of shape {scores.shape} and log_nu of {log_nu.shape}, "
+            "expected (..., rows, columns) and (..., columns)"
+        )
+    if step is not None and (config.gradient == "implicit" or config.method != "sinkhorn"):
+        raise InputError(
+            f"sinkhorn: found a step beside method {config.method!r} and gradient "
+            f"{config.gradient!r}, expected method 'sinkhorn' and gradient 'unrolled', "
+            "'optimistix' or 'stop': the closed form is that of the built-in step"
+        )
+    if solver is not None and config.gradient != "optimistix":
+        raise InputError(
+            f"sinkhorn: found a solver beside gradient {config.gradient!r}, expected 'optimistix'"
+        )
+    known = {"scores": scores, "log_mu": log_mu, "log_nu": log_nu}
+    known = {
+        name: np.asarray(value, np.float64)
+        for name, value in known.items()
+        if not isinstance(value, jax.core.Tracer)
+    }
+    for name, value in known.items():
+        if not np.isfinite(value).all():
+            raise InputError(
+                f"sinkhorn: {name} found with NaN or infinity, expected finite numbers"
+            )
+    if not isinstance(epsilon, jax.core.Tracer) and not float(epsilon) > 0:
+        raise InputError(f"sinkhorn: epsilon found {epsilon}, expected more than 0")
+    if config.balanced and {"log_mu", "log_nu"} <= known.keys():
+        totals = [np.exp(known[name]).sum(axis=-1) for name in ("log_mu", "log_nu")]
+        # Sums of float32 logarithms.
+        if not np.allclose(*totals, rtol=1e-4):
+            found = " and ".join(f"{np.ravel(total)[0]:.6g}" for total in totals)
+            raise InputError(
+                f"sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to {found}, "
+                "expected the same"
+            )
