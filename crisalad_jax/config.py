@@ -263,6 +263,11 @@ class SaladConfig:
         _require_positive(self, "clusters", "cluster_dim", "token_dim", "hidden")
         _require_fraction(self, "dropout")
 
+    @property
+    def scores(self) -> int:
+        """Scores of a patch: one a cluster, and one for a dustbin that the network scores."""
+        return self.clusters + (self.sinkhorn.dustbin == "token")
+
 
 @dataclasses.dataclass(frozen=True)
 class CrossImageConfig:
@@ -364,7 +369,9 @@ class ModelConfig:
                 aggregator.
         """
         if self.aggregator == "salad":
-            check_image_size(image_size, self.salad.clusters)
+            # Where the dustbin's mass is what patches are more than clusters.
+            differs = self.salad.sinkhorn.dustbin in ("column", "token")
+            check_image_size(image_size, self.salad.clusters if differs else 0)
             return
         _check_sides(image_size)
         side = PATCH_SIZE * max(PYRAMID_LEVELS)

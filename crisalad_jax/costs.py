@@ -71,7 +71,7 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
 
 def _salad_macs(config: ModelConfig, patches: int) -> int:
     dim, salad = config.backbone.dim, config.salad
-    networks = salad.hidden * (2 * dim + salad.cluster_dim + salad.clusters)
+    networks = salad.hidden * (2 * dim + salad.cluster_dim + salad.scores)
     sums = salad.clusters * salad.cluster_dim
     return salad.hidden * (dim + salad.token_dim) + patches * (networks + sums)
 

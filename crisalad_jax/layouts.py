@@ -199,7 +199,8 @@ def aggregator_lines(config: ModelConfig) -> Iterator[Entry]:
         yield Entry(("aggregator.p",), ("aggregation.1.p",), _FIRST)
     if config.aggregator != "salad":
         return
-    yield Entry(("aggregator.dust_bin",), ("aggregator.dust_bin",), _SAME)
+    if config.salad.sinkhorn.dustbin not in ("none", "token"):
+        yield Entry(("aggregator.dust_bin",), ("aggregator.dust_bin",), _SAME)
     for name, second, form in (
         ("token_features", 2, _LINEAR),
         ("cluster_features", 3, _POINTWISE),
@@ -401,7 +402,7 @@ def _infer(state: State) -> tuple[str, ModelConfig]:
         return layout, _whole(backbone=backbone, aggregator="class-token", layers=0)
     backbone = _vit_config(_Reader(state, LAYOUTS[layout].backbone))
     head = _Reader(state)
-    if "aggregator.dust_bin" in state:
+    if "aggregator.score.3.weight" in state:
         salad = SaladConfig(
             clusters=head.size("aggregator.score.3.weight", 0),
             cluster_dim=head.size("aggregator.cluster_features.3.weight", 0),

@@ -16,7 +16,7 @@ from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, 
 from crisalad_jax.nn.layers import split_key
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
-from crisalad_jax.nn.vit import ViT, grid_of, init_vit, vit
+from crisalad_jax.nn.vit import Features, ViT, grid_of, init_vit, vit
 from crisalad_jax.pytree import params
 
 Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
@@ -84,18 +84,14 @@ def tokenise(
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
     config.check_image_size((images.shape[1], images.shape[2]))
 
-    def one(
+    def look(
         image: UInt8[Array, "height width 3"] | Float[Array, "height width 3"],
-        key: PRNGKeyArray | None,
-    ) -> Tokens:
+    ) -> Features:
         if image.dtype == jnp.uint8:
             image = normalise(image, config.normalisation)
-        features = vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
-        return aggregate(params.aggregator, features, grid_of(image), config, key=key)
+        return vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
 
-    if key is None:
-        return jax.vmap(functools.partial(one, key=None))(images)
-    return jax.vmap(one)(images, jax.random.split(key, len(images)))
+    return aggregate(params.aggregator, jax.vmap(look)(images), grid_of(images[0]), config, key=key)
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config import SinkhornConfig
@@ -56,25 +57,33 @@ class SinkhornResult(NamedTuple):
 
 @params
 class Problem:
-    """What a step sees: the scores over epsilon, and the marginals."""
+    """What a step sees: the scores over epsilon and the marginals; sums in the log domain."""
 
     kernel: Float[Array, "*batch rows columns"]
     log_mu: Float[Array, "*batch rows"]
     log_nu: Float[Array, "*batch columns"]
-    row_max: Float[Array, "*batch rows"] | None = None
-    gibbs: Float[Array, "*batch rows columns"] | None = None
-    """exp(kernel - row_max) in the scaling domain; None in the log domain."""
 
     def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
         """Logarithm of each row's sum of exp(kernel + column)."""
-        if self.gibbs is None:
-            return _log_sum(self.kernel, column, -1)
-        return self.row_max + _products("...nk,...k->...n", self.gibbs, column)
+        return _log_sum(self.kernel, column, -1)
 
     def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
         """Logarithm of each column's sum of exp(kernel + row)."""
-        if self.gibbs is None:
-            return _log_sum(self.kernel, row, -2)
+        return _log_sum(self.kernel, row, -2)
+
+
+@params
+class _ScalingProblem(Problem):
+    """In the scaling domain: exponentials once, then products of a matrix with vectors."""
+
+    row_max: Float[Array, "*batch rows"]
+    gibbs: Float[Array, "*batch rows columns"]
+    """exp(kernel - row_max)."""
+
+    def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
+        return self.row_max + _products("...nk,...k->...n", self.gibbs, column)
+
+    def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
         return _products("...nk,...n->...k", self.gibbs, row + self.row_max)
 
 
@@ -93,7 +102,7 @@ Step = Callable[[Problem, Potentials], Potentials]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _log_sum(kernel: Array, potential: Array, axis: int) -> Array:
+def _log_sum(kernel: Array, potential: Array, axis: int) -> Any:
     """Logarithm of the sums of exp(kernel + potential) over the axis that the potential has.
 
     Differentiating keeps what goes in and comes out, where `logsumexp` would keep a matrix.
@@ -101,7 +110,7 @@ def _log_sum(kernel: Array, potential: Array, axis: int) -> Array:
     return jax.nn.logsumexp(kernel + _along(potential, axis), axis=axis)
 
 
-def _log_sum_forward(kernel: Array, potential: Array, axis: int) -> tuple[Array, Any]:
+def _log_sum_forward(kernel: Array, potential: Array, axis: int) -> tuple[Any, Any]:
     out = _log_sum(kernel, potential, axis)
     return out, (kernel, potential, out)
 
@@ -256,13 +265,14 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
             Potentials(*kept), memory, at.iterations + active, jnp.where(active, change, at.change)
         )
 
-    if config.tolerance is not None:
+    tolerance = config.tolerance
+    if tolerance is not None:
 
         def unfinished(at: _Progress) -> Bool[Array, ""]:
-            return ((at.change > config.tolerance) & (at.iterations < config.iterations)).any()
+            return ((at.change > tolerance) & (at.iterations < config.iterations)).any()
 
         return jax.lax.while_loop(unfinished, advance, at)
-    if problem.gibbs is not None and config.iterations <= UNROLLED:
+    if isinstance(problem, _ScalingProblem) and config.iterations <= UNROLLED:
         for _ in range(config.iterations):
             at = advance(at)
         return at
@@ -347,7 +357,7 @@ def _solve(
     logarithmic = Problem(kernel, log_mu, log_nu)
     if scaled is None:
         return solve(logarithmic)
-    scaling = Problem(kernel, log_mu, log_nu, scaled.row_max, scaled.gibbs)
+    scaling = _ScalingProblem(kernel, log_mu, log_nu, scaled.row_max, scaled.gibbs)
     return jax.lax.cond(scaled.fits, lambda: solve(scaling), lambda: solve(logarithmic))
 
 
@@ -387,7 +397,7 @@ def _unrolled_forward(
         return solution, (inputs, None, pull)
 
     def start(gibbs: Array, log_mu: Array, log_nu: Array) -> Problem:
-        return Problem(kernel, log_mu, log_nu, scaled.row_max, gibbs)
+        return _ScalingProblem(kernel, log_mu, log_nu, scaled.row_max, gibbs)
 
     found, pull = _pull(start, (scaled.gibbs, log_mu, log_nu), step, config)
     solution = jax.lax.cond(scaled.fits, lambda: found, lambda: _solve(*inputs, None, step, config))
@@ -437,8 +447,8 @@ _unrolled.defvjp(_unrolled_forward, _unrolled_backward)
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
 def _implicit(
     kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
-) -> _Solution:
-    """The solution, differentiated by the optimality conditions: no iteration is remembered."""
+) -> Any:
+    """The `_Solution`, differentiated by the optimality conditions: no iteration is remembered."""
     return _solve(kernel, log_mu, log_nu, _scale(kernel, config), step, config)
 
 
@@ -446,7 +456,7 @@ def _implicit_forward(
     kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
 ) -> tuple[_Solution, tuple[Array, Potentials]]:
     # Through the rule itself, so that it may be differentiated again.
-    solution = _implicit(kernel, log_mu, log_nu, step, config)
+    solution: Any = _implicit(kernel, log_mu, log_nu, step, config)
     return solution, (kernel, solution.potentials)
 
 
@@ -483,7 +493,8 @@ def _by_optimistix(
     import optimistix
 
     if solver is None:
-        solver = optimistix.FixedPointIteration(rtol=config.tolerance, atol=config.tolerance)
+        tolerance = config.tolerance or 0.0  # never None: see SinkhornConfig
+        solver = optimistix.FixedPointIteration(rtol=tolerance, atol=tolerance)
 
     def one(kernel: Array, log_mu: Array, log_nu: Array) -> _Solution:
         def again(potentials: Potentials, problem: Problem) -> Potentials:
@@ -574,6 +585,7 @@ def _sinkhorn(
             row_tau=config.row_tau,
             column_tau=config.column_tau,
         )
+    solution: Any  # what custom_vjp returns has no type for the checker
     if config.gradient == "implicit":
         solution = _implicit(kernel, log_mu, log_nu, step, config)
     elif config.gradient == "optimistix":
@@ -739,14 +751,14 @@ def _check(
     known = {
         name: np.asarray(value, np.float64)
         for name, value in known.items()
-        if not isinstance(value, jax.core.Tracer)
+        if not isinstance(value, Tracer)
     }
     for name, value in known.items():
         if not np.isfinite(value).all():
             raise InputError(
                 f"sinkhorn: {name} found with NaN or infinity, expected finite numbers"
             )
-    if not isinstance(epsilon, jax.core.Tracer) and not float(epsilon) > 0:
+    if not isinstance(epsilon, Tracer) and not float(epsilon) > 0:
         raise InputError(f"sinkhorn: epsilon found {epsilon}, expected more than 0")
     if config.balanced and {"log_mu", "log_nu"} <= known.keys():
         totals = [np.exp(known[name]).sum(axis=-1) for name in ("log_mu", "log_nu")]

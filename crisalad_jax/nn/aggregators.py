@@ -41,7 +41,7 @@ def aggregate(
     *,
     key: PRNGKeyArray | None,
 ) -> Tokens:
-    """Tokens of one image, in float32 at least.
+    """Tokens of one image or of a batch, in float32 at least.
 
     `grid` is the rows and columns of patches. `key` draws dropout, None means inference.
 
@@ -52,27 +52,27 @@ def aggregate(
         return salad(params, features, config.salad, key=key)
     class_token, patches = widen(features.class_token), widen(features.patches)
     if params is None:
-        return Tokens(class_token, patches[:0])
+        return Tokens(class_token, patches[..., :0, :])
     return Tokens(class_token, gem_pyramid(params, patches, grid))
 
 
 def gem_pyramid(
-    params: GemPyramid, patches: Float[Array, "patch dim"], grid: tuple[int, int]
-) -> Float[Array, "region dim"]:
+    params: GemPyramid, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
+) -> Float[Array, "*batch region dim"]:
     """Generalised means (Radenovic et al. 2018) of unit patches over 2 x 2 and 3 x 3 regions.
 
     Regions come level by level in row order. A side of n patches is cut at round(i n / level):
     CricaVPR's 8, and 5 and 11, for the 16 x 16 grid that it was published for and fixed to.
     """
     cells = jnp.maximum(l2_normalise(patches), GEM_FLOOR) ** params.p
-    cells = cells.reshape(*grid, -1)
+    cells = cells.reshape(*cells.shape[:-2], *grid, cells.shape[-1])
     means = [
-        cells[top:bottom, left:right].mean(axis=(0, 1))
+        cells[..., top:bottom, left:right, :].mean(axis=(-3, -2))
         for level in PYRAMID_LEVELS
         for top, bottom in _cuts(grid[0], level)
         for left, right in _cuts(grid[1], level)
     ]
-    return jnp.stack(means) ** (1 / params.p)
+    return jnp.stack(means, axis=-2) ** (1 / params.p)
 
 
 def _cuts(side: int, level: int) -> list[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""What an aggregator makes of one image: the tokens that become a descriptor."""
+"""What an aggregator makes of an image: the tokens that become a descriptor."""
 
 from typing import NamedTuple
 
@@ -7,10 +7,10 @@ from jaxtyping import Array, Float
 
 
 class Tokens(NamedTuple):
-    """One global token, and the local ones: of SALAD's clusters, or of the regions of a pyramid."""
+    """One global token an image, and local ones: SALAD's clusters', or a pyramid's regions'."""
 
-    global_token: Float[Array, " global_dim"]
-    local: Float[Array, "token dim"]
+    global_token: Float[Array, "*batch global_dim"]
+    local: Float[Array, "*batch token dim"]
 
 
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "token dim"]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
 from crisalad_jax.config import PATCH_SIZE, ViTConfig
 from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
@@ -77,10 +77,10 @@ class ViT:
 
 
 class Features(NamedTuple):
-    """What a backbone says of one image, after its last layer norm."""
+    """What a backbone says of an image, or of a batch, after its last layer norm."""
 
-    class_token: Float[Array, " dim"]
-    patches: Float[Array, "patch dim"]
+    class_token: Float[Array, "*batch dim"]
+    patches: Float[Array, "*batch patch dim"]
 
 
 def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
@@ -144,7 +144,7 @@ def vit(params: ViT, image: Float[Array, "height width 3"], config: ViTConfig) -
     return Features(tokens[0], tokens[1 + config.registers :])
 
 
-def grid_of(image: Float[Array, "height width 3"]) -> tuple[int, int]:
+def grid_of(image: Shaped[Array, "height width 3"]) -> tuple[int, int]:
     """Rows and columns of patches."""
     return image.shape[0] // PATCH_SIZE, image.shape[1] // PATCH_SIZE
 
