@@ -16,12 +16,18 @@ import numpy as np
 from crisalad_jax.checkpoint import StateStore, save_weights
 from crisalad_jax.config import TrainConfig
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage, training_batches
+from crisalad_jax.data.loader import (
+    ImageBatch,
+    ImageCache,
+    OnBadImage,
+    image_batches,
+    training_batches,
+)
 from crisalad_jax.data.places import Places, epoch_batches
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.files import atomic_path, write_json
-from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.training import (
@@ -32,6 +38,8 @@ from crisalad_jax.training import (
     train_step,
 )
 
+WATCHED_QUERIES = 16
+"""So many images show how the transport does, at every validation."""
 SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
 
@@ -236,7 +244,8 @@ class _Run:
             quiet=True,
         )
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
-        self._log.write({"step": self.step, "epoch": epoch, **recalls})
+        watched = self._watch_transport(params, benchmark)
+        self._log.write({"step": self.step, "epoch": epoch, **recalls, **watched})
         if record.best_recall is None or result.recalls[5] > record.best_recall:
             record.best_recall, record.without_gain = result.recalls[5], 0
             save_weights(self.out / "best.safetensors", params, self.config.model)
@@ -247,6 +256,18 @@ class _Run:
         self._stepped_at = time.monotonic()
         words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
         return f"epoch {epoch}, step {self.step}: {words}"
+
+    def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:
+        """Statistics of the transport on the first queries, always the same ones."""
+        model = self.config.model
+        if model.aggregator != "salad":
+            return {}
+        paths = benchmark.queries[:WATCHED_QUERIES]
+        batches = image_batches(
+            paths, image_size=model.image_size, batch_size=len(paths), cache=self.cache
+        )
+        statistics = watch_transport(params, next(iter(batches)).images, model)
+        return {name: float(value) for name, value in statistics._asdict().items()}
 
     def save(self) -> None:
         """Write the weights and the resumable state."""

@@ -15,6 +15,7 @@ from crisalad_jax.nn.aggregators import Aggregator, aggregate, init_aggregator, 
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.layers import split_key
 from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.nn.salad import Salad, TransportStatistics, transport_statistics
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.nn.vit import Features, ViT, grid_of, init_vit, vit
 from crisalad_jax.pytree import params
@@ -80,6 +81,11 @@ def tokenise(
     params: Crisalad, images: Images, config: ModelConfig, *, key: PRNGKeyArray | None = None
 ) -> Tokens:
     """The first half of `describe`: every image's tokens, which owe nothing to other images."""
+    features = _features(params, images, config)
+    return aggregate(params.aggregator, features, grid_of(images[0]), config, key=key)
+
+
+def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
     config.check_image_size((images.shape[1], images.shape[2]))
@@ -91,7 +97,20 @@ def tokenise(
             image = normalise(image, config.normalisation)
         return vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
 
-    return aggregate(params.aggregator, jax.vmap(look)(images), grid_of(images[0]), config, key=key)
+    return jax.vmap(look)(images)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def watch_transport(params: Crisalad, images: Images, config: ModelConfig) -> TransportStatistics:
+    """Statistics of SALAD's transport on a batch of images, without dropout.
+
+    Raises:
+        InputError: as `describe`, or the aggregator is not SALAD.
+    """
+    if not isinstance(params.aggregator, Salad):
+        raise InputError(f"aggregator: found {config.aggregator!r}, expected 'salad'")
+    patches = _features(params, images, config).patches
+    return transport_statistics(params.aggregator, patches, config.salad)
 
 
 @functools.partial(jax.jit, static_argnames="config")

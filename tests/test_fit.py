@@ -13,11 +13,12 @@ import crisalad_jax.fit
 from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.config import TrainConfig
 from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GroupingResult, evaluate
 from crisalad_jax.fit import FitResult, MetricsLog, claim_run, fit, read_metrics
-from crisalad_jax.model import Crisalad
+from crisalad_jax.model import Crisalad, watch_transport
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.retrieval import Neighbours
 from crisalad_jax.serial import read_config
@@ -96,10 +97,14 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     assert [(line["step"], line["epoch"]) for line in validations] == [(2, 1), (4, 2), (6, 3)]
     params, config = load_weights(run / "last.safetensors")
     (result,) = evaluate(params, config, benchmark, groupings=("single",), quiet=True)
+    size = config.image_size
+    queries = np.stack([resize_image(read_image(q), size) for q in benchmark.queries])
+    watched = watch_transport(params, queries, config)
     assert validations[-1] == {
         "step": 6,
         "epoch": 3,
         **{f"R@{k}": recall for k, recall in result.recalls.items()},
+        **{name: float(value) for name, value in watched._asdict().items()},
     }
 
 

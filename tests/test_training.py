@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.config import AdapterConfig, MultiSimilarityConfig, OptimiserConfig
+from crisalad_jax.config import (
+    AdapterConfig,
+    MultiSimilarityConfig,
+    OptimiserConfig,
+    SinkhornConfig,
+)
 from crisalad_jax.errors import InputError
 from crisalad_jax.losses import multi_similarity_loss
 from crisalad_jax.model import describe, init_crisalad
@@ -270,3 +275,50 @@ def test_training_learns(params) -> None:
         )
         found.append(float(metrics.loss))
     assert found[-1] < found[0] - 0.2
+
+
+CONVERGED = {"tolerance": 1e-4, "iterations": 200, "gradient": "implicit"}
+VARIANTS: list[dict] = [
+    {"domain": "log"},
+    {"iterations": 10, "relaxation": 1.5},
+    {"dustbin": "none"},
+    {"dustbin": "row and column"},
+    {"dustbin": "token"},
+    {"dustbin": "mass"},
+    {"column_tau": 0.9},
+    {"gradient": "stop"},
+    {"method": "softmax"},
+    {"method": "dual-softmax"},
+    CONVERGED,
+    CONVERGED | {"anderson": 5, "row_tau": 0.9, "column_tau": 0.9},
+    CONVERGED | {"method": "newton"},
+    CONVERGED | {"gradient": "optimistix"},
+]
+
+
+QUICK = ({"dustbin": "token"}, {"dustbin": "mass"}, CONVERGED)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        pytest.param(fields, id=str(fields), marks=() if fields in QUICK else pytest.mark.slow)
+        for fields in VARIANTS
+    ],
+)
+def test_every_transport_trains(fields: dict) -> None:
+    """Ten steps on one batch move the score network and lower the loss."""
+    salad = dataclasses.replace(MODEL.salad, sinkhorn=SinkhornConfig(**fields))
+    config = dataclasses.replace(STEP, model=dataclasses.replace(MODEL, salad=salad), steps=100)
+    start = init_crisalad(jax.random.key(0), config.model)
+    state, frozen = init_state(fresh(start), "adapters+head", config)
+    losses = []
+    for _ in range(10):
+        state, metrics = train_step(
+            state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), config
+        )
+        losses.append(float(metrics.loss))
+    assert losses[-1] < losses[0] - 0.02
+    trained = merge_params(state.trainable, frozen).aggregator
+    moved = np.abs(trained.score.fc1.weight - start.aggregator.score.fc1.weight).max()
+    assert moved > 1e-3  # ten steps of Adam at 1e-3

@@ -1,13 +1,15 @@
-"""SALAD's parts beside its golden file: dropout, and too few patches."""
+"""SALAD's parts beside its golden file: dropout, dustbins, statistics, and too few patches."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.config import SaladConfig
+from crisalad_jax.config import SaladConfig, SinkhornConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.nn.salad import init_salad, salad
+from crisalad_jax.nn.salad import init_salad, salad, transport, transport_statistics
 from crisalad_jax.nn.vit import Features
 
 CONFIG = SaladConfig(clusters=3, cluster_dim=4, token_dim=8, hidden=16, dropout=0.5)
@@ -69,3 +71,80 @@ def test_dropout_stands_before_relu_of_the_two_local_networks(monkeypatch) -> No
     assert len(set(drawn)) == 2
     assert None not in drawn
     assert (0.0, None) in calls  # the global token's network
+
+
+def with_sinkhorn(**fields) -> SaladConfig:
+    return dataclasses.replace(CONFIG, sinkhorn=SinkhornConfig(**fields))
+
+
+@pytest.mark.parametrize("dustbin", ["none", "column", "row and column", "token", "mass"])
+def test_a_batch_is_its_images_under_every_dustbin(dustbin: str) -> None:
+    config = with_sinkhorn(dustbin=dustbin)
+    params = init_salad(jax.random.key(0), 12, config)
+    keys = jax.random.split(jax.random.key(1))
+    batch = Features(jax.random.normal(keys[0], (5, 12)), jax.random.normal(keys[1], (5, 10, 12)))
+    together = salad(params, batch, config, key=None)
+    assert together.local.shape == (5, 3, 4)
+    by_vmap = jax.vmap(lambda f: salad(params, f, config, key=None))(batch)
+    one_by_one = [
+        salad(params, Features(*(x[i] for x in batch)), config, key=None) for i in range(5)
+    ]
+    for ours, mapped, *singles in zip(together, by_vmap, *one_by_one, strict=True):
+        # float32 rounding of unit vectors by other kernels.
+        np.testing.assert_allclose(ours, mapped, atol=1e-6)
+        np.testing.assert_allclose(ours, jnp.stack(singles), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("dustbin", "live"), [("column", False), ("row and column", True), ("mass", True)]
+)
+def test_the_published_dustbin_is_dead_and_others_live(dustbin: str, live: bool) -> None:
+    config = with_sinkhorn(dustbin=dustbin, domain="log")
+    params = init_salad(jax.random.key(0), 12, config)
+    patches = 20 * features(30).patches
+
+    def lost(dust_bin: jax.Array) -> jax.Array:
+        replaced = dataclasses.replace(params, dust_bin=dust_bin)
+        log_plan = transport(replaced, patches, config, key=None).log_plan
+        return jnp.sin(3 * jnp.exp(log_plan)).sum()
+
+    gradient = abs(float(jax.grad(lost)(jnp.float32(1))))
+    # Rounding noise of sums of a hundred terms of order 1, against what a live parameter has.
+    assert gradient > 1e-3 if live else gradient < 1e-4
+
+
+def test_a_dustbin_score_a_patch_is_the_networks_own_column() -> None:
+    config = with_sinkhorn(dustbin="token")
+    params = init_salad(jax.random.key(0), 12, config)
+    assert params.dust_bin is None
+    assert params.score.fc2.weight.shape == (16, 4)
+    patches = features(10).patches
+
+    def plan(weight: jax.Array) -> jax.Array:
+        second = dataclasses.replace(params.score.fc2, weight=weight)
+        whole = dataclasses.replace(params, score=dataclasses.replace(params.score, fc2=second))
+        return jnp.exp(transport(whole, patches, config, key=None).log_plan)
+
+    weight = params.score.fc2.weight
+    np.testing.assert_allclose(plan(weight).sum(axis=1), 1, atol=1e-5)  # rows are met last
+    gradient = jax.grad(lambda w: jnp.sin(3 * plan(w)).sum())(weight)
+    assert jnp.abs(gradient[:, -1]).max() > 1e-3  # the dustbin's own weights train
+
+
+def test_a_dustbin_of_fixed_mass_allows_more_clusters_than_patches() -> None:
+    config = with_sinkhorn(dustbin="mass")
+    params = init_salad(jax.random.key(0), 12, config)
+    tokens = salad(params, features(2), config, key=None)
+    np.testing.assert_allclose(jnp.linalg.norm(tokens.local, axis=-1), 1, atol=1e-6)
+
+
+def test_statistics_by_hand() -> None:
+    """Scores all alike: every cluster has mass 1 of all ten patches, the dustbin 7 of 10."""
+    params = init_salad(jax.random.key(0), 12, CONFIG)
+    flat = jax.tree.map(jnp.zeros_like, params.score)
+    params = dataclasses.replace(params, score=flat, dust_bin=jnp.zeros(()))
+    patches = jnp.stack([features(10).patches] * 2)
+    found = transport_statistics(params, patches, CONFIG)
+    np.testing.assert_allclose(found.column_error, 0, atol=1e-6)
+    np.testing.assert_allclose(found.dustbin_share, 0.7, rtol=1e-6)
+    np.testing.assert_allclose(found.patches_per_cluster, 10, rtol=1e-5)
