@@ -6,6 +6,7 @@ The problem is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo 
 `docs/sinkhorn.md` has the equations, the variants and how they compare.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -111,7 +112,8 @@ def _log_sum(kernel: Array, potential: Array, axis: int) -> Any:
 
 
 def _log_sum_forward(kernel: Array, potential: Array, axis: int) -> tuple[Any, Any]:
-    out = _log_sum(kernel, potential, axis)
+    # Not through the rule itself: JAX mixes up what is kept when a scan is differentiated twice.
+    out = jax.nn.logsumexp(kernel + _along(potential, axis), axis=axis)
     return out, (kernel, potential, out)
 
 
@@ -200,7 +202,8 @@ def _solve_columns(
     diag(masses / column_tau) - row_tau * shares^T plan, written as a Laplacian, which loses no
     digits to cancellation. Where both sides are balanced the last column's unknown is 0.
     """
-    masses = plan.sum(axis=-2)
+    # The floor is for columns so far from all rows that their masses are 0.
+    masses = jnp.maximum(plan.sum(axis=-2), jnp.finfo(plan.dtype).tiny ** 0.5)
     weights = jnp.einsum("...nk,...nl->...kl", shares, plan, precision=jax.lax.Precision.HIGHEST)
     weights = row_tau * weights * (1 - jnp.eye(masses.shape[-1], dtype=plan.dtype))
     slack = 1 / column_tau - row_tau
@@ -352,7 +355,7 @@ def _solve(
     """Iterate in the configured domain; scaling falls back where the scores are too far apart."""
 
     def solve(problem: Problem) -> _Solution:
-        return _finish(_iterate(problem, step, config), config)
+        return _finish(problem, _iterate(problem, step, config), config)
 
     logarithmic = Problem(kernel, log_mu, log_nu)
     if scaled is None:
@@ -361,10 +364,15 @@ def _solve(
     return jax.lax.cond(scaled.fits, lambda: solve(scaling), lambda: solve(logarithmic))
 
 
-def _finish(at: _Progress, config: SinkhornConfig) -> _Solution:
+def _finish(problem: Problem, at: _Progress, config: SinkhornConfig) -> _Solution:
     finite = jnp.isfinite(at.change)
     met = finite if config.tolerance is None else at.change <= config.tolerance
-    return _Solution(at.potentials, at.iterations, met)
+    potentials = at.potentials
+    if config.relaxation != 1:
+        # Left too far by the last step, rows could have more mass than a float can hold.
+        row = config.row_tau * (problem.log_mu - problem.over_columns(potentials.column))
+        potentials = Potentials(row, potentials.column)
+    return _Solution(potentials, at.iterations, met)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5))
@@ -396,10 +404,11 @@ def _unrolled_forward(
         solution, pull = _pull(Problem, inputs, step, config)
         return solution, (inputs, None, pull)
 
-    def start(gibbs: Array, log_mu: Array, log_nu: Array) -> Problem:
+    def start(gibbs: Array, kernel: Array, log_mu: Array, log_nu: Array) -> Problem:
         return _ScalingProblem(kernel, log_mu, log_nu, scaled.row_max, gibbs)
 
-    found, pull = _pull(start, (scaled.gibbs, log_mu, log_nu), step, config)
+    # The kernel as well: a step of the user's own may read it.
+    found, pull = _pull(start, (scaled.gibbs, *inputs), step, config)
     solution = jax.lax.cond(scaled.fits, lambda: found, lambda: _solve(*inputs, None, step, config))
     return solution, (inputs, scaled, pull)
 
@@ -410,7 +419,8 @@ def _pull(
     """The iterations, and the function that takes their gradient back to the inputs."""
 
     def solve(*inputs: Array) -> tuple[Potentials, _Solution]:
-        solution = _finish(_iterate(start(*inputs), step, config), config)
+        problem = start(*inputs)
+        solution = _finish(problem, _iterate(problem, step, config), config)
         return solution.potentials, solution
 
     _, pull, solution = jax.vjp(solve, *inputs, has_aux=True)
@@ -425,8 +435,8 @@ def _unrolled_backward(
         return *pull(towards.potentials), None
 
     def scaling() -> tuple[Array, ...]:
-        gibbs, *marginals = pull(towards.potentials)
-        return scaled.gibbs * gibbs, *marginals
+        gibbs, kernel, *marginals = pull(towards.potentials)
+        return scaled.gibbs * gibbs + kernel, *marginals
 
     def logarithmic() -> tuple[Array, ...]:
         def one(at: tuple[tuple[Array, ...], Potentials]) -> tuple[Array, ...]:
@@ -494,7 +504,7 @@ def _by_optimistix(
 
     if solver is None:
         tolerance = config.tolerance or 0.0  # never None: see SinkhornConfig
-        solver = optimistix.FixedPointIteration(rtol=tolerance, atol=tolerance)
+        solver = optimistix.FixedPointIteration(rtol=0.0, atol=tolerance)
 
     def one(kernel: Array, log_mu: Array, log_nu: Array) -> _Solution:
         def again(potentials: Potentials, problem: Problem) -> Potentials:
@@ -556,6 +566,8 @@ def sinkhorn(
         RuntimeError: `config.must_converge`, and a tolerance was not met.
     """
     _check(scores, log_mu, log_nu, epsilon, config, step, solver)
+    # Not to compile anew for an epsilon that is not read from there.
+    config = dataclasses.replace(config, epsilon=1.0)
     return _sinkhorn(scores, log_mu, log_nu, epsilon, config, step, solver)
 
 
@@ -686,10 +698,14 @@ def assign(
         config: the variant.
 
     Raises:
-        InputError: no more patches than clusters, where the dustbin's mass is their difference; or
-            a dustbin of another shape than the variant's.
+        InputError: no more patches than clusters, where the dustbin's mass is their difference;
+            scores without two axes; or a dustbin of another shape than the variant's.
     """
     kind = config.dustbin
+    if scores.ndim < 2:
+        raise InputError(
+            f"assign: found scores of shape {scores.shape}, expected (..., patches, clusters)"
+        )
     rows, clusters = scores.shape[-2:]
     wanted = {"none": None, "token": scores.shape[:-1]}.get(kind, ())
     found = None if dustbin is None else dustbin.shape
@@ -727,15 +743,18 @@ def _check(
     step: Step | None,
     solver: Any,
 ) -> None:
-    if scores.ndim < 2 or log_mu.shape[-1:] != scores.shape[-2:-1]:
+    marginals = (("log_mu", log_mu, -2, "rows"), ("log_nu", log_nu, -1, "columns"))
+    for name, marginal, axis, side in marginals:
+        if scores.ndim < 2 or not _spreads(
+            marginal.shape, (*scores.shape[:-2], scores.shape[axis])
+        ):
+            raise InputError(
+                f"sinkhorn: found scores of shape {scores.shape} and {name} of {marginal.shape}, "
+                f"expected (..., rows, columns) and (..., {side})"
+            )
+    if jnp.ndim(epsilon):
         raise InputError(
-            f"sinkhorn: found scores of shape {scores.shape} and log_mu of {log_mu.shape}, "
-            "expected (..., rows, columns) and (..., rows)"
-        )
-    if log_nu.shape[-1:] != scores.shape[-1:]:
-        raise InputError(
-            f"sinkhorn: found scores of shape {scores.shape} and log_nu of {log_nu.shape}, "
-            "expected (..., rows, columns) and (..., columns)"
+            f"sinkhorn: epsilon found of shape {jnp.shape(epsilon)}, expected a single number"
         )
     if step is not None and (config.gradient == "implicit" or config.method != "sinkhorn"):
         raise InputError(
@@ -746,6 +765,11 @@ def _check(
     if solver is not None and config.gradient != "optimistix":
         raise InputError(
             f"sinkhorn: found a solver beside gradient {config.gradient!r}, expected 'optimistix'"
+        )
+    if step is not None and config.relaxation != 1:
+        raise InputError(
+            f"sinkhorn: found a step beside relaxation {config.relaxation}, expected 1: it is the "
+            "built-in step that relaxation belongs to"
         )
     known = {"scores": scores, "log_mu": log_mu, "log_nu": log_nu}
     known = {
@@ -763,9 +787,21 @@ def _check(
     if config.balanced and {"log_mu", "log_nu"} <= known.keys():
         totals = [np.exp(known[name]).sum(axis=-1) for name in ("log_mu", "log_nu")]
         # Sums of float32 logarithms.
-        if not np.allclose(*totals, rtol=1e-4):
-            found = " and ".join(f"{np.ravel(total)[0]:.6g}" for total in totals)
+        unlike = ~np.isclose(*totals, rtol=1e-4)
+        if unlike.any():
+            worst = [np.broadcast_to(total, unlike.shape)[unlike][0] for total in totals]
+            found = " and ".join(f"{total:.6g}" for total in worst)
             raise InputError(
                 f"sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to {found}, "
                 "expected the same"
             )
+
+
+def _spreads(shape: tuple[int, ...], target: tuple[int, ...]) -> bool:
+    """Whether an array of `shape` broadcasts to `target`, its last axis being there already."""
+    leading = zip(reversed(shape[:-1]), reversed(target[:-1]), strict=False)
+    return (
+        shape[-1:] == target[-1:]
+        and len(shape) <= len(target)
+        and all(size in (1, wanted) for size, wanted in leading)
+    )

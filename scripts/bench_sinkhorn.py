@@ -1,0 +1,468 @@
+"""Time and memory of the transport, forward and backward, beside torch and ott-jax, in one run.
+
+    python scripts/bench_sinkhorn.py [--out docs/sinkhorn] [--page docs/sinkhorn.md]
+
+Needs torch (the `dev` extra); contenders of ott-jax join in where it is installed. On a GPU if both
+jax and torch find one. Before anything is timed, plans and gradients are checked to be equal. Where
+ott-jax's gradient raises, its traceback is printed and the failure counted.
+
+Fairness. The contenders take turns, `--rounds` times: a pause of a quarter of a second, in which
+the threads of the one before stop spinning (OpenMP's do so after each call), two calls that do not
+count, then `--calls` that do. A ratio is that of two medians of the same round; of the ratios the
+median over rounds is shown, and the range. All use as many threads as they like.
+
+Memory is what a call needs at once beyond its inputs and the gradients that it returns. Of jax that
+is what the compiled program sets aside (`temp_size_in_bytes`), of torch the peak of the allocations
+less the releases that its profiler saw (on a GPU: of its allocator's counter).
+"""
+
+import argparse
+import functools
+import itertools
+import math
+import os
+import pathlib
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+# On a GPU jax would take most of the memory at once, and leave torch too little.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+from fragments import COLOURS, Study, Table, markdown, panels, save, splice
+
+from crisalad_jax.config import SinkhornConfig
+from crisalad_jax.sinkhorn import append_dustbin, assign, log_marginals
+
+try:
+    from ott.geometry.geometry import Geometry
+    from ott.problems.linear.linear_problem import LinearProblem
+    from ott.solvers.linear.sinkhorn import Sinkhorn as OttSinkhorn
+except ImportError:
+    OttSinkhorn = None
+
+PAUSE = 0.25
+DUSTBIN = 1.0
+TOLERANCES = tuple(10 ** (-i / 2) for i in range(2, 15))
+"""Asked for from the loosest on, until the error that is measured is small enough."""
+MOST_ITERATIONS = 2000
+
+
+class Inputs(NamedTuple):
+    scores: np.ndarray
+    """(images, patches, clusters), as are the weights."""
+    weights: np.ndarray
+    """The loss is the sum of the weights times the clusters' part of the plan."""
+
+    @classmethod
+    def random(cls, images: int, patches: int, clusters: int, std: float, seed: int) -> "Inputs":
+        generator = np.random.default_rng(seed)
+        shape = (images, patches, clusters)
+        scores, weights = (generator.standard_normal(shape).astype(np.float32) for _ in range(2))
+        return cls(np.float32(std) * scores, weights)
+
+
+class Contender(NamedTuple):
+    name: str
+    call: Callable[[], Any]
+    """Forward and backward, waited for; returns the gradients."""
+    plan: Callable[[], np.ndarray]
+    """(images, patches, clusters + 1)."""
+    gradient: Callable[[], np.ndarray]
+    """With respect to the scores, in their layout."""
+    memory: Callable[[], int]
+    """In bytes."""
+
+
+class Timed(NamedTuple):
+    rounds: list[float]
+    """The median of each round, in ms."""
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.rounds)
+
+
+LogPlan = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+class Entry(NamedTuple):
+    """Of a program that is compiled once, for inputs of one shape."""
+
+    name: str
+    on: Callable[[Inputs], Contender]
+
+
+def by_jax(name: str, log_plan: LogPlan) -> Entry:
+    """`log_plan` takes scores and the dustbin's score to (images, patches, clusters + 1)."""
+
+    def loss(scores: jax.Array, dustbin: jax.Array, weights: jax.Array) -> jax.Array:
+        return (weights * jnp.exp(log_plan(scores, dustbin)[..., :-1])).sum()
+
+    forward, both = jax.jit(log_plan), jax.jit(jax.grad(loss, argnums=(0, 1)))
+
+    def on(inputs: Inputs) -> Contender:
+        leaves = (jnp.asarray(inputs.scores), jnp.float32(DUSTBIN))
+        weights = jnp.asarray(inputs.weights)
+
+        def call() -> Any:
+            return jax.block_until_ready(both(*leaves, weights))
+
+        def plan() -> np.ndarray:
+            return np.exp(np.asarray(forward(*leaves)))
+
+        def memory() -> int:
+            analysis: Any = both.lower(*leaves, weights).compile().memory_analysis()
+            return analysis.temp_size_in_bytes
+
+        return Contender(name, call, plan, lambda: np.asarray(call()[0]), memory)
+
+    return Entry(name, on)
+
+
+def ours(name: str, config: SinkhornConfig) -> Entry:
+    return by_jax(name, lambda scores, z: assign(scores, z, config).log_plan)
+
+
+def by_ott(name: str, solver: Any) -> Entry:
+    def log_plan(scores: jax.Array, dustbin: jax.Array) -> jax.Array:
+        patches, clusters = scores.shape[1:]
+        mu, nu = (jnp.exp(x) / patches for x in log_marginals(patches, clusters))
+
+        def one(full: jax.Array) -> jax.Array:
+            found = solver(LinearProblem(Geometry(cost_matrix=-full, epsilon=1.0), a=mu, b=nu))
+            return full + found.f[:, None] + found.g + math.log(patches)
+
+        return jax.vmap(one)(append_dustbin(scores, dustbin))
+
+    return by_jax(name, log_plan)
+
+
+def published(scores: torch.Tensor, dustbin: torch.Tensor, iterations: int) -> torch.Tensor:
+    """SALAD's transport in its layout, (images, clusters + 1, patches): CVPR 2024, Eq. 4 to 6."""
+    images, clusters, patches = scores.shape
+    full = torch.cat([scores, dustbin.expand(images, 1, patches)], dim=1)
+    log_nu = scores.new_zeros(clusters + 1)
+    log_nu[-1] = math.log(patches - clusters)
+    row = scores.new_zeros(images, patches)
+    column = scores.new_zeros(images, clusters + 1)
+    for _ in range(iterations):
+        column = log_nu - torch.logsumexp(full + row[:, None, :], dim=2)
+        row = -torch.logsumexp(full + column[:, :, None], dim=1)
+    return full + column[:, :, None] + row[:, None, :]
+
+
+def by_torch(name: str, inputs: Inputs, iterations: int, compiled: bool) -> Contender:
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    scores, weights = (torch.from_numpy(x).mT.contiguous().to(device) for x in inputs)
+    dustbin = torch.tensor(DUSTBIN, device=device)
+    leaves = (scores.requires_grad_(), dustbin.requires_grad_())
+
+    def loss(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
+        return (weights * published(scores, dustbin, iterations)[:, :-1].exp()).sum()
+
+    if compiled:
+        loss = torch.compile(loss, dynamic=False)
+
+    def wait() -> None:
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    def call() -> tuple[torch.Tensor, ...]:
+        found = torch.autograd.grad(loss(*leaves), leaves)
+        wait()
+        return found
+
+    def plan() -> np.ndarray:
+        with torch.no_grad():
+            return published(scores, dustbin, iterations).exp().mT.cpu().numpy()
+
+    def memory() -> int:
+        returned = 4 * (scores.numel() + 1)
+        if device == "cuda":
+            before = torch.cuda.memory_allocated()
+            torch.cuda.reset_peak_memory_stats()
+            call()
+            return torch.cuda.max_memory_allocated() - before - returned
+        activities = [torch.profiler.ProfilerActivity.CPU]
+        with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
+            kept = call()
+        events: list[Any] = profile.profiler.kineto_results.events()  # pyright: ignore
+        events = [event for event in events if event.name() == "[memory]"]
+        sizes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
+        del kept
+        return max(itertools.accumulate(sizes)) - returned
+
+    return Contender(name, call, plan, lambda: call()[0].mT.cpu().numpy(), memory)
+
+
+def check(contenders: list[Contender]) -> None:
+    """Plans and gradients are equal, to what rounding of float32 leaves.
+
+    Raises:
+        RuntimeError: they are not.
+    """
+    for part in ("plan", "gradient"):
+        first, *others = ((one.name, getattr(one, part)().astype(np.float64)) for one in contenders)
+        for name, found in others:
+            off = np.abs(found - first[1]).max() / np.abs(first[1]).max()
+            # Hundreds of float32 terms, 3 to 20 iterations deep; another algorithm is off by 1e-2.
+            if not off < 1e-4:
+                raise RuntimeError(f"{name}: {part} differs from {first[0]}'s by {off:.1e}")
+
+
+def race(contenders: list[Contender], rounds: int, calls: int) -> dict[str, Timed]:
+    timed = {one.name: Timed([]) for one in contenders}
+    for _ in range(rounds):
+        for one in contenders:
+            time.sleep(PAUSE)
+            one.call()
+            one.call()
+            times = []
+            for _ in range(calls):
+                started = time.perf_counter()
+                one.call()
+                times.append(1e3 * (time.perf_counter() - started))
+            timed[one.name].rounds.append(statistics.median(times))
+    return timed
+
+
+def ratio(slow: Timed, fast: Timed) -> tuple[float, float, float]:
+    """How many times faster: median over the rounds, least, most."""
+    found = [a / b for a, b in zip(slow.rounds, fast.rounds, strict=True)]
+    return statistics.median(found), min(found), max(found)
+
+
+def times(value: tuple[float, float, float]) -> str:
+    return f"{value[0]:.2f} ({value[1]:.2f} to {value[2]:.2f})"
+
+
+def milliseconds(timed: Timed) -> str:
+    return f"{timed.median:.1f} ({min(timed.rounds):.1f} to {max(timed.rounds):.1f})"
+
+
+def megabytes(size: float) -> str:
+    return f"{size / 1e6:.1f}"
+
+
+def fixed(arguments: argparse.Namespace) -> Study:
+    """A fixed number of iterations."""
+    values, rows = [], []
+    for iterations, patches in itertools.product(arguments.iterations, arguments.patches):
+        inputs = Inputs.random(arguments.images, patches, arguments.clusters, arguments.std, 0)
+        config = functools.partial(SinkhornConfig, iterations=iterations)
+        contenders = [
+            by_torch("torch eager", inputs, iterations, compiled=False),
+            by_torch("torch.compile", inputs, iterations, compiled=True),
+            ours("ours", config()).on(inputs),
+            ours("ours, log domain", config(domain="log")).on(inputs),
+        ]
+        if OttSinkhorn is not None:
+            solver = OttSinkhorn(
+                min_iterations=iterations,
+                max_iterations=iterations,
+                # With the default of 10, 3 iterations are none at all; with more than one block
+                # of them, the gradient is wrong.
+                inner_iterations=iterations,
+                implicit_diff=None,
+            )
+            contenders.append(by_ott("ott-jax, unrolled", solver).on(inputs))
+        check(contenders)
+        timed = race(contenders, arguments.rounds, arguments.calls)
+        memory = {one.name: one.memory() for one in contenders}
+        torches = ("torch eager", "torch.compile")
+        best = min(torches, key=lambda name: timed[name].median)
+        least = min(memory[name] for name in torches)
+        for one in contenders:
+            faster = ratio(timed[best], timed[one.name])
+            values.append(
+                {
+                    "patches": patches,
+                    "iterations": iterations,
+                    "contender": one.name,
+                    "ms": timed[one.name].rounds,
+                    "faster than the better torch": faster,
+                    "memory": memory[one.name],
+                    "memory over the lesser torch's": memory[one.name] / least,
+                }
+            )
+            cells = (milliseconds(timed[one.name]), times(faster), megabytes(memory[one.name]))
+            share = f"{memory[one.name] / least:.2f}"
+            rows.append((f"{iterations}", f"{patches}", one.name, *cells, share))
+    figure = draw(values, lambda v: f"k = {v['iterations']}, N = {v['patches']}")
+    header = ("k", "N", "contender", "ms", "times faster", "MB", "share of MB")
+    caption = (
+        f"A fixed number of iterations k, forward and backward, {describe(arguments)}: time, how "
+        "many times faster than the better of torch eager and torch.compile, memory, and its share "
+        "of the lesser of those two's."
+    )
+    return Study(Table(header, rows, caption, 3), values, figure)
+
+
+def describe(arguments: argparse.Namespace) -> str:
+    device = jax.devices()[0].device_kind
+    return (
+        f"B = {arguments.images}, m = {arguments.clusters}, iid scores of standard deviation "
+        f"{arguments.std:g}, float32, {device}, {os.cpu_count()} cores, jax {jax.__version__}, "
+        f"torch {torch.__version__}; medians and ranges of {arguments.rounds} rounds of "
+        f"{arguments.calls} calls"
+    )
+
+
+def marginal_error(plan: np.ndarray) -> float:
+    """Largest relative error of a row's or column's mass, measured in float64."""
+    plan = plan.astype(np.float64)
+    patches, clusters = plan.shape[1], plan.shape[2] - 1
+    masses = np.append(np.ones(clusters), patches - clusters)
+    columns = np.abs(plan.sum(axis=1) / masses - 1).max()
+    return float(max(columns, np.abs(plan.sum(axis=2) - 1).max()))
+
+
+def works(contender: Contender) -> bool:
+    """Whether nothing raises and all numbers of the gradient are finite."""
+    try:
+        return bool(np.isfinite(contender.gradient()).all())
+    except RuntimeError:  # jax's own and equinox's
+        return False
+
+
+def converging() -> dict[str, Callable[[float], Entry]]:
+    """By name, the program for a tolerance."""
+
+    def own(name: str, fields: dict[str, Any], tolerance: float) -> Entry:
+        config = SinkhornConfig(
+            tolerance=tolerance, iterations=MOST_ITERATIONS, gradient="implicit", **fields
+        )
+        return ours(name, config)
+
+    def other(name: str, inner: int, tolerance: float) -> Entry:
+        solver = OttSinkhorn(  # pyright: ignore[reportOptionalCall]
+            threshold=tolerance, inner_iterations=inner, max_iterations=MOST_ITERATIONS
+        )
+        return by_ott(name, solver)
+
+    variants: dict[str, dict[str, Any]] = {
+        "ours": {},
+        "ours, Anderson 10": {"anderson": 10},
+        "ours, Newton": {"method": "newton"},
+    }
+    found = {name: functools.partial(own, name, fields) for name, fields in variants.items()}
+    if OttSinkhorn is not None:
+        for inner in (1, 10):
+            name = f"ott-jax, checked every {inner}"
+            found[name] = functools.partial(other, name, inner)
+    return found
+
+
+def loosest(
+    program: Callable[[float], Entry], inputs: Inputs, target: float
+) -> tuple[float, float] | None:
+    """The loosest tolerance whose measured error is at most `target`, and that error."""
+    for tolerance in TOLERANCES:
+        error = marginal_error(program(tolerance).on(inputs).plan())
+        if error <= target:
+            return tolerance, error
+    return None
+
+
+def converged(arguments: argparse.Namespace) -> Study:
+    """To a measured marginal error, with the implicit gradient."""
+    values, rows = [], []
+    for target, patches in itertools.product(arguments.errors, arguments.patches):
+        batches = [
+            Inputs.random(arguments.images, patches, arguments.clusters, arguments.std, seed)
+            for seed in range(arguments.batches)
+        ]
+        entered: list[Contender] = []
+        lines: dict[str, dict[str, Any]] = {}
+        for name, program in converging().items():
+            line = lines[name] = {"patches": patches, "target": target, "contender": name}
+            settled = loosest(program, batches[0], target)
+            if settled is None:
+                continue
+            line["tolerance"], line["error"] = settled
+            entry = program(settled[0])
+            working = [one for one in map(entry.on, batches) if works(one)]
+            line["failures"] = len(batches) - len(working)
+            entered += working[:1]
+        timed = race(entered, arguments.rounds, arguments.calls)
+        theirs = [name for name in timed if name.startswith("ott")]
+        best = min(theirs, key=lambda name: timed[name].median, default=None)
+        for one in entered:
+            lines[one.name] |= {"ms": timed[one.name].rounds, "memory": one.memory()}
+            if best is not None:
+                lines[one.name]["faster than ott-jax"] = ratio(timed[best], timed[one.name])
+        for name, line in lines.items():
+            cells = ["not met"] * 5
+            if "error" in line:
+                failed = f"{line['failures']} of {len(batches)}"
+                cells = [f"{line['error']:.1e}", "raises", "", "", failed]
+            if name in timed:
+                cells[1:4] = milliseconds(timed[name]), "", megabytes(line["memory"])
+                if best is not None:
+                    cells[2] = times(line["faster than ott-jax"])
+            rows.append((f"{target:g}", f"{patches}", name, *cells))
+            values.append(line)
+    figure = draw(
+        [line for line in values if "ms" in line],
+        lambda line: f"to {line['target']:g}, N = {line['patches']}",
+    )
+    header = ("error", "N", "contender", "measured", "ms", "times faster", "MB", "failures")
+    caption = (
+        "To a measured largest relative marginal error, implicit gradient, forward and backward, "
+        f"{describe(arguments)}. Each is asked for the loosest tolerance, of half decades, that "
+        'reaches the error. "Times faster": than the faster ott-jax. "Failures": of '
+        f"{arguments.batches} batches, how many raise or are not finite."
+    )
+    return Study(Table(header, rows, caption, 3), values, figure)
+
+
+def draw(values: list[dict[str, Any]], title: Callable[[dict[str, Any]], str]) -> Any:
+    titles = tuple(dict.fromkeys(title(value) for value in values))
+    names = list(dict.fromkeys(value["contender"] for value in values))
+    figure, axes = panels(len(titles), titles, width=3.2, height=3.2, sharey=False)
+    for one, name in zip(axes, titles, strict=True):
+        chosen = [value for value in values if title(value) == name]
+        medians = [statistics.median(value["ms"]) for value in chosen]
+        colours = [COLOURS[names.index(value["contender"])] for value in chosen]
+        places = range(len(chosen))
+        one.barh(places, medians, color=colours)
+        for place, median in zip(places, medians, strict=True):
+            one.annotate(f" {median:.1f}", (median, place), va="center", fontsize=8)
+        one.set_yticks(places, [value["contender"] for value in chosen], fontsize=8)
+        one.invert_yaxis()
+        one.set_xlim(0, 1.2 * max(medians))
+        one.grid(visible=False)
+        one.set_xlabel("ms, forward and backward")
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Time the transport; see the top.")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/sinkhorn"))
+    parser.add_argument("--page", type=pathlib.Path, help="also put the tables into this page")
+    parser.add_argument("--images", type=int, default=32)
+    parser.add_argument("--clusters", type=int, default=64)
+    parser.add_argument("--patches", type=int, nargs="+", default=[256, 529])
+    parser.add_argument("--iterations", type=int, nargs="+", default=[3, 20])
+    parser.add_argument("--errors", type=float, nargs="+", default=[1e-3, 1e-5])
+    parser.add_argument("--std", type=float, default=3.0)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--calls", type=int, default=10)
+    parser.add_argument("--batches", type=int, default=8, help="to count failures in")
+    arguments = parser.parse_args()
+    for name, study_of in (("bench_fixed", fixed), ("bench_converged", converged)):
+        study = study_of(arguments)
+        save(name, study, arguments.out)
+        if arguments.page is not None:
+            splice(arguments.page, name, study.table)
+        print(markdown(study.table), flush=True)
+
+
+if __name__ == "__main__":
+    main()

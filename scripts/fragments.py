@@ -1,0 +1,83 @@
+"""What a study leaves: a table in Markdown, its numbers, a picture; and the page that shows it."""
+
+import pathlib
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import atomic_path, write_json
+
+INK, GREY, PALE = "#222222", "#757575", "#e4e4e4"
+# Okabe and Ito's: told apart by the colour-blind.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222")
+
+
+class Table(NamedTuple):
+    """One table: the first `labels` columns are words, the others numbers."""
+
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    caption: str
+    labels: int = 1
+
+
+class Study(NamedTuple):
+    table: Table
+    values: Any
+    """The same unrounded, for JSON."""
+    figure: Figure
+
+
+def number(value: float) -> str:
+    """Two significant digits."""
+    value = float(value)
+    return f"{value:.1e}" if value and not 1e-3 <= abs(value) < 1e4 else f"{value:.2g}"
+
+
+def markdown(table: Table) -> str:
+    rule = ["---"] * table.labels + ["---:"] * (len(table.header) - table.labels)
+    lines = [f"| {' | '.join(cells)} |" for cells in (table.header, rule, *table.rows)]
+    return table.caption + "\n\n" + "\n".join(lines) + "\n"
+
+
+def save(name: str, study: Study, out: pathlib.Path) -> None:
+    """Write NAME.md, NAME.json and NAME.png."""
+    with atomic_path(out / f"{name}.md") as temporary:
+        temporary.write_text(markdown(study.table), encoding="utf-8")
+    write_json(out / f"{name}.json", study.values)
+    with atomic_path(out / f"{name}.png") as temporary:
+        study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
+
+
+def splice(page: pathlib.Path, name: str, table: Table) -> None:
+    """Put the table in the page, between its two comments that name the study.
+
+    Raises:
+        InputError: the page has no such comments.
+    """
+    text = page.read_text(encoding="utf-8")
+    start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+    before, found, rest = text.partition(start)
+    _, closed, after = rest.partition(end)
+    if not found or not closed:
+        raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
+    with atomic_path(page) as temporary:
+        temporary.write_text(before + start + markdown(table) + end + after, encoding="utf-8")
+
+
+def panels(
+    count: int, titles: tuple[str, ...], *, width: float = 4.0, height: float = 3.4, sharey=True
+) -> tuple[Figure, list[Axes]]:
+    """A row of panels in the project's plain style."""
+    figure = Figure(figsize=(width * count, height), layout="constrained")
+    axes = list(figure.subplots(1, count, squeeze=False, sharey=sharey)[0])
+    for one, title in zip(axes, titles, strict=True):
+        one.set_title(title, fontsize=10, color=INK, loc="left")
+        one.spines[["top", "right"]].set_visible(False)
+        one.spines[["left", "bottom"]].set_color(GREY)
+        one.tick_params(colors=GREY, labelcolor=INK, labelsize=9)
+        one.grid(axis="y", color=PALE, linewidth=0.8)
+        one.set_axisbelow(True)
+    return figure, axes

@@ -1,0 +1,346 @@
+"""The transport's studies against numpy at small size, and its page, run as written.
+
+`plan_of` is the published algorithm by its scaling form in float64: exponentials of scores up to
+about 40 in size are far from overflow there.
+"""
+
+import argparse
+import contextlib
+import importlib
+import io
+import itertools
+import pathlib
+import re
+import sys
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+import pytest
+
+from crisalad_jax.config import SinkhornConfig
+from crisalad_jax.errors import InputError
+from crisalad_jax.sinkhorn import sinkhorn
+
+ROOT = pathlib.Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "sinkhorn.md"
+IMAGES, PATCHES, CLUSTERS = 3, 24, 5
+CASES = list(itertools.product(("iid", "lowrank"), (1.0, 3.0, 10.0)))
+
+
+@pytest.fixture(scope="module")
+def scripts() -> Any:
+    """Imports a script by its name."""
+    sys.path.insert(0, str(ROOT / "scripts"))
+    yield importlib.import_module
+    sys.path.remove(str(ROOT / "scripts"))
+
+
+@pytest.fixture(scope="module")
+def study(scripts: Any) -> ModuleType:
+    return scripts("sinkhorn_study")
+
+
+def size(study: ModuleType, **fields: int) -> Any:
+    small = {"images": IMAGES, "patches": PATCHES, "clusters": CLUSTERS, "limit": 400}
+    return study.Size(**small | fields)
+
+
+def plan_of(scores: np.ndarray, iterations: int, share: float | None = None) -> np.ndarray:
+    """(patches, clusters) to (patches, clusters + 1), the dustbin's mass as published or a share"""
+    patches, clusters = scores.shape
+    kernel = np.exp(np.append(scores, np.zeros((patches, 1)), axis=1))
+    share = (patches - clusters) / patches if share is None else share
+    nu = patches * np.append(np.full(clusters, (1 - share) / clusters), share)
+    u = np.ones(patches)
+    for _ in range(iterations):
+        v = nu / (kernel.T @ u)
+        u = 1 / (kernel @ v)
+    return u[:, None] * kernel * v
+
+
+def slopes(plan: Any, at: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Central differences of the weighted sum of the clusters' part of the plan."""
+    out = np.empty(at.size)
+    for i, one in enumerate(np.eye(at.size).reshape(-1, *at.shape)):
+        ends = [(weights * plan(at + sign * 1e-5 * one)[:, :-1]).sum() for sign in (1, -1)]
+        out[i] = (ends[0] - ends[1]) / 2e-5
+    return out
+
+
+def run(study: ModuleType, name: str, **fields: int) -> Any:
+    with jax.enable_x64(True):
+        return study.STUDIES[name](size(study, **fields))
+
+
+def scores_of(study: ModuleType, kind: str, std: float, **fields: int) -> np.ndarray:
+    return study.scores_of(kind, std, size(study, **fields))
+
+
+def test_scores_have_their_scale_and_rank(study: ModuleType) -> None:
+    for kind, std in CASES:
+        scores = scores_of(study, kind, std, images=8, patches=64, clusters=32)
+        np.testing.assert_allclose(scores.std(), std, rtol=0.02)  # 16,384 independent ones
+    # Four of the products, and one of the bias.
+    assert np.linalg.matrix_rank(scores[0]) == 5
+
+
+def test_errors_and_masses_are_those_of_the_scaling_form(study: ModuleType) -> None:
+    errors, masses = run(study, "error").values, run(study, "mass").values
+    for (kind, std), mass in zip(CASES, masses, strict=True):
+        plans = [plan_of(one, 3) for one in scores_of(study, kind, std)]
+        found = np.array([plan.sum(axis=0) for plan in plans])
+        relative = np.abs(found / np.array([1] * CLUSTERS + [PATCHES - CLUSTERS]) - 1).max(axis=1)
+        (error,) = (v for v in errors if (v["kind"], v["std"], v["k"]) == (kind, std, 3))
+        # Both are float64; errors are differences of numbers near 1.
+        np.testing.assert_allclose(
+            [error["median"], error["largest"]], [np.median(relative), relative.max()], atol=1e-12
+        )
+        clusters = found[:, :-1]
+        np.testing.assert_allclose(
+            [mass["smallest"], mass["largest"], mass["mean worst error"]],
+            [clusters.min(), clusters.max(), np.abs(clusters - 1).max(axis=1).mean()],
+            atol=1e-12,
+        )
+
+
+def test_gradients_are_those_of_central_differences(study: ModuleType) -> None:
+    values = run(study, "gradient", images=1).values
+    weights = np.random.default_rng(1).standard_normal((1, PATCHES, CLUSTERS))[0]
+    scores = scores_of(study, "lowrank", 3.0, images=1)[0]
+    # 400: the marginal error is then rounding, which is asserted.
+    assert np.abs(plan_of(scores, 400)[:, :-1].sum(axis=0) - 1).max() < 1e-12
+    three, exact = (slopes(lambda at, k=k: plan_of(at, k), scores, weights) for k in (3, 400))
+    (found,) = (v for v in values if (v["kind"], v["std"], v["k"]) == ("lowrank", 3.0, 3))
+    relative = np.linalg.norm(three - exact) / np.linalg.norm(exact)
+    cosine = three @ exact / np.linalg.norm(three) / np.linalg.norm(exact)
+    # What differences over 2e-5 leave.
+    np.testing.assert_allclose([found["relative"], found["cosine"]], [relative, cosine], atol=1e-7)
+
+
+def iterations_to(tolerance: float, scores: np.ndarray, limit: int) -> int:
+    """Of the plain iteration, until no centred potential changes more; one more than the limit."""
+    kernel = np.append(scores, np.zeros((PATCHES, 1)), axis=1)
+    log_nu = np.log(np.array([1.0] * CLUSTERS + [PATCHES - CLUSTERS]))
+    row, column = np.zeros(PATCHES), np.zeros(CLUSTERS + 1)
+    for count in range(1, limit + 1):
+        new_column = log_nu - np.logaddexp.reduce(kernel + row[:, None], axis=0)
+        new_row = -np.logaddexp.reduce(kernel + new_column, axis=1)
+        shift = (new_column - column).mean()
+        change = max(np.abs(new_row - row + shift).max(), np.abs(new_column - column - shift).max())
+        row, column = new_row, new_column
+        if change <= tolerance:
+            return count
+    return limit + 1
+
+
+def test_plain_iterations_are_counted_right_and_others_converge(study: ModuleType) -> None:
+    limit = 300
+    values = run(study, "acceleration", limit=limit).values
+    for (kind, std), tolerance in itertools.product(CASES, (1e-3, 1e-6)):
+        lines = {
+            v["solver"]: v
+            for v in values
+            if (v["kind"], v["std"], v["tolerance"]) == (kind, std, tolerance)
+        }
+        counts = np.array(
+            [iterations_to(tolerance, one, limit) for one in scores_of(study, kind, std)]
+        )
+        assert lines["plain"]["median"] == np.median(np.minimum(counts, limit))
+        assert lines["plain"]["largest"] == min(counts.max(), limit)
+        assert lines["plain"]["missed"] == (counts > limit).sum()
+        for name in ("relaxation 1.8, guarded", "Anderson 10", "Newton"):
+            # Sharper scores, of few patches, have plans that need more iterations.
+            assert std == 10 or lines[name]["missed"] == 0
+            # Centring takes away up to half of a change.
+            assert lines[name]["largest error of those that met it"] < 2 * tolerance
+
+
+def test_rounded_scores_are_as_far_off_as_numpy_says(study: ModuleType) -> None:
+    values = run(study, "precision").values
+    for kind, std in CASES:
+        found = {v["way"]: v["worst"] for v in values if (v["kind"], v["std"]) == (kind, std)}
+        scores = scores_of(study, kind, std)
+        for name, dtype in (("bfloat16", ml_dtypes.bfloat16), ("float16", np.float16)):
+            worst = max(
+                np.abs(plan_of(one.astype(dtype).astype(np.float64), 3) - plan_of(one, 3)).max()
+                for one in scores
+            )
+            # What float32 adds: about 1e-6 at scores of 30.
+            np.testing.assert_allclose(found[f"{name} scores, float32 inside"], worst, atol=1e-5)
+            # Once more at least than the scores' own rounding.
+            assert found[f"{name} inside"] > 1e-4 > found["float32, scaling domain"]
+
+
+def test_a_rounded_step_that_rounds_nothing_is_the_step(study: ModuleType) -> None:
+    scores = jnp.asarray(scores_of(study, "iid", 3.0), jnp.float32)
+    whole = study.rounded_step(study.Half("float32", 8, 23))
+    found = study.solve(scores, SinkhornConfig(domain="log"), whole).log_plan
+    expected = study.solve(scores, SinkhornConfig(domain="log")).log_plan
+    np.testing.assert_allclose(found, expected, atol=1e-5)  # float32 at numbers of order 20
+
+
+def test_only_the_published_dustbin_is_dead(study: ModuleType) -> None:
+    values = run(study, "dustbin", images=1).values
+    for v in values:
+        if v["dustbin"].startswith("column (published"):
+            assert max(v["slope"], v["move"]) < 1e-13
+        elif v["std"] == 1:
+            assert min(v["slope"], v["move"]) > 1e-4
+    weights = np.random.default_rng(1).standard_normal((1, PATCHES, CLUSTERS))[0]
+    scores = scores_of(study, "iid", 3.0, images=1)[0]
+
+    def with_mass(z: np.ndarray) -> np.ndarray:
+        return plan_of(scores, 3, share=1 / (1 + np.exp(-z[0])))
+
+    (mass,) = (v for v in values if (v["dustbin"], v["std"]) == ("mass", 3.0))
+    # What differences over 2e-5 leave.
+    np.testing.assert_allclose(
+        mass["slope"], abs(slopes(with_mass, np.zeros(1), weights)[0]), atol=1e-7
+    )
+    np.testing.assert_allclose(
+        mass["move"],
+        np.abs(with_mass(np.ones(1)) - with_mass(np.zeros(1)))[:, :-1].max(),
+        atol=1e-12,  # float64
+    )
+
+
+def test_the_page_shows_the_tables_as_written(scripts: Any, study: ModuleType) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    shown = re.findall(r"<!-- (\w+) -->\n(.*?)<!-- end of \1 -->", page, re.DOTALL)
+    assert {name for name, _ in shown} == {*study.STUDIES, "bench_fixed", "bench_converged"}
+    for name, table in shown:
+        assert table == (PAGE.parent / "sinkhorn" / f"{name}.md").read_text(encoding="utf-8")
+        assert f"(sinkhorn/{name}.png)" in page
+        assert (PAGE.parent / "sinkhorn" / f"{name}.png").exists()
+
+
+def test_a_table_goes_between_its_comments(scripts: Any, tmp_path: pathlib.Path) -> None:
+    fragments = scripts("fragments")
+    page = tmp_path / "page.md"
+    page.write_text("above\n<!-- x -->\nold\n<!-- end of x -->\nbelow\n")
+    table = fragments.Table(("what", "number"), [("a", "1"), ("b", "2")], "Caption.")
+    fragments.splice(page, "x", table)
+    expected = "Caption.\n\n| what | number |\n| --- | ---: |\n| a | 1 |\n| b | 2 |\n"
+    assert page.read_text() == f"above\n<!-- x -->\n{expected}<!-- end of x -->\nbelow\n"
+    with pytest.raises(InputError, match=r"page\.md: found no <!-- y -->"):
+        fragments.splice(page, "y", table)
+
+
+def test_numbers_have_two_digits(scripts: Any) -> None:
+    number = scripts("fragments").number
+    given = (0, 1, 0.123, 0.00123, 0.000123, 12345, 1e-16)
+    assert [number(x) for x in given] == [
+        "0",
+        "1",
+        "0.12",
+        "0.0012",
+        "1.2e-04",
+        "1.2e+04",
+        "1.0e-16",
+    ]
+
+
+def snippets() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_dead_dustbin_snippet_shows_what_the_page_says() -> None:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(snippets()[0], {})
+    found = dict(line.rsplit(": ", 1) for line in printed.getvalue().splitlines())
+    assert list(found) == ["column", "row and column", "mass"]
+    # Rounding of float64, of 16,384 terms.
+    assert float(found["column"]) < 1e-14
+    assert min(float(found["row and column"]), float(found["mass"])) > 1e-3
+
+
+def test_the_ten_line_variant_converges_to_the_same_plan_and_gradient() -> None:
+    names: dict[str, Any] = {}
+    with contextlib.redirect_stdout(io.StringIO()):
+        exec(snippets()[1], names)
+    source = re.search(r"def guarded_step.*?return Potentials.*?\n", snippets()[1], re.DOTALL)
+    assert source is not None
+    assert len([line for line in source[0].splitlines() if line]) <= 10
+    assert names["result"].converged.all()
+    problem = names["scores"], names["log_mu"], names["log_nu"]
+    exact = SinkhornConfig(tolerance=1e-5, iterations=2000, gradient="implicit")
+
+    def gradient(config: SinkhornConfig, step: Any) -> jax.Array:
+        weights = jax.random.normal(jax.random.key(1), names["scores"].shape)
+
+        def loss(scores: jax.Array) -> jax.Array:
+            result = sinkhorn(scores, *problem[1:], config=config, step=step)
+            return (weights * jnp.exp(result.log_plan)).sum()
+
+        return jax.grad(loss)(names["scores"])
+
+    plan, other = (
+        jnp.exp(result.log_plan) for result in (names["result"], sinkhorn(*problem, config=exact))
+    )
+    np.testing.assert_allclose(plan, other, atol=2e-3)  # the tolerance of 1e-3, on two sides
+    found = gradient(names["config"], names["guarded_step"])
+    reference = gradient(exact, None)
+    # The tolerance, times how much the gradient of a sharp plan moves with the plan.
+    assert jnp.linalg.norm(found - reference) < 5e-3 * jnp.linalg.norm(reference)
+
+
+@pytest.fixture(scope="module")
+def bench(scripts: Any) -> ModuleType:
+    return scripts("bench_sinkhorn")
+
+
+def test_the_published_algorithm_in_torch_is_that_of_numpy(bench: ModuleType) -> None:
+    inputs = bench.Inputs.random(2, PATCHES, CLUSTERS, 3.0, seed=0)
+    torch_one = bench.by_torch("torch", inputs, 3, compiled=False)
+    # The dustbin's score is no matter, and plan_of's is another one.
+    expected = [plan_of(one.astype(np.float64), 3) for one in inputs.scores]
+    np.testing.assert_allclose(torch_one.plan(), expected, atol=1e-6)  # float32
+    expected = slopes(
+        lambda at: plan_of(at, 3), inputs.scores[0].astype(np.float64), inputs.weights[0]
+    )
+    np.testing.assert_allclose(torch_one.gradient()[0].ravel(), expected, atol=1e-5)  # float32
+    # Of its log-sum-exps at least one array is kept for the gradient.
+    assert torch_one.memory() > inputs.scores.nbytes
+
+
+def test_unequal_contenders_are_not_timed(bench: ModuleType) -> None:
+    inputs = bench.Inputs.random(2, PATCHES, CLUSTERS, 3.0, seed=0)
+    reference = bench.by_torch("torch", inputs, 3, compiled=False)
+    same = bench.ours("same", SinkhornConfig()).on(inputs)
+    other = bench.ours("other", SinkhornConfig(iterations=4)).on(inputs)
+    bench.check([reference, same])
+    with pytest.raises(RuntimeError, match="other: plan differs from torch's"):
+        bench.check([reference, same, other])
+    blind = same._replace(name="blind", gradient=lambda: 0 * same.gradient())
+    with pytest.raises(RuntimeError, match="blind: gradient differs from torch's"):
+        bench.check([reference, blind])
+
+
+def test_the_benchmark_asks_for_the_loosest_tolerance_that_will_do(
+    bench: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = "ours"
+    monkeypatch.setattr(bench, "TOLERANCES", (1.0, 1e-3, 1e-4))
+    programs = {chosen: bench.converging()[chosen]}
+    monkeypatch.setattr(bench, "converging", lambda: programs)
+    arguments = argparse.Namespace(
+        images=2, clusters=CLUSTERS, patches=[PATCHES], std=3.0, errors=[1e-3, 1e-12],
+        rounds=2, calls=2, batches=2,
+    )  # fmt: skip
+    met, missed = bench.converged(arguments).values
+    assert met["failures"] == 0
+    assert met["error"] <= 1e-3
+    assert met["tolerance"] < 1
+    assert len(met["ms"]) == 2
+    assert "error" not in missed  # beyond float32
+    inputs = bench.Inputs.random(2, PATCHES, CLUSTERS, 3.0, seed=0)
+    errors = {
+        tolerance: bench.marginal_error(programs[chosen](tolerance).on(inputs).plan())
+        for tolerance in (1.0, met["tolerance"])
+    }
+    assert errors[1.0] > 1e-3
+    assert errors[met["tolerance"]] == met["error"]
