@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path
+from crisalad_jax.files import atomic_path, check_source
 from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import differences, from_plain, to_plain
@@ -84,8 +84,7 @@ def load_weights(
             its configuration is not `expected` (all fields that differ are listed).
     """
     path = pathlib.Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: found no such file, expected a .safetensors file of weights")
+    check_source(path, "a .safetensors file of weights")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
@@ -102,7 +101,7 @@ def load_weights(
         ) from error
     try:
         plain = json.loads(metadata[FORMAT])
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: found no configuration in its metadata: {error}") from error
     config = from_plain(ModelConfig, plain, source=f"{path} (metadata)")
     if expected is not None:
@@ -123,6 +122,15 @@ def _with_free_fields_of(other: ModelConfig, config: ModelConfig) -> ModelConfig
 
 
 def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:
+    # Said before a template is made of sizes that any text may claim; small ones are listed below.
+    largest = max(n for n in jax.tree.leaves(to_plain(config)) if type(n) is int)
+    if largest > max(2**20, sum(array.size for array in found.values())) or (
+        config.encoder.layers > max(64, len(found))
+    ):
+        raise InputError(
+            f"{path}: found {len(found)} arrays, far from the sizes that its configuration says, "
+            f"of up to {largest}"
+        )
     template = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
     wanted = named_leaves(template)
     problems = [f"{name} missing" for name in wanted.keys() - found.keys()]

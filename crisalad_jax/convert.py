@@ -19,11 +19,13 @@ import safetensors.numpy
 from crisalad_jax.checkpoint import is_ours, load_extras, load_weights, save_weights
 from crisalad_jax.config import ModelConfig, ViTConfig, choose
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_target
-from crisalad_jax.layouts import LAYOUTS, State, infer, table, to_params, to_state
+from crisalad_jax.files import atomic_path, check_source, check_target
+from crisalad_jax.layouts import LAYOUTS, State, check_holds, infer, to_params, to_state
 from crisalad_jax.model import Crisalad
 from crisalad_jax.nn.vit import Block, ViT
 from crisalad_jax.serial import differences, from_plain, to_plain
+
+TORCH_SUFFIXES = (".pth", ".pt", ".ckpt")
 
 
 class Checkpoint(NamedTuple):
@@ -47,15 +49,17 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
             torch is needed and not installed.
     """
     path = pathlib.Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: found no such file, expected a checkpoint")
+    check_source(path, "a checkpoint")
     if is_ours(path):
         params, config = load_weights(path)
         return Checkpoint(params, config, load_extras(path), None)
-    with path.open("rb") as file:
-        start = file.read(9)
+    try:
+        with path.open("rb") as file:
+            start = file.read(9)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     # Torch writes zip archives, and wrote plain pickles before; safetensors a length and a brace.
-    if start[8:] == b"{" and not start.startswith(b"PK"):
+    if start[8:] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
         content: Any = _read_safetensors(path)
     else:
         content = _read_torch(path)
@@ -77,6 +81,8 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
 def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
     try:
         return safetensors.numpy.load_file(path)
+    except AttributeError as error:  # how it says that numpy has no such type
+        raise InputError(f"{path}: found a type that numpy does not know: {error}") from error
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path}: not a whole safetensors file: {error}") from error
 
@@ -90,14 +96,14 @@ def _read_torch(path: pathlib.Path) -> Any:
     except pickle.UnpicklingError as error:
         # Torch's message is a page of advice on how to run the code all the same.
         found = re.search(r"GLOBAL ([\w.]+)", str(error)) or re.search(
-            r"Unsupported \w+ ([\w.]+)", str(error)
+            r"Unsupported \w+ ([a-zA-Z_][\w.]*)", str(error)
         )
         what = f"asks for {found[1]}" if found else "is no plain pickle of tensors"
         raise InputError(
             f"{path}: refused: it {what}, expected nothing but tensors (loading anything else "
             "could run code)"
         ) from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, TypeError) as error:
+    except Exception as error:  # damaged pickles make it raise almost anything
         reason = str(error).split("\n")[0][:200] or type(error).__name__
         raise InputError(f"{path}: not a whole torch checkpoint: {reason}") from error
 
@@ -177,12 +183,12 @@ def _float32(name: str, array: np.ndarray, path: pathlib.Path) -> np.ndarray:
 
 
 def layout_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
-    """The public layout that a model came from, by its parts; a .safetensors is Hugging Face's."""
+    """The public layout that holds all of a model, or ours; a .safetensors is Hugging Face's."""
     if pathlib.Path(target).suffix == ".safetensors":
         return "huggingface"
     for layout in ("dinov2", "dino-salad", "cricavpr"):
         try:
-            table(config, layout)
+            check_holds(config, layout)
         except InputError:
             continue
         return layout
@@ -204,6 +210,7 @@ def write_checkpoint(
     """
     path = pathlib.Path(path)
     names = choose("layout", layout, LAYOUTS)
+    check_holds(config, layout, extras)
     state = to_state(params, config, layout, extras)
     if layout == "huggingface":
         with atomic_path(path) as temporary:
@@ -249,18 +256,26 @@ def convert(
         choose("layout", layout, LAYOUTS)
     check_target(target)
     found = read_checkpoint(source)
+    if pathlib.Path(target).exists() and os.path.samefile(source, target):
+        raise InputError(f"{target}: found the source itself, expected another file")
     suffix = pathlib.Path(target).suffix
     if found.layout is None:
         layout = layout or layout_for(found.config, target)
-        if (layout == "huggingface") != (suffix == ".safetensors"):
-            wanted = ".safetensors" if layout == "huggingface" else ".pth, .pt or .ckpt"
-            raise InputError(f"{target}: found suffix {suffix!r}, expected {wanted} for {layout}")
+        wanted = (".safetensors",) if layout == "huggingface" else TORCH_SUFFIXES
+        if suffix not in wanted:
+            raise InputError(
+                f"{target}: found suffix {suffix!r}, expected {' or '.join(wanted)} for {layout}"
+            )
+        try:
+            check_holds(found.config, layout, found.extras)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from error
         write_checkpoint(target, found.params, found.config, layout, found.extras)
         return Conversion(None, layout, found.config)
     if layout is not None:
         raise InputError(
-            f"--layout {layout}: found a public checkpoint ({found.layout}) as source, expected a "
-            "file of this package; convert it to one first"
+            f"{source}: found a public checkpoint ({found.layout}) beside --layout {layout}, "
+            "expected a file of this package; convert it to one first"
         )
     if suffix != ".safetensors":
         raise InputError(f"{target}: found suffix {suffix!r}, expected .safetensors")

@@ -11,18 +11,40 @@ from typing import Any
 from crisalad_jax.errors import InputError
 
 
+def check_source(path: str | os.PathLike[str], expected: str) -> None:
+    """Check that there is a file at `path`; `expected` says of what kind.
+
+    Raises:
+        InputError: there is none, or a folder, or no file can have such a name.
+    """
+    path = pathlib.Path(path)
+    try:
+        found = "a folder" if path.is_dir() else None if path.is_file() else "no such file"
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+    if found is not None:
+        raise InputError(f"{path}: found {found}, expected {expected}")
+
+
 def check_target(path: str | os.PathLike[str]) -> None:
     """Check that a file can be made at `path`, before the work whose result it is to hold.
 
     Nothing is made yet: work that fails leaves no empty folders.
 
     Raises:
-        InputError: `path` is a folder itself, or its folder cannot be made or written to.
+        InputError: `path` is a folder itself, no file can have such a name, or its folder cannot be
+            made or written to.
     """
     path = pathlib.Path(path)
-    if path.is_dir():
+    try:
+        is_folder = path.is_dir()
+        nearest = next(folder for folder in path.parents if folder.exists())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be made: {error}") from error
+    if "\0" in str(path):  # which pathlib takes for the name of a file that is not there
+        raise InputError(f"{path}: cannot be made: found a NUL in the name")
+    if is_folder:
         raise InputError(f"{path}: found a folder, expected a file or nothing yet")
-    nearest = next(folder for folder in path.parents if folder.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
         raise InputError(
             f"{path}: cannot be made: found {nearest}, expected a folder that can be written to"
@@ -45,7 +67,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path.parent}: cannot make this folder: {error.strerror}") from error
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
+    temporary = path.with_name(f".{uuid.uuid4().hex[:12]}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)

@@ -27,6 +27,7 @@ from crisalad_jax.config import (
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.pytree import named_leaves
+from crisalad_jax.serial import differences
 
 State = Mapping[str, np.ndarray]
 HEAD_WIDTH = 64
@@ -255,6 +256,65 @@ def table(config: ModelConfig, layout: str) -> list[Entry | Extra]:
     ]
 
 
+def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -> None:
+    """Check that a model can be written in `layout` and read back as the same model.
+
+    Raises:
+        InputError: what `table` raises; a setting that no shape tells and that differs from the
+            published one, which reading would take for it; or extras that the layout has no place
+            for.
+    """
+    lines = [line for line in table(config, layout) if isinstance(line, Extra)]
+    if layout != "reference":
+        shapes = public_shapes(config, layout)
+        blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
+        read_back = dataclasses.replace(_infer(blank)[1], image_size=config.image_size)
+        wrong = differences(_told(read_back), _told(config))
+        if wrong:
+            raise InputError(
+                f"layout {layout}: cannot tell these apart from the published ones: "
+                f"{'; '.join(wrong)} (layout reference can)"
+            )
+    for line in lines:
+        array = (extras or {}).get(line.name)
+        if array is None:
+            continue
+        if (array.shape, array.dtype) != (line.shape, np.dtype(line.dtype)):
+            raise InputError(
+                f"extra.{line.name}: found {array.dtype} {array.shape}, expected "
+                f"{np.dtype(line.dtype)} {line.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise InputError(f"extra.{line.name}: holds NaN or infinity")
+
+
+def _told(config: ModelConfig) -> ModelConfig:
+    """A configuration with the same value in all that says nothing about the finished model."""
+    backbone, adapter = config.backbone, config.backbone.adapter
+    if adapter.kind == "none":
+        adapter = AdapterConfig(kind="none")
+    elif adapter.kind != "depthwise":
+        adapter = dataclasses.replace(adapter, kernel_size=AdapterConfig.kernel_size)
+    if adapter.kind != "none":
+        adapter = dataclasses.replace(adapter, bottleneck=backbone.adapter_dim / backbone.dim)
+    backbone = dataclasses.replace(
+        backbone,
+        mlp_ratio=backbone.hidden / backbone.dim,
+        position_start=ViTConfig.position_start,
+        layer_scale_start=ViTConfig.layer_scale_start,
+        adapter=adapter,
+    )
+    salad = config.salad if config.aggregator == "salad" else SaladConfig()
+    encoder = config.encoder if config.encoder.layers else CrossImageConfig(layers=0)
+    return dataclasses.replace(
+        config,
+        backbone=backbone,
+        salad=dataclasses.replace(salad, dropout=0.0),
+        encoder=dataclasses.replace(encoder, dropout=0.0),
+        compute_dtype=ModelConfig.compute_dtype,
+    )
+
+
 def public_shapes(config: ModelConfig, layout: str) -> dict[str, tuple[int, ...]]:
     """Every name of a layout and its shape, in the public order.
 
@@ -320,7 +380,7 @@ def to_state(
     """Undo `to_params`, in the public order. Extras that are not given are 0, as at the start.
 
     Raises:
-        InputError: the layout cannot hold this model.
+        InputError: the layout has no place for a part of this model.
     """
     ours = _numbered(named_leaves(params))
     state: dict[str, np.ndarray] = {}

@@ -30,7 +30,7 @@ class Parity:
     full_size: bool = False
     """Also ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308: up to 4 GB."""
     only: str = ""
-    """Only layers whose name contains this, in upper or lower case."""
+    """Only what has this in its name, in upper or lower case."""
     seed: int = 0
     """Draws weights and inputs."""
     out: pathlib.Path = pathlib.Path("parity-report")
@@ -44,8 +44,8 @@ def _plan(arguments: Parity) -> Work:
     """What to do, by precision and name.
 
     Raises:
-        InputError: no such precision, a negative seed, nothing of this name, or a folder that
-            cannot be made.
+        InputError: no such precision, a negative seed, nothing of this name in any of the
+            precisions, or a folder that cannot be made.
     """
     if arguments.seed < 0:
         raise InputError(f"--seed: found {arguments.seed}, expected at least 0")
@@ -61,7 +61,10 @@ def _plan(arguments: Parity) -> Work:
             if arguments.only.lower() in name.lower():
                 work[precision, name] = check
     if not work:
-        raise InputError(f"--only: found {arguments.only!r}, which is in the name of no layer")
+        raise InputError(
+            f"--only: found {arguments.only!r}, which is in the name of nothing that is compared "
+            f"in {arguments.precision}"
+        )
     return work
 
 

@@ -76,7 +76,7 @@ def write_report(folder: pathlib.Path, rows: Sequence[Row], settings: Mapping[st
 
 def _plain(row: Row) -> dict[str, Any]:
     plain = dataclasses.asdict(row) | {"passed": row.passed}
-    for name in ("max_abs", "relative"):  # JSON knows no infinity
+    for name in ("max_abs", "relative", "tolerance"):  # JSON knows no infinity
         plain[name] = plain[name] if math.isfinite(plain[name]) else None
     return plain
 

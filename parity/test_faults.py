@@ -13,10 +13,13 @@ import pytest
 
 import crisalad_jax.nn.adapter
 import crisalad_jax.nn.cross_image
+import crisalad_jax.nn.pixels
 import crisalad_jax.nn.vit
 import parity.cases.case
 import parity.cases.parts
+import parity.cases.run
 from crisalad_jax.nn import vit
+from crisalad_jax.nn.layers import Linear, widen
 from parity.cases import checks
 from parity.compare import OWN_STEP, STEP
 
@@ -48,8 +51,8 @@ def fresh_programs() -> Iterator[None]:
     jax.clear_caches()
 
 
-def missed(name: str) -> set[str]:
-    return {row.quantity for row in checks("float32", 0)[name]() if not row.passed}
+def missed(name: str, precision: str = "float32") -> set[str]:
+    return {row.quantity for row in checks(precision, 0)[name]() if not row.passed}
 
 
 def swap(first: str, second: str) -> Callable[[Patch], None]:
@@ -101,6 +104,18 @@ def _constant_first_layer(feed_forward: Any) -> Any:
     def wrong(params: vit.Mlp, x: Any) -> Any:
         constant = jax.lax.stop_gradient(params.fc1)
         return feed_forward(dataclasses.replace(params, fc1=constant), x)
+
+    return wrong
+
+
+def _constant_input(feed_forward: Any) -> Any:
+    return lambda params, x: feed_forward(params, jax.lax.stop_gradient(x))
+
+
+def _all_positives(mine: Any) -> Any:
+    def wrong(similarities: Any, labels: Any, *, epsilon: float) -> Any:
+        same = (labels[:, None] == labels) & ~jnp.eye(len(labels), dtype=bool)
+        return mine(similarities, labels, epsilon=epsilon)._replace(positives=same)
 
     return wrong
 
@@ -183,15 +198,26 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
         {"choices"},
         replace(PARTS, "mine", lambda mine: lambda *x, epsilon: mine(*x, epsilon=2 * epsilon)),
     ),
+    "positives all mined": ("miner", {"choices"}, replace(PARTS, "mine", _all_positives)),
+    "mean of ImageNet": (
+        "pixels to numbers",
+        FORWARD,
+        replace(crisalad_jax.nn.pixels, "IMAGENET_MEAN", lambda _: (0.485, 0.456, 0.407)),
+    ),
     "a weight without gradient": (
         "MLP",
         {"gradients"},
         replace(PARTS, "feed_forward", _constant_first_layer),
     ),
+    "an input without gradient": (
+        "MLP",
+        {"gradients"},
+        replace(PARTS, "feed_forward", _constant_input),
+    ),
     "epsilon of Adam": (
-        "attention",
+        "MLP",
         {STEP, OWN_STEP},
-        replace(optax, "adamw", lambda adamw: functools.partial(adamw, eps=1e-7)),
+        replace(optax, "adamw", lambda adamw: functools.partial(adamw, eps=2e-8)),
     ),
     "no weight decay": (
         "attention",
@@ -208,6 +234,76 @@ def test_a_fault_misses(fault: str, monkeypatch: Patch) -> None:
     name, quantities, plant = FAULTS[fault]
     plant(monkeypatch)
     assert quantities <= missed(name)
+
+
+@jax.custom_vjp
+def _add_bias(y: Any, bias: Any) -> Any:
+    return (widen(y) + bias).astype(y.dtype)
+
+
+def _sum_in_8_bits(_: None, slope: Any) -> Any:
+    def add(total: Any, x: Any) -> Any:
+        return jax.lax.reduce_precision(total + x, exponent_bits=8, mantissa_bits=7), None
+
+    rows = widen(slope).reshape(-1, slope.shape[-1])
+    return slope, jax.lax.scan(add, jnp.zeros(slope.shape[-1]), rows)[0]
+
+
+_add_bias.defvjp(lambda *x: (_add_bias(*x), None), _sum_in_8_bits)
+
+
+def _bias_in_8_bits(_: Any) -> Any:
+    return lambda params, x: _add_bias(x @ params.weight.astype(x.dtype), params.bias)
+
+
+def _two_bits_short(linear: Any) -> Any:
+    def wrong(params: Linear, x: Any) -> Any:
+        return jax.lax.reduce_precision(linear(params, x), exponent_bits=8, mantissa_bits=5)
+
+    return wrong
+
+
+@pytest.mark.parametrize(
+    ("fault", "quantities"),
+    [
+        # What a processor with bfloat16 arithmetic makes of a bias that is added in bfloat16.
+        (_bias_in_8_bits, {"gradients, from float64"}),
+        (_two_bits_short, {"forward, from float64", "gradients, from float64"}),
+    ],
+)
+def test_a_fault_of_bfloat16_shows_beside_float64_alone(
+    fault: Callable[[Any], Any], quantities: set[str], monkeypatch: Patch
+) -> None:
+    assert not missed("MLP", "bfloat16")
+    replace(VIT, "linear", fault)(monkeypatch)
+    assert missed("MLP", "bfloat16") == quantities
+
+
+RUN = parity.cases.run
+
+
+def test_a_frozen_parameter_that_moves_misses(monkeypatch: Patch) -> None:
+    def fault(merge_params: Any) -> Any:
+        def wrong(trainable: Any, frozen: Any) -> Any:
+            positions = frozen.backbone.pos_embed * (1 + 2e-7)
+            backbone = dataclasses.replace(frozen.backbone, pos_embed=positions)
+            return merge_params(trainable, dataclasses.replace(frozen, backbone=backbone))
+
+        return wrong
+
+    replace(RUN, "merge_params", fault)(monkeypatch)
+    assert missed("training CriSALAD's adapters and head") == {"frozen"}
+
+
+def test_padding_that_counts_misses(monkeypatch: Patch) -> None:
+    def fault(train_step: Any) -> Any:
+        def wrong(state: Any, frozen: Any, images: Any, labels: Any, valid: Any, *rest: Any) -> Any:
+            return train_step(state, frozen, images, labels, jnp.ones_like(valid), *rest)
+
+        return wrong
+
+    replace(RUN, "train_step", fault)(monkeypatch)
+    assert {"losses", "parameters at the end"} <= missed("training CriSALAD's adapters and head")
 
 
 @pytest.mark.usefixtures("fresh_programs")

@@ -3,11 +3,16 @@
 Of bfloat16 and float64 a few are taken; all others, and the full size, are marked slow.
 """
 
-import pytest
+from typing import Any
 
+import numpy as np
+import pytest
+import torch
+
+import parity.cases.case
 from parity.cases import CASES, RUNS, checks
 from parity.cases.case import build, cancelling, random, split
-from parity.compare import Row
+from parity.compare import Arrays, Row, compare
 from parity.full_size import SIZES, full_size_checks
 
 SEED = 0
@@ -47,20 +52,43 @@ def assert_passed(rows: list[Row]) -> None:
     [
         pytest.param(precision, name, marks=() if name in quick else pytest.mark.slow)
         for precision, quick in QUICK.items()
-        for name in NAMES
+        for name in checks(precision, SEED)
     ],
 )
-def test_parity(precision: str, name: str) -> None:
-    rows = checks(precision, SEED)[name]()
-    assert_passed(rows)
-    whole = [case for case in CASES if case.name == name and case.forward == "descriptor"]
-    for case in whole:  # one or none: every parameter of it has a gradient, and was compared
-        names = dict(build(case.model, precision, random(name, SEED)).named_parameters())
-        del names["backbone.mask_token"]
-        parts = split({n: p.detach().float().numpy() for n, p in names.items()})
-        row = next(row for row in rows if row.quantity == "gradients")
-        # Rounding may leave exactly 0 of those that cancel. The 1 is the images.
-        assert len(parts) + 1 - len(cancelling(parts)) <= row.arrays <= len(parts) + 1
+def test_parity(precision: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    covered: dict[str, set[str]] = {}
+
+    def spy(case: str, quantity: str, precision: str, ours: Arrays, *rest: Any, **more: Any) -> Row:
+        covered[quantity] = set(ours)
+        return compare(case, quantity, precision, ours, *rest, **more)
+
+    monkeypatch.setattr(parity.cases.case, "compare", spy)
+    assert_passed(checks(precision, SEED)[name]())
+    for case in CASES:
+        if case.name == name and "gradients" in covered:
+            drawn = {n: draw(random(name, SEED)) for n, draw in case.inputs.items()}
+            reals = {n for n, x in drawn.items() if np.issubdtype(x.dtype, np.floating)}
+            assert reals <= covered["gradients"]
+            if case.forward == "descriptor":  # the whole model: all of it has a gradient
+                names = dict(build(case.model, precision, random(name, SEED)).named_parameters())
+                del names["backbone.mask_token"]
+                parts = split({n: p.detach().float().numpy() for n, p in names.items()})
+                # Of those that cancel rounding may leave exactly 0.
+                dead = cancelling(parts).keys()
+                assert covered["gradients"] - dead == (parts.keys() | reals) - dead
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_miner_takes_some_pairs_and_leaves_some(seed: int) -> None:
+    case = next(case for case in CASES if case.name == "miner")
+    rng = random(case.name, seed)
+    inputs = {name: torch.from_numpy(draw(rng)) for name, draw in case.inputs.items()}
+    model = build(case.model, "float32", random(case.name, seed))
+    found = case.part.theirs(model, inputs, model.config)
+    labels = inputs["labels"]
+    same = labels[:, None] == labels
+    assert 0 < found["positives"].sum() < same.sum() - len(labels)  # an image is none of its own
+    assert 0 < found["negatives"].sum() < (~same).sum()
 
 
 def test_the_quick_ones_exist() -> None:

@@ -1,5 +1,6 @@
 """Errors, verdicts, the files and the exit codes."""
 
+import dataclasses
 import json
 import math
 import pathlib
@@ -9,7 +10,9 @@ import pytest
 
 import parity.cases.parts
 from parity.__main__ import main
-from parity.compare import Row, Tolerance, compare, relative_error
+from parity.cases import CASES, RUNS, checks
+from parity.compare import Row, Tolerance, compare, compare_truth, relative_error
+from parity.full_size import cosine_row
 from parity.report import terminal_table, write_report
 
 LOOSE = Tolerance(0.5, "for a test")
@@ -55,6 +58,67 @@ def test_noise_is_measured_by_what_cancels() -> None:
     assert not row_of({**ours, "dead": [3.0]}, theirs, {"dead": "alive"}).passed
 
 
+@pytest.mark.parametrize(
+    ("ours", "theirs"), [(1.0, math.nan), (math.nan, 1.0), (1.0, math.inf), (math.inf, 1.0)]
+)
+def test_noise_that_is_no_number_is_a_miss(ours: float, theirs: float) -> None:
+    sides = {"dead": [ours], "alive": [4.0]}, {"dead": [theirs], "alive": [4.0]}
+    assert not row_of(*sides, {"dead": "alive"}).passed
+
+
+def test_a_tolerance_that_is_no_number_holds_nothing() -> None:
+    row = row_of({"a": [1.0]}, {"a": [1.0]})
+    assert row.passed
+    for tolerance in (math.inf, math.nan):
+        assert not dataclasses.replace(row, tolerance=tolerance).passed
+
+
+def truth_row_of(ours: float, theirs: float, truth: float) -> Row:
+    sides = ({"a": np.array([x, 2.0])} for x in (ours, theirs, truth))
+    return compare_truth("layer", "forward", "bfloat16", *sides)
+
+
+def test_the_truth_may_be_missed_by_half_as_much_again_as_torch_misses_it() -> None:
+    norm = math.sqrt(1 + 2**2)
+    row = truth_row_of(1.2, 1.1, 1.0)
+    assert row.relative == pytest.approx(0.2 / norm)
+    assert row.tolerance == pytest.approx(1.5 * 0.1 / norm)
+    assert row.max_abs == pytest.approx(0.2)
+    assert not row.passed
+    assert truth_row_of(1.14, 1.1, 1.0).passed
+    assert not truth_row_of(1.16, 1.1, 1.0).passed
+    assert truth_row_of(1.0, 1.0, 1.0).passed
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("ours", [1.0, 5.0, math.nan, math.inf])
+def test_a_truth_is_nothing_without_numbers(ours: float, bad: float) -> None:
+    assert not truth_row_of(ours, bad, 1.0).passed
+    assert not truth_row_of(ours, 1.1, bad).passed
+    assert not truth_row_of(bad, 1.1, 1.0).passed
+
+
+def test_a_rotated_descriptor_misses() -> None:
+    row = row_of({"a": [1.0]}, {"a": [1.0]})
+    theirs = np.array([[0.6, 0.8], [1.0, 0.0]])
+    loose, strict = (dataclasses.replace(row, tolerance=bound) for bound in (0.11, 0.05))
+    # cos(0.1) = 1 - 0.1^2 / 2 + 0.1^4 / 24; a square of 0.0121 lets it pass, one of 0.0025 not.
+    turned = np.array([[0.6, 0.8], [math.cos(0.1), math.sin(0.1)]])
+    found = cosine_row(strict, turned, theirs)
+    assert found.relative == pytest.approx(0.0049958, rel=1e-4)
+    assert found.tolerance == pytest.approx(0.0025)
+    assert not found.passed
+    assert cosine_row(loose, turned, theirs).passed
+    assert cosine_row(strict, 3 * theirs, theirs).passed  # direction alone counts
+    # In float64 a square of 1e-28 is below what a sum of 1 can tell, and the reason says so.
+    exact = dataclasses.replace(row, tolerance=1e-14)
+    found = cosine_row(exact, theirs, theirs)
+    assert (found.tolerance, found.passed) == (1e-15, True)
+    assert "squared:" not in found.why
+    assert not cosine_row(exact, turned, theirs).passed
+    assert not cosine_row(exact, np.full((2, 2), math.nan), theirs).passed
+
+
 def test_files(tmp_path: pathlib.Path) -> None:
     rows = [row_of({"a": [1.0]}, {"a": [1.0]}), row_of({"a": [math.nan]}, {"a": [1.0]})]
     write_report(tmp_path / "new", rows, {"seed": 7})
@@ -70,6 +134,10 @@ def test_files(tmp_path: pathlib.Path) -> None:
     assert "- **5.0e-01**: for a test." in text
     assert terminal_table(rows, "float32").row_count == 2
     assert terminal_table(rows, "float64").row_count == 0
+    unheld = dataclasses.replace(rows[0], tolerance=math.inf)
+    write_report(tmp_path, [unheld], {})
+    (found,) = json.loads((tmp_path / "parity.json").read_text())["rows"]
+    assert (found["tolerance"], found["passed"]) == (None, False)
 
 
 def test_the_command_passes_and_misses(
@@ -91,6 +159,7 @@ def test_the_command_passes_and_misses(
     [
         (["--precision", "float16"], "--precision: found 'float16'"),
         (["--only", "no such layer"], "--only: found 'no such layer'"),
+        (["--only", "pixels", "--precision", "bfloat16"], "nothing that is compared in bfloat16"),
         (["--seed", "-1"], "--seed: found -1"),
         (["--out", __file__], "test_report.py"),
         (["--seed", "one"], "seed"),
@@ -101,4 +170,23 @@ def test_bad_arguments(
     arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments) == 2
-    assert complaint in capsys.readouterr().err
+    shown = capsys.readouterr()
+    assert complaint in shown.err
+    assert not shown.out
+
+
+def test_only_what_has_something_to_say_is_offered() -> None:
+    bfloat16, others = checks("bfloat16", 0), [checks(x, 0) for x in ("float32", "float64")]
+    assert [list(found) for found in others] == [[what.name for what in (*CASES, *RUNS)]] * 2
+    assert bfloat16.keys() == others[0].keys() - {c.name for c in CASES if not c.bfloat16}
+    assert "pixels to numbers" not in bfloat16
+
+
+def test_a_precision_without_the_layer_is_left_out(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["--only", "pixels", "--precision", "bfloat16,float32", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert "1 rows, none missed" in capsys.readouterr().out
+    document = json.loads((tmp_path / "parity.json").read_text())
+    assert [row["precision"] for row in document["rows"]] == ["float32"]

@@ -133,6 +133,10 @@ def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words)
         ({"crisalad-jax 1": "{"}, "found no configuration in its metadata"),
         ({"crisalad-jax 1": "[]"}, "found list"),
         ({"crisalad-jax 1": '{"clusters": 3}'}, "clusters"),
+        ({"crisalad-jax 1": "[" * 10**5}, "found no configuration in its metadata"),
+        ({"crisalad-jax 1": '{"encoder": {"layers": 99999999999}}'}, "of up to 99999999999"),
+        ({"crisalad-jax 1": '{"encoder": {"layers": 900}}'}, "far from the sizes"),
+        ({"crisalad-jax 1": '{"backbone": {"dim": 9000000000000}}'}, "of up to 9000000000000"),
     ],
 )
 def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
@@ -154,8 +158,8 @@ def test_a_file_cut_short_is_refused(tmp_path, shared, length):
 
 
 def test_no_file_or_another_one_is_refused(tmp_path):
-    for path in (tmp_path, tmp_path / "none.safetensors"):
-        with pytest.raises(InputError, match=f"^{path}: found no such file"):
+    for path, what in ((tmp_path, "a folder"), (tmp_path / "none.safetensors", "no such file")):
+        with pytest.raises(InputError, match=f"^{path}: found {what}, expected a .safetensors"):
             load_weights(path)
     (tmp_path / "w.safetensors").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
     with pytest.raises(InputError, match=r"w\.safetensors: not a whole safetensors file"):

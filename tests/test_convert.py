@@ -120,11 +120,9 @@ def test_hugging_face_there_and_back(tmp_path: pathlib.Path, registers: int, ffn
     ours, back = tmp_path / "ours.safetensors", tmp_path / "back.safetensors"
     assert convert(source, ours).config == config
     convert(ours, back)
+    assert back.read_bytes() == source.read_bytes()
+    assert back.stat().st_mode & 0o777 == 0o644  # the library's own would be 0600
     found = safetensors.numpy.load_file(back)
-    assert found.keys() == state.keys()
-    for name, tensor in state.items():
-        assert found[name].tobytes() == tensor.numpy().tobytes()
-        assert found[name].shape == tuple(tensor.shape)
     # By way of the other layout for the same model.
     convert(ours, tmp_path / "dinov2.pth", "dinov2")
     again = read_checkpoint(tmp_path / "dinov2.pth")
@@ -142,6 +140,80 @@ def test_the_reference_carries_its_configuration(tmp_path: pathlib.Path) -> None
     wanted = named_leaves(params)
     for name, leaf in named_leaves(found.params).items():
         np.testing.assert_array_equal(leaf, wanted[name])
+
+
+@pytest.mark.parametrize(
+    ("layout", "changed", "words"),
+    [
+        ("dino-salad", {"salad.sinkhorn.iterations": 10}, "iterations: found 3, expected 10"),
+        ("dino-salad", {"normalisation": "local-contrast"}, "normalisation: found imagenet"),
+        ("dinov2", {"backbone.heads": 2}, "backbone.heads: found 1, expected 2"),
+        ("cricavpr", {"backbone.adapter.alpha": 0.5}, "alpha: found 0.2, expected 0.5"),
+        ("cricavpr", {"encoder.heads": 4}, "encoder.heads: found 16, expected 4"),
+    ],
+)
+def test_what_a_layout_cannot_tell_goes_to_the_reference(
+    tmp_path: pathlib.Path, layout: str, changed: dict, words: str
+) -> None:
+    """Else the way back would give another model, with other descriptors."""
+    public = read_checkpoint(written(tmp_path, layout))
+    config = public.config
+    for path, value in changed.items():
+        config = replaced(config, path.split("."), value)
+    ours, back = tmp_path / "ours.safetensors", tmp_path / "back.pth"
+    save_weights(ours, public.params, config, extras=public.extras)
+    with pytest.raises(InputError, match=f"^{ours}: layout {layout}: cannot tell .*{words}"):
+        convert(ours, back, layout)
+    assert not back.exists()
+    assert convert(ours, back).target == "reference"
+    assert read_checkpoint(back).config == config
+
+
+def replaced(config, path: list[str], value):
+    """A configuration with one field, deep inside, changed."""
+    head, *rest = path
+    inner = replaced(getattr(config, head), rest, value) if rest else value
+    return dataclasses.replace(config, **{head: inner})
+
+
+def test_what_no_description_depends_on_hinders_no_layout(tmp_path: pathlib.Path) -> None:
+    public = read_checkpoint(written(tmp_path, "dino-salad"))
+    config = replaced(public.config, ["salad", "dropout"], 0.1)
+    config = replaced(config, ["image_size"], (224, 224))
+    config = replaced(config, ["compute_dtype"], "bfloat16")
+    config = replaced(config, ["backbone", "layer_scale_start"], 1e-5)
+    ours = tmp_path / "ours.safetensors"
+    save_weights(ours, public.params, config)
+    assert convert(ours, tmp_path / "back.ckpt").target == "dino-salad"
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (np.zeros((3, 3), np.float32), r"found float32 \(3, 3\), expected float32 \(1, 64\)"),
+        (np.zeros((1, 64)), "found float64"),
+        (np.full((1, 64), np.nan, np.float32), "holds NaN"),
+    ],
+)
+def test_extras_that_do_not_fit_are_refused(tmp_path: pathlib.Path, extra, words: str) -> None:
+    public = read_checkpoint(written(tmp_path, "dinov2"))
+    name = next(iter(public.extras))
+    ours = tmp_path / "ours.safetensors"
+    save_weights(ours, public.params, public.config, extras={name: extra})
+    with pytest.raises(InputError, match=f"^{ours}: extra.{name}: {words}"):
+        convert(ours, tmp_path / "back.pth")
+    assert files(tmp_path) == {"public.pth", "ours.safetensors"}
+
+
+def test_the_source_is_never_written_over(tmp_path: pathlib.Path) -> None:
+    state = random_state(public_shapes(HUGGING_FACE, "huggingface"))
+    source = save(tmp_path / "model.safetensors", state)
+    before = source.read_bytes()
+    (tmp_path / "link.safetensors").symlink_to(source)
+    for target in (source, tmp_path / "link.safetensors"):
+        with pytest.raises(InputError, match=f"^{target}: found the source itself"):
+            convert(source, target)
+    assert source.read_bytes() == before
 
 
 @pytest.mark.parametrize("under", [None, "state_dict", "model_state_dict", "model"])
@@ -220,6 +292,12 @@ def test_adapters_come_along_where_they_are_the_same(tmp_path: pathlib.Path, kin
     np.testing.assert_array_equal(found[name], wanted[name] if same else named_leaves(start)[name])
 
 
+def test_a_backbone_of_other_heads_is_refused(tmp_path: pathlib.Path) -> None:
+    config, start = fresh("depthwise", heads=2)
+    with pytest.raises(InputError, match=r"another size: heads: found 1, expected 2$"):
+        read_backbone(written(tmp_path, "dinov2"), config.backbone, start)
+
+
 def test_a_backbone_of_another_size_is_refused(tmp_path: pathlib.Path) -> None:
     source = written(tmp_path, "registers")
     config, start = fresh("depthwise", depth=3)
@@ -251,6 +329,25 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         path.write_bytes(b"")
     elif kind == "cut":
         path.write_bytes(data[: len(data) // 2])
+    elif kind.startswith("old format cut at"):
+        torch.save(state, path, _use_new_zipfile_serialization=False)
+        path.write_bytes(path.read_bytes()[: int(kind.split()[-1])])
+    elif kind == "safetensors empty":
+        path.write_bytes(b"")
+    elif kind == "safetensors of text":
+        path.write_text("no checkpoint, but long enough to be one")
+    elif kind == "safetensors of eight bits":
+        hugging = random_state(public_shapes(HUGGING_FACE, "huggingface"))
+        name = "layernorm.bias"
+        save(path, hugging | {name: hugging[name].to(torch.float8_e4m3fn)})
+    elif kind == "a float count":
+        state = random_state(SMALL["cricavpr"])
+        count = next(name for name in state if name.endswith("num_batches_tracked"))
+        torch.save(nested(state | {count: torch.zeros(())}), path)
+    elif kind == "no width":
+        torch.save(state | {"cls_token": torch.zeros(1, 1, 0)}, path)
+    elif kind == "a folder":
+        path.mkdir()
     elif kind == "cut at the end":
         path.write_bytes(data[:-10])
     elif kind == "text":
@@ -305,6 +402,15 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         ("empty", "not a whole torch checkpoint"),
         ("cut", "not a whole torch checkpoint"),
         ("cut at the end", "not a whole torch checkpoint"),
+        ("old format cut at 322", "not a whole torch checkpoint"),
+        ("old format cut at 338", "not a whole torch checkpoint"),
+        ("old format cut at 2000", "not a whole torch checkpoint"),
+        ("safetensors empty", "not a whole safetensors file"),
+        ("safetensors of text", "not a whole safetensors file"),
+        ("safetensors of eight bits", "found a type that numpy does not know: .*float8"),
+        ("a float count", "num_batches_tracked found float32, expected int64"),
+        ("no width", "cls_token found of shape .1, 1, 0., expected more than 2 axes, none of th"),
+        ("a folder", "found a folder, expected a checkpoint"),
         ("text", "not a whole torch checkpoint|refused"),
         ("zip", "not a whole torch checkpoint"),
         ("runs code", "refused: it asks for [a-z]+.mkdir, expected nothing but tensors"),
@@ -346,7 +452,7 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     public, ours = written(tmp_path, "dino-salad"), tmp_path / "ours.safetensors"
     for target, layout, words in (
         ("x.pth", None, "x.pth: found suffix '.pth', expected .safetensors"),
-        ("x.safetensors", "dinov2", "found a public checkpoint .dino-salad. as source"),
+        ("x.safetensors", "dinov2", "found a public checkpoint .dino-salad. beside --layout"),
         ("x.safetensors", "timm", "layout: found 'timm'"),
         (".", None, "found a folder, expected a file"),
     ):
@@ -355,13 +461,20 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     convert(public, ours)
     for target, layout, words in (
         ("x.pth", "dinov2", "layout dinov2: found a model of aggregator salad"),
+        ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt for dino"),
+        ("x", None, "x: found suffix '', expected .pth"),
+        ("x\0.pth", None, "cannot be made"),
+        ("x" * 300 + ".pth", None, "cannot be made: .*too long"),
         ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors for hugging"),
         ("x.safetensors", None, "layout huggingface: found a model of aggregator salad"),
-        ("x.safetensors", "reference", "suffix '.safetensors', expected .pth, .pt or .ckpt"),
+        ("x.safetensors", "reference", "suffix '.safetensors', expected .pth or .pt or .ckpt"),
     ):
         with pytest.raises(InputError, match=words):
             convert(ours, tmp_path / target, layout)
     assert files(tmp_path) == {"public.ckpt", "ours.safetensors"}
+    long = tmp_path / f"{'x' * 245}.ckpt"  # the temporary name beside it must not be longer
+    convert(ours, long)
+    assert long.read_bytes() == public.read_bytes()
 
 
 def test_without_torch_its_files_ask_for_it(tmp_path: pathlib.Path, monkeypatch) -> None:

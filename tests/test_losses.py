@@ -149,23 +149,32 @@ def test_ties_with_the_margin_mine_nothing() -> None:
     assert wider.negatives.sum() == 2
 
 
-def test_the_quirk_needs_few_pairs_on_both_sides() -> None:
-    """One positive and two negatives: anchor 0's positive at 0.6, negatives at 0.55 and 0.58."""
-    similarities = np.array(
-        [
-            [1.0, 0.60, 0.55, 0.58],
-            [0.60, 1.0, 0.10, 0.10],
-            [0.55, 0.10, 1.0, 0.30],
-            [0.58, 0.10, 0.30, 1.0],
-        ]
-    )
+@pytest.mark.parametrize(
+    ("to_first", "others", "labels", "positives", "negatives"),
+    [
+        # Anchor 0's positive at 0.6, negatives at 0.55 and 0.58.
+        ((0.60, 0.55, 0.58), (0.10, 0.10, 0.30), [0, 0, 1, 2], 1, 2),
+        # Its positives at 0.6 and 0.58, a negative at 0.55.
+        ((0.60, 0.58, 0.55), (0.50, 0.10, 0.10), [0, 0, 0, 1], 2, 1),
+    ],
+)
+def test_the_quirk_needs_few_pairs_on_both_sides(
+    to_first: tuple[float, ...],
+    others: tuple[float, ...],
+    labels: list[int],
+    positives: int,
+    negatives: int,
+) -> None:
+    """Anchor 0 alone mines: one pair on one side and two on the other are not few."""
+    similarities = np.eye(4)
+    similarities[np.triu_indices(4, 1)] = (*to_first, *others)
+    similarities = np.maximum(similarities, similarities.T)
     x = np.linalg.cholesky(similarities).astype(np.float32)
-    labels = np.array([0, 0, 1, 2])
     pairs = mine(jnp.asarray(x @ x.T), jnp.asarray(labels), epsilon=0.1)
-    assert pairs.positives.sum() == 1
-    assert pairs.negatives.sum() == 2
+    assert pairs.positives.sum() == positives
+    assert pairs.negatives.sum() == negatives
     config = MultiSimilarityConfig(library_quirk=True)
-    loss, _, _ = theirs(x, labels, config)
+    loss, _, _ = theirs(x, np.array(labels), config)
     assert loss > 0
     value, _ = ours(jnp.asarray(x), jnp.asarray(labels), config)
     np.testing.assert_allclose(value, loss, rtol=1e-5)

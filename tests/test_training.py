@@ -246,6 +246,43 @@ def test_a_step_that_is_not_finite_keeps_the_state(params) -> None:
         np.testing.assert_array_equal(leaf, before[name])
 
 
+def test_a_finite_loss_with_an_infinite_gradient_keeps_the_state(params) -> None:
+    """Below a hidden unit of 1e25 weights of 1e-25 give tokens of order 1, with slopes of 1e25."""
+    network = params.aggregator.token_features
+    scaled = dataclasses.replace(
+        network,
+        fc1=dataclasses.replace(network.fc1, bias=network.fc1.bias.at[0].set(1e25)),
+        fc2=dataclasses.replace(network.fc2, weight=network.fc2.weight.at[0].multiply(1e-25)),
+    )
+    steep = dataclasses.replace(
+        params, aggregator=dataclasses.replace(params.aggregator, token_features=scaled)
+    )
+    state, frozen = init_state(fresh(steep), "adapters+head", STEP)
+    before = named_leaves(fresh(state.trainable))
+    state, metrics = train_step(state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    assert jnp.isfinite(metrics.loss)
+    assert not jnp.isfinite(metrics.gradient_norm)
+    assert state.step == 0
+    for name, leaf in named_leaves(state.trainable).items():
+        np.testing.assert_array_equal(leaf, before[name])
+
+
+def test_an_infinite_loss_with_a_finite_gradient_keeps_the_state(params) -> None:
+    """Over a tiny alpha the positives' logarithms overflow; alpha leaves their slopes."""
+    loss = MultiSimilarityConfig(alpha=1.2e-38)
+    config, labels = dataclasses.replace(STEP, loss=loss), jnp.array([0, 0, 0, 1, 1, 1])
+    state, frozen = init_state(fresh(params), "adapters+head", config)
+    before = named_leaves(fresh(state.trainable))
+    state, metrics = train_step(
+        state, frozen, pictures(6), labels, VALID, jax.random.key(0), config
+    )
+    assert jnp.isposinf(metrics.loss)
+    assert jnp.isfinite(metrics.gradient_norm)
+    assert state.step == 0
+    for name, leaf in named_leaves(state.trainable).items():
+        np.testing.assert_array_equal(leaf, before[name])
+
+
 def test_same_key_same_bits_and_dropout_changes_with_the_step() -> None:
     config = dataclasses.replace(STEP, model=CONFIG)
     start = init_crisalad(jax.random.key(0), CONFIG)
@@ -262,6 +299,15 @@ def test_same_key_same_bits_and_dropout_changes_with_the_step() -> None:
 
     assert losses(0) == losses(0)
     assert losses(0, 1) != losses(1, 1)
+
+    def loss_at(step: int) -> float:
+        state, frozen = init_state(fresh(start), "adapters+head", config)
+        state = state._replace(step=jnp.int32(step))
+        key = jax.random.key(0)
+        return float(train_step(state, frozen, pictures(6), LABELS, VALID, key, config)[1].loss)
+
+    # The same parameters, batch and key: only the step's number tells the two draws apart.
+    assert loss_at(1) != loss_at(0) == losses(0, 1)[0]
 
 
 def test_training_learns(params) -> None:

@@ -1,7 +1,7 @@
 """What is compared: one list of layers, whole models and training runs, all of them tiny."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -81,12 +81,17 @@ def pixels(*shape: int) -> Draw:
     return lambda rng: rng.integers(0, 256, shape, dtype=np.uint8)
 
 
-def similarities(count: int) -> Draw:
-    """Draws inner products of such vectors."""
+def similarities(looks: Sequence[int]) -> Draw:
+    """Draws inner products of images; those that have the same number in `looks` are alike.
+
+    An image that looks like another place's makes pairs that a miner takes, among those it leaves.
+    """
 
     def draw(rng: np.random.Generator) -> np.ndarray:
-        vectors = unit(count, 8)(rng)
-        return vectors @ vectors.T
+        vectors = np.eye(max(looks) + 1)[list(looks)]
+        vectors += rng.normal(scale=0.2, size=vectors.shape)
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        return (vectors @ vectors.T).astype(np.float32)
 
     return draw
 
@@ -192,7 +197,8 @@ CASES: tuple[Case, ...] = (
         "miner",
         PLAIN,
         parts.MINER,
-        {"similarities": similarities(10), "labels": LABELS},
+        # Of places 1 and 2 one image each strayed; of place 0 none.
+        {"similarities": similarities((0, 0, 0, 1, 1, 2, 2, 2, 3, 3)), "labels": LABELS},
         bfloat16=False,
         exact=True,
     ),
@@ -236,7 +242,10 @@ RUNS: tuple[Run, ...] = (
 
 
 def checks(precision: str, seed: int) -> dict[str, Callable[[], list[Row]]]:
-    """Everything to do in one precision, by name, in the table's order."""
+    """Everything to do in one precision, by name, in the table's order.
+
+    What is float32 at least in every model has nothing new to say in bfloat16, and is not there.
+    """
 
     def of_case(case: Case) -> Callable[[], list[Row]]:
         return lambda: check_case(case, precision, seed)
@@ -244,4 +253,5 @@ def checks(precision: str, seed: int) -> dict[str, Callable[[], list[Row]]]:
     def of_run(run: Run) -> Callable[[], list[Row]]:
         return lambda: check_run(run, precision, seed)
 
-    return {case.name: of_case(case) for case in CASES} | {run.name: of_run(run) for run in RUNS}
+    cases = [case for case in CASES if case.bfloat16 or precision != "bfloat16"]
+    return {case.name: of_case(case) for case in cases} | {run.name: of_run(run) for run in RUNS}

@@ -41,7 +41,10 @@ STEPS = 20
 ONE_STEP = OptimiserConfig(learning_rate=1e-2)
 """A step so long that the rounding of the parameter it is added to is small beside it."""
 SLOPE = 1e-4
-"""Size of the gradients that flow into a case: small, so that AdamW's epsilon of 1e-8 counts."""
+"""Size of the gradients that flow into a case: small, so that AdamW's epsilon of 1e-8 counts.
+
+Doubling the epsilon changes the MLP's step by 1.6 %, and by 1e-5, unseen, were this 1.
+"""
 
 Draw = Callable[[np.random.Generator], np.ndarray]
 
@@ -75,9 +78,7 @@ class Pass(NamedTuple):
 
 
 def check_case(case: Case, precision: str, seed: int) -> list[Row]:
-    """All rows of a case; none where the precision says nothing new."""
-    if precision == "bfloat16" and not case.bfloat16:
-        return []
+    """All rows of a case."""
     tolerances = TOLERANCES[precision]
     rng = random(case.name, seed)
     model = build(case.model, precision, rng)

@@ -17,7 +17,7 @@ from crisalad_jax.model import Crisalad, describe
 from crisalad_jax.nn.aggregators import aggregate
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.cross_image import cross_image_encoder
-from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN, normalise
+from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Block, Features, block, embed, feed_forward, interpolate_positions
 from crisalad_jax.sinkhorn import assign
@@ -30,6 +30,8 @@ from parity.reference.vit import Features as TorchFeatures
 GRID = (3, 4)
 """Rows and columns of patches wherever a case needs a grid: not square, so axes cannot be mixed."""
 LOSS = MultiSimilarityConfig(base=0.5)
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""ImageNet's, as torchvision's models publish them: our own constants are what is tested."""
 
 Inputs = Mapping[str, Any]
 
@@ -59,7 +61,7 @@ def _their_pixels(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[str, 
 
 def torch_normalise(images: Tensor, dtype: torch.dtype) -> Tensor:
     """8-bit (..., 3) as torchvision's `to_tensor` and `normalize` do, the channels left last."""
-    mean, deviation = (torch.tensor(x, dtype=dtype) for x in (IMAGENET_MEAN, IMAGENET_DEVIATION))
+    mean, deviation = (torch.tensor(x, dtype=dtype) for x in (MEAN, DEVIATION))
     return (images.to(dtype) / 255 - mean) / deviation
 
 

@@ -61,6 +61,14 @@ def test_the_pyramid_is_torchs_pooling_of_its_regions(grid, cuts, exponent: floa
     np.testing.assert_allclose(found, torch.stack(regions), atol=2e-6)
 
 
+def test_the_pyramid_starts_at_the_published_exponent() -> None:
+    pyramid = init_aggregator(
+        jax.random.key(0), dataclasses.replace(MODEL, aggregator="gem-pyramid")
+    )
+    assert isinstance(pyramid, GemPyramid)
+    assert (pyramid.p.shape, float(pyramid.p)) == ((), 3.0)  # CricaVPR's GeM(p=3)
+
+
 def test_a_class_token_is_all_there_is() -> None:
     config = dataclasses.replace(MODEL, aggregator="class-token")
     assert init_aggregator(jax.random.key(0), config) is None

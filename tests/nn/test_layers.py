@@ -3,6 +3,9 @@
 Bounds of 1e-6 relative to outputs of order 1 are a few units of float32's last place.
 """
 
+import dataclasses
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,14 +13,18 @@ import pytest
 import torch
 
 from crisalad_jax.nn.layers import (
+    BatchNorm,
     Conv,
     DepthwiseConv,
     LayerNorm,
     Linear,
+    batch_norm,
     conv,
     depthwise_conv,
     dropout,
     gelu,
+    init_batch_norm,
+    init_conv,
     init_depthwise_conv,
     init_linear,
     l2_normalise,
@@ -92,6 +99,18 @@ def test_layer_norm_of_bfloat16_is_computed_in_float32() -> None:
     np.testing.assert_allclose(np.asarray(ours, np.float64), expected, atol=4 * 2**-8)
 
 
+def test_batch_norm_of_bfloat16_is_computed_in_float32() -> None:
+    x = jnp.asarray(100 + normal(0, 4, 64)).astype(jnp.bfloat16)
+    wide = np.asarray(x, np.float64)
+    mean, variance, weight, bias = 100.2, 0.7, 1.1, 0.3
+    expected = (wide - mean) / np.sqrt(variance + 1e-3) * weight + bias
+    stored = (jnp.full(64, value) for value in (weight, bias, mean, variance))
+    ours = batch_norm(BatchNorm(*stored), x, epsilon=1e-3)
+    assert ours.dtype == jnp.bfloat16
+    # One rounding to bfloat16, 2^-9 of values up to 4; a mean in bfloat16 alone is off by 0.26.
+    np.testing.assert_allclose(np.asarray(ours, np.float64), expected, atol=4 * 2**-8)
+
+
 @pytest.mark.parametrize("size", [1, 3, 5])
 def test_depthwise_conv_equals_torch(size: int) -> None:
     x, weight, bias = normal(0, 4, 6, 8), normal(1, size, size, 8), normal(2, 8)
@@ -151,5 +170,17 @@ def test_starts_are_torch_defaults() -> None:
         largest = float(jnp.abs(values).max())
         assert 0.99 / 8 < largest <= 1 / 8
     assert init_linear(jax.random.key(0), 64, 4, bias=False).bias is None
-    conv = init_depthwise_conv(jax.random.key(0), 3, 400)
-    assert 0.99 / 3 < float(jnp.abs(conv.weight).max()) <= 1 / 3
+    depthwise = init_depthwise_conv(jax.random.key(0), 3, 400)
+    full = init_conv(jax.random.key(0), 3, 16, 400)
+    for layer, bound in ((depthwise, 1 / 3), (full, 1 / math.sqrt(3 * 3 * 16))):
+        for values in (layer.weight, layer.bias):
+            assert 0.99 * bound < float(jnp.abs(values).max()) <= bound
+
+
+def test_batch_norm_starts_as_torchs() -> None:
+    theirs = {name: x.numpy() for name, x in torch.nn.BatchNorm2d(5).state_dict().items()}
+    del theirs["num_batches_tracked"]
+    ours = dataclasses.asdict(init_batch_norm(5))
+    assert ours.keys() == theirs.keys()
+    for name, values in theirs.items():
+        np.testing.assert_array_equal(ours[name], values)
