@@ -1,6 +1,6 @@
 """Time and memory of the transport, forward and backward, beside torch and ott-jax, in one run.
 
-    python scripts/bench_sinkhorn.py [--out docs/sinkhorn] [--page docs/sinkhorn.md]
+    python scripts/bench_sinkhorn.py [--out docs/sinkhorn] [--page docs/sinkhorn.md] [BENCH ...]
 
 Needs torch (the `dev` extra); contenders of ott-jax join in where it is installed. On a GPU if both
 jax and torch find one. Before anything is timed, plans and gradients are checked to be equal. Where
@@ -50,7 +50,7 @@ PAUSE = 0.25
 DUSTBIN = 1.0
 TOLERANCES = tuple(10 ** (-i / 2) for i in range(2, 15))
 """Asked for from the loosest on, until the error that is measured is small enough."""
-MOST_ITERATIONS = 2000
+MOST_ITERATIONS = 500
 
 
 class Inputs(NamedTuple):
@@ -442,8 +442,12 @@ def draw(values: list[dict[str, Any]], title: Callable[[dict[str, Any]], str]) -
     return figure
 
 
+BENCHES = {"bench_fixed": fixed, "bench_converged": converged}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Time the transport; see the top.")
+    parser.add_argument("benches", nargs="*", metavar="BENCH", help=f"of {', '.join(BENCHES)}")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/sinkhorn"))
     parser.add_argument("--page", type=pathlib.Path, help="also put the tables into this page")
     parser.add_argument("--images", type=int, default=32)
@@ -456,8 +460,10 @@ def main() -> None:
     parser.add_argument("--calls", type=int, default=10)
     parser.add_argument("--batches", type=int, default=8, help="to count failures in")
     arguments = parser.parse_args()
-    for name, study_of in (("bench_fixed", fixed), ("bench_converged", converged)):
-        study = study_of(arguments)
+    if unknown := set(arguments.benches) - set(BENCHES):
+        parser.error(f"found {', '.join(sorted(unknown))}, expected of {', '.join(BENCHES)}")
+    for name in arguments.benches or BENCHES:
+        study = BENCHES[name](arguments)
         save(name, study, arguments.out)
         if arguments.page is not None:
             splice(arguments.page, name, study.table)

@@ -12,11 +12,13 @@ from crisalad_jax.config import (
     CrossImageConfig,
     ModelConfig,
     SaladConfig,
+    SinkhornConfig,
     ViTConfig,
 )
 from crisalad_jax.errors import InputError
 from crisalad_jax.layouts import (
     LAYOUTS,
+    check_holds,
     infer,
     public_shapes,
     table,
@@ -231,3 +233,23 @@ def test_unusual_widths_are_inferred() -> None:
     )
     state = blank(public_shapes(config, "reference"))
     assert infer(state, source="state") == ("reference", config)
+
+
+@pytest.mark.parametrize("dustbin", ["token", "mass", "none"])
+def test_other_dustbins_go_to_the_reference_alone(dustbin) -> None:
+    sinkhorn = SinkhornConfig(dustbin=dustbin)
+    config = dataclasses.replace(
+        MODEL,
+        backbone=dataclasses.replace(MODEL.backbone, dim=64, heads=1, adapter=NO_ADAPTER),
+        salad=dataclasses.replace(MODEL.salad, sinkhorn=sinkhorn),
+        encoder=BARE,
+    )
+    with pytest.raises(InputError, match=f"layout dino-salad: cannot tell.*dustbin.*{dustbin}"):
+        check_holds(config, "dino-salad")
+    params = random_params(config)
+    state = to_state(params, config, "reference", {})
+    assert ("aggregator.dust_bin" in state) == (dustbin == "mass")
+    again, _ = to_params(state, config, "reference", source="it")
+    wanted = named_leaves(params)
+    for name, leaf in named_leaves(again).items():
+        np.testing.assert_array_equal(leaf, wanted[name])

@@ -1,23 +1,41 @@
-"""Transport plans against their defining properties, and against torch-free recomputation.
+"""Transport plans against their defining properties, numpy and torch, in float32.
 
-The published outputs and gradients are in parity/test_goldens.py.
+Other libraries' plans and all exact gradients are in test_sinkhorn_float64.py, the published
+outputs and gradients in parity/test_goldens.py.
 """
+
+import dataclasses
+import functools
+import itertools
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
+import optimistix
 import pytest
-from hypothesis import given, settings
+import torch
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.sinkhorn import (
+    Potentials,
+    Problem,
+    SinkhornResult,
     append_dustbin,
     assign,
     log_marginals,
     marginal_error,
     sinkhorn,
+    sinkhorn_step,
 )
 
 
@@ -25,24 +43,80 @@ def scores_of(seed: int, *shape: int, scale: float = 1.0) -> jax.Array:
     return scale * jax.random.normal(jax.random.key(seed), shape)
 
 
-def test_equals_the_scaling_form_in_float64() -> None:
-    """u = mu / (K v), v = nu / (K^T u), written out in numpy."""
-    scores, epsilon = np.asarray(scores_of(0, 9, 4), np.float64), 0.7
-    kernel = np.exp(np.concatenate([scores, np.full((9, 1), 1.3)], axis=1) / epsilon)
-    nu = np.array([1, 1, 1, 1, 5.0])
-    u = np.ones(9)
-    for _ in range(4):
-        v = nu / (kernel.T @ u)
-        u = 1 / (kernel @ v)
-    expected = u[:, None] * kernel * v
-    config = SinkhornConfig(iterations=4, epsilon=epsilon)
-    ours = jnp.exp(assign(jnp.asarray(scores, jnp.float32), jnp.float32(1.3), config).log_plan)
-    np.testing.assert_allclose(ours, expected, rtol=1e-5)  # logarithms of order 5 in float32
+def implicit(**fields: Any) -> SinkhornConfig:
+    standard: dict[str, Any] = {"gradient": "implicit", "tolerance": 1e-5, "iterations": 300}
+    return SinkhornConfig(**{**standard, **fields})
+
+
+def plan_of(result: SinkhornResult) -> np.ndarray:
+    return np.exp(np.asarray(result.log_plan, np.float64))
+
+
+# The published algorithm
+
+
+def published(scores: np.ndarray, dustbin: float, epsilon: float, count: int) -> np.ndarray:
+    """SALAD's log_otp_solver, written out in torch from the paper: (K, N), clusters first."""
+    kernel = torch.from_numpy(np.asarray(scores, np.float64)).T / epsilon
+    clusters, rows = kernel.shape
+    kernel = torch.cat([kernel, torch.full((1, rows), dustbin / epsilon)])
+    log_a = torch.zeros(clusters + 1)
+    log_a[-1] = np.log(rows - clusters)
+    u, v = torch.zeros(clusters + 1), torch.zeros(rows)
+    for _ in range(count):
+        u = log_a - torch.logsumexp(kernel + v, dim=1)
+        v = -torch.logsumexp(kernel + u[:, None], dim=0)
+    return torch.exp(kernel + u[:, None] + v).T.numpy()
+
+
+@pytest.mark.parametrize("domain", ["scaling", "log"])
+@pytest.mark.parametrize("count", [1, 3, 12])
+def test_equals_the_published_iterations(domain: Any, count: int) -> None:
+    scores = scores_of(0, 9, 4, scale=2.0)
+    config = SinkhornConfig(iterations=count, epsilon=0.7, domain=domain)
+    result = assign(scores, jnp.float32(1.3), config)
+    expected = published(np.asarray(scores), 1.3, 0.7, count)
+    # Logarithms of order 10 in float32.
+    np.testing.assert_allclose(plan_of(result), expected, rtol=1e-5)
+    assert result.iterations == count
+
+
+def test_defaults_are_the_published_ones() -> None:
+    scores = scores_of(1, 2, 9, 4, scale=3.0)
+    result = assign(scores, jnp.float32(-0.4))
+    for one, plan in zip(np.asarray(scores), plan_of(result), strict=True):
+        # As above.
+        np.testing.assert_allclose(plan, published(one, -0.4, 1.0, 3), rtol=1e-5)
+    np.testing.assert_array_equal(result.iterations, [3, 3])
+    assert result.converged.all()
+
+
+@pytest.mark.parametrize("fields", [{}, {"row_tau": 0.7}, {"column_tau": 0.7}], ids=str)
+def test_over_relaxed_iterations_by_hand(fields: Any) -> None:
+    scores, w = np.asarray(scores_of(2, 7, 3), np.float64), 1.5
+    row_tau, column_tau = fields.get("row_tau", 1.0), fields.get("column_tau", 1.0)
+    mu, nu = np.linspace(0.5, 1.5, 7), np.array([2.0, 4.0, 1.0])
+    row, column = np.zeros(7), np.zeros(3)
+    for _ in range(2):
+        target = column_tau * (np.log(nu) - np.log(np.exp(scores + row[:, None]).sum(axis=0)))
+        column = (1 - w) * column + w * target
+        target = row_tau * (np.log(mu) - np.log(np.exp(scores + column).sum(axis=1)))
+        row = (1 - w) * row + w * target
+    # And in the end the rows are met, so that no plan is too large for a float.
+    row = row_tau * (np.log(mu) - np.log(np.exp(scores + column).sum(axis=1)))
+    config = SinkhornConfig(relaxation=w, iterations=2, **fields)
+    log_mu, log_nu = jnp.log(jnp.asarray(mu)), jnp.log(jnp.asarray(nu))
+    result = sinkhorn(jnp.asarray(scores), log_mu, log_nu, config=config)
+    # Rounding of logarithms.
+    np.testing.assert_allclose(plan_of(result), np.exp(scores + row[:, None] + column), rtol=1e-5)
+
+
+# Diagnostics
 
 
 def test_converged_plan_meets_both_marginals_and_reports_it() -> None:
     result = assign(scores_of(0, 2, 20, 6), jnp.float32(0), SinkhornConfig(iterations=200))
-    plan = np.exp(np.asarray(result.log_plan, np.float64))
+    plan = plan_of(result)
     # What float32 potentials allow at convergence.
     np.testing.assert_allclose(plan.sum(axis=2), 1, atol=1e-5)
     np.testing.assert_allclose(plan.sum(axis=1), [[1] * 6 + [14]] * 2, rtol=1e-5)
@@ -53,17 +127,508 @@ def test_converged_plan_meets_both_marginals_and_reports_it() -> None:
 
 def test_three_iterations_leave_sharp_scores_unbalanced_and_say_so() -> None:
     result = assign(scores_of(0, 50, 8, scale=10.0), jnp.float32(1))
-    masses = np.exp(np.asarray(result.log_plan)).sum(axis=0)
+    masses = plan_of(result).sum(axis=0)
     relative = np.abs(masses / np.array([1] * 8 + [42]) - 1).max()
     np.testing.assert_allclose(result.column_error, relative, rtol=1e-4)
     assert result.column_error > 0.01
     assert result.row_error < 1e-5  # rows are met last
 
 
+def test_marginal_error_by_hand() -> None:
+    plan = jnp.log(jnp.array([[0.5, 0.25], [0.5, 1.0]]))
+    rows, columns = marginal_error(plan, jnp.log(jnp.array([1.0, 2.0])), jnp.log(jnp.ones(2)))
+    # Rounding of logarithms.
+    np.testing.assert_allclose(rows, 0.25, atol=1e-6)
+    np.testing.assert_allclose(columns, 0.25, atol=1e-6)
+    rows, columns = marginal_error(plan, jnp.log(jnp.array([0.5, 1.5])), jnp.log(jnp.ones(2)))
+    np.testing.assert_allclose(rows, 0.5, atol=1e-6)
+
+
+def test_iterations_are_counted_until_nothing_changes_more() -> None:
+    """The count of a loop in numpy that stops at the same change."""
+    scores = np.asarray(scores_of(4, 30, 5, scale=3.0), np.float64)
+    full = np.concatenate([scores, np.zeros((30, 1))], axis=1)
+    log_nu = np.log([1, 1, 1, 1, 1, 25.0])
+    row, column, changes = np.zeros(30), np.zeros(6), []
+    for _ in range(60):
+        old = row + column.mean(), column - column.mean()
+        column = log_nu - np.log(np.exp(full + row[:, None]).sum(axis=0))
+        row = -np.log(np.exp(full + column).sum(axis=1))
+        new = row + column.mean(), column - column.mean()
+        changes.append(max(np.abs(a - b).max() for a, b in zip(old, new, strict=True)))
+    for tolerance in (1e-1, 1e-3):
+        expected = int(np.argmax(np.array(changes) <= tolerance)) + 1
+        assert 3 < expected < 60
+        for config in (implicit(tolerance=tolerance), implicit(tolerance=tolerance, domain="log")):
+            result = assign(jnp.asarray(scores, jnp.float32), jnp.float32(0), config)
+            assert result.iterations == expected
+            assert result.converged
+            assert result.column_error <= tolerance
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"method": "newton"},
+        {"gradient": "optimistix"},
+        pytest.param({"anderson": 4}, marks=SLOW),
+        pytest.param({"gradient": "stop"}, marks=SLOW),
+    ],
+    ids=str,
+)
+def test_too_small_a_budget_is_reported_and_can_raise(fields: Any) -> None:
+    scores = scores_of(0, 2, 30, 5, scale=20.0).at[1].multiply(0.001)
+    config = implicit(iterations=4, **fields)
+    result = assign(scores, jnp.float32(0), config)
+    np.testing.assert_array_equal(result.converged, [False, True])
+    assert result.iterations[0] == 4
+    assert result.iterations[1] < 4
+    assert result.column_error[0] > 1e-4
+    strict = dataclasses.replace(config, must_converge=True)
+    assert assign(0.001 * scores, jnp.float32(0), strict).converged.all()
+    with pytest.raises(RuntimeError, match="no convergence to 1e-05 in 4 iterations"):
+        jax.block_until_ready(assign(scores, jnp.float32(0), strict))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"anderson": 6}, {"relaxation": 1.5}, pytest.param({"method": "newton"}, marks=SLOW)],
+    ids=str,
+)
+def test_acceleration_accelerates(fields: Any) -> None:
+    """Sharp scores, where the plain iteration takes hundreds."""
+    scores = scores_of(1, 4, 40, 6, scale=6.0)
+    plain = assign(scores, jnp.float32(0), implicit(tolerance=1e-3, iterations=2000))
+    fast = assign(scores, jnp.float32(0), implicit(tolerance=1e-3, iterations=2000, **fields))
+    assert plain.converged.all()
+    assert fast.converged.all()
+    assert fast.iterations.sum() < 0.7 * plain.iterations.sum()
+    # The tolerance, for a plain iteration a good part of the distance that is left.
+    np.testing.assert_allclose(plan_of(fast), plan_of(plain), atol=3e-2)
+
+
+# Domains, batches, transformations
+
+
+@pytest.mark.parametrize("iterations", [4, 20])
+def test_too_far_apart_for_scaling_falls_back_to_the_log_domain(iterations: int) -> None:
+    weights = scores_of(4, 12, 5)
+
+    def both(domain: Any) -> Any:
+        def of(scores: jax.Array) -> Any:
+            config = SinkhornConfig(domain=domain, iterations=iterations)
+            log_plan = assign(scores, jnp.float32(1), config).log_plan
+            return (weights * jnp.exp(log_plan)).sum(), log_plan
+
+        return jax.jit(jax.grad(of, has_aux=True))
+
+    scaling, logarithmic = both("scaling"), both("log")
+    for scale in (1.0, 40.0, 1e4):
+        scores = scores_of(3, 2, 12, 4, scale=scale)
+        gradient, log_plan = scaling(scores)
+        expected_gradient, expected = logarithmic(scores)
+        # In range: rounding of logarithms of order 10. Beyond it: the very same code.
+        atol = 1e-5 if scale == 1 else 0
+        np.testing.assert_allclose(log_plan, expected, rtol=1e-6, atol=atol)
+        np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-6, atol=1e-6)
+        assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(
+    "fields", [{}, {"anderson": 4}, pytest.param({"method": "newton"}, marks=SLOW)], ids=str
+)
+def test_a_plan_owes_nothing_to_its_batch(fields: Any) -> None:
+    """The second problem takes many times the iterations of the first."""
+    scores = scores_of(5, 3, 20, 4) * jnp.array([0.5, 4.0, 1.0])[:, None, None]
+    together = assign(scores, jnp.float32(0), implicit(**fields))
+    assert together.iterations[1] > together.iterations[0]
+    for index in range(3):
+        alone = assign(scores[index : index + 1], jnp.float32(0), implicit(**fields))
+        assert alone.iterations[0] == together.iterations[index]
+        # Rounding: matrix products of a batch may add up in another order.
+        np.testing.assert_allclose(plan_of(together)[index], plan_of(alone)[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SinkhornConfig(),
+        implicit(),
+        pytest.param(implicit(gradient="optimistix"), marks=SLOW),
+        pytest.param(SinkhornConfig(domain="log", anderson=3), marks=SLOW),
+    ],
+    ids=["3", "implicit", "optimistix", "log"],
+)
+def test_any_leading_axes_jit_and_vmap_agree(config: SinkhornConfig) -> None:
+    scores = scores_of(6, 2, 3, 12, 4, scale=2.0)
+    weights = scores_of(7, 12, 5)
+
+    def of(scores: jax.Array) -> Any:
+        result = assign(scores, jnp.float32(1), config)
+        return (weights * jnp.exp(result.log_plan)).sum(), result
+
+    both = jax.grad(of, has_aux=True)
+    gradient, result = jax.jit(both)(scores)
+    assert result.log_plan.shape == (2, 3, 12, 5)
+    assert result.potentials.row.shape == (2, 3, 12)
+    assert result.potentials.column.shape == (2, 3, 5)
+    for field in (result.row_error, result.column_error, result.iterations, result.converged):
+        assert field.shape == (2, 3)
+    mapped = jax.jit(jax.vmap(jax.vmap(both)))(scores)
+    row = jax.jit(both)(scores[1])
+    one = jax.jit(both)(scores[1, 2])
+    for ours, theirs in (
+        (mapped, (gradient, result)),
+        (row, jax.tree.map(lambda x: x[1], (gradient, result))),
+        (one, jax.tree.map(lambda x: x[1, 2], (gradient, result))),
+    ):
+        np.testing.assert_array_equal(ours[1].iterations, theirs[1].iterations)
+        # Rounding of logarithms of order 10.
+        np.testing.assert_allclose(ours[1].log_plan, theirs[1].log_plan, atol=1e-5)
+        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-5)
+
+
+def test_half_precision_is_widened() -> None:
+    scores = scores_of(8, 12, 4).astype(jnp.bfloat16)
+    result = assign(scores, jnp.bfloat16(1))
+    assert result.log_plan.dtype == jnp.float32
+    wide = assign(scores.astype(jnp.float32), jnp.float32(1))
+    np.testing.assert_array_equal(result.log_plan, wide.log_plan)
+    gradient = jax.grad(lambda s: jnp.exp(assign(s, jnp.bfloat16(1)).log_plan)[:, 0].sum())(scores)
+    assert gradient.dtype == jnp.bfloat16
+    assert jnp.abs(gradient).max() > 0
+
+
+def test_nothing_is_compiled_anew_for_another_number(caplog: pytest.LogCaptureFixture) -> None:
+    scores = scores_of(9, 11, 4)
+    log_mu, log_nu = log_marginals(11, 4)
+
+    def everything(number: float) -> None:
+        assign(scores + number, jnp.float32(number))
+        assign(scores, jnp.float32(number), SinkhornConfig(epsilon=number))
+        assign(scores, jnp.float32(number), SinkhornConfig(dustbin="mass"))
+        full = append_dustbin(scores, jnp.float32(number))
+        sinkhorn(full, log_mu, log_nu, epsilon=number)
+        sinkhorn(full, log_mu, log_nu, epsilon=jnp.float32(number), config=implicit())
+
+    jax.clear_caches()
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        everything(0.5)
+        assert any("Compiling" in record.message for record in caplog.records)
+        caplog.clear()
+        everything(0.75)
+        assert not [r.message for r in caplog.records if "Compiling" in r.message]
+
+
+SHARDED = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from crisalad_jax.config import SinkhornConfig
+from crisalad_jax.sinkhorn import assign
+
+assert len(jax.devices()) == 8
+scores = 2 * jax.random.normal(jax.random.key(0), (16, 12, 4))
+weights = jax.random.normal(jax.random.key(1), (12, 5))
+over = NamedSharding(Mesh(np.array(jax.devices()), ("batch",)), PartitionSpec("batch"))
+spread = jax.device_put(scores, over)
+for fields in ({}, {"gradient": "implicit", "tolerance": 1e-5, "iterations": 300}):
+    def of(scores):
+        result = assign(scores, jnp.float32(1), SinkhornConfig(**fields))
+        return (weights * jnp.exp(result.log_plan)).sum(), result
+
+    step = jax.jit(jax.grad(of, has_aux=True))
+    for x in (1, 100):  # in range of the scaling domain, and out of it
+        gradient, result = step(x * spread)
+        expected_gradient, expected = step(x * scores)
+        assert len(result.log_plan.sharding.device_set) == 8, result.log_plan.sharding
+        np.testing.assert_array_equal(result.iterations, expected.iterations)
+        # Rounding of logarithms of order 10 x.
+        np.testing.assert_allclose(result.log_plan, expected.log_plan, atol=1e-5 * x)
+        np.testing.assert_allclose(gradient, expected_gradient, atol=1e-5)
+print("agreed")
+"""
+
+
+def test_eight_devices_give_the_same_plans() -> None:
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", SHARDED],
+        env={**os.environ, **flags},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "agreed\n", done.stderr
+
+
+# Finite for finite scores
+
+CLUSTERS = 8
+MODES: dict[str, SinkhornConfig] = {
+    "scaling": SinkhornConfig(),
+    "log": SinkhornConfig(domain="log"),
+    "scan": SinkhornConfig(iterations=10),
+    "relaxation": SinkhornConfig(relaxation=1.9, iterations=10),
+    "anderson": SinkhornConfig(anderson=4, iterations=10),
+    "implicit": implicit(iterations=30),
+    "implicit, log": implicit(iterations=30, domain="log"),
+    "implicit, relaxation": implicit(iterations=30, relaxation=1.9),
+    "implicit, anderson": implicit(iterations=30, anderson=5),
+    "newton": implicit(iterations=6, method="newton"),
+    "optimistix": implicit(iterations=30, gradient="optimistix"),
+    "stop": SinkhornConfig(gradient="stop"),
+    "columns": implicit(iterations=30, column_tau=0.5),
+    "mass": SinkhornConfig(dustbin="mass"),
+    "row and column": SinkhornConfig(dustbin="row and column"),
+    "token": implicit(iterations=30, dustbin="token"),
+    "dual-softmax": SinkhornConfig(method="dual-softmax"),
+}
+QUICK = {"scaling", "scan", "relaxation", "implicit", "implicit, relaxation", "newton", "columns"}
+PATTERNS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "random": lambda scores: scores,
+    "flat": lambda scores: 0 * scores + scores[0, 0],
+    "sharp": lambda scores: jnp.where(scores == scores.max(axis=1, keepdims=True), 1.0, -1.0),
+    "one cluster": lambda scores: jnp.zeros_like(scores).at[:, 0].set(1.0).at[:, 1].set(-1.0),
+    "one patch": lambda scores: jnp.zeros_like(scores).at[0].set(-1.0).at[0, 0].set(1.0),
+    "low rank": lambda scores: scores[:, :1] * scores[:1],
+}
+
+
+@functools.lru_cache
+def finite_check(mode: str, mapped: bool) -> Callable[[jax.Array, jax.Array], Any]:
+    def loss(scores: jax.Array, dustbin: jax.Array) -> jax.Array:
+        log_plan = assign(scores, dustbin, MODES[mode]).log_plan
+        # Through the plan as in a model, and through its logarithm.
+        return jnp.sin(jnp.exp(log_plan)).sum() + 1e-3 * log_plan.sum()
+
+    both = jax.value_and_grad(loss, argnums=(0, 1))
+    return jax.jit(jax.vmap(both) if mapped else both)
+
+
+def assert_finite(
+    mode: str, pattern: str, scale: float, seed: int, rows: int, mapped: bool
+) -> None:
+    scores = jnp.clip(scale * PATTERNS[pattern](scores_of(seed, rows, CLUSTERS)), -1e4, 1e4)
+    dustbin = jnp.full(rows, 1.0) if MODES[mode].dustbin == "token" else jnp.float32(1)
+    if mapped:  # beside a harmless problem
+        scores, dustbin = jnp.stack([scores, 0.1 * scores]), jnp.stack([dustbin, dustbin])
+    out = finite_check(mode, mapped)(scores, dustbin)
+    for name, x in zip(("value", "gradient", "dustbin's"), jax.tree.leaves(out), strict=True):
+        assert jnp.isfinite(x).all(), (name, x)
+
+
+SCORES = {
+    "pattern": st.sampled_from(sorted(PATTERNS)),
+    "scale": st.sampled_from([1e-3, 1.0, 10.0, 30.0, 100.0, 1e3, 1e4]),
+    "seed": st.integers(0, 1000),
+}
+
+
+@pytest.mark.parametrize(
+    "mode", [pytest.param(mode, marks=() if mode in QUICK else SLOW) for mode in MODES]
+)
+@given(**SCORES)
+@example(pattern="random", scale=1e4, seed=0)
+@example(pattern="sharp", scale=1e4, seed=0)
+@settings(max_examples=12, deadline=None)
+def test_never_nan(mode: str, pattern: str, scale: float, seed: int) -> None:
+    """With the least mass that a dustbin can have, and scores of 30 either side of the guard."""
+    assert_finite(mode, pattern, scale, seed, rows=CLUSTERS + 1, mapped=False)
+
+
+@pytest.mark.parametrize("mode", ["scaling", "optimistix"])
+@given(**SCORES)
+@example(pattern="random", scale=1e4, seed=0)
+@settings(max_examples=8, deadline=None)
+def test_never_nan_under_vmap(mode: str, pattern: str, scale: float, seed: int) -> None:
+    """Which computes both of what the guard chooses from."""
+    assert_finite(mode, pattern, scale, seed, rows=24, mapped=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("rows", [40, 2048])
+@pytest.mark.parametrize("mode", MODES)
+@given(**SCORES)
+@example(pattern="random", scale=1e4, seed=0)
+@settings(max_examples=20, deadline=None)
+def test_never_nan_for_many_patches(
+    mode: str, rows: int, mapped: bool, pattern: str, scale: float, seed: int
+) -> None:
+    assert_finite(mode, pattern, scale, seed, rows=rows, mapped=mapped)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        pytest.param({"anderson": 5}, marks=SLOW),
+        pytest.param({"method": "newton"}, marks=SLOW),
+        pytest.param({"row_tau": 0.9, "column_tau": 0.8}, marks=SLOW),
+    ],
+    ids=str,
+)
+def test_implicit_gradient_in_float32(fields: Any) -> None:
+    """Against the same in float64, which test_sinkhorn_float64.py holds to unrolling."""
+    scores = np.asarray(scores_of(10, 4, 64, 16, scale=3.0))
+    weights = np.asarray(scores_of(11, 64, 17))
+
+    def gradient(dtype: Any, tolerance: float) -> np.ndarray:
+        def of(scores: jax.Array) -> jax.Array:
+            config = implicit(tolerance=tolerance, iterations=1000, **fields)
+            result = assign(scores, jnp.zeros((), dtype), config)
+            return (jnp.asarray(weights, dtype) * jnp.exp(result.log_plan)).sum()
+
+        return np.asarray(jax.jit(jax.grad(of))(jnp.asarray(scores, dtype)))
+
+    ours = {tolerance: gradient(jnp.float32, tolerance) for tolerance in (1e-5, 1e-3)}
+    with jax.enable_x64(True):
+        exact = gradient(jnp.float64, 1e-12)
+    errors = {x: np.linalg.norm(found - exact) / np.linalg.norm(exact) for x, found in ours.items()}
+    print(fields, errors)
+    # The stated bounds: of rounding and of the tolerance, amplified by the condition number.
+    assert errors[1e-5] < 1e-5
+    assert errors[1e-3] < 1e-3
+
+
+# Dustbins
+
+
+def test_no_dustbin_shares_the_patches_alike() -> None:
+    result = assign(scores_of(0, 12, 5), None, SinkhornConfig(dustbin="none", iterations=100))
+    plan = plan_of(result)
+    assert plan.shape == (12, 5)
+    # What float32 potentials allow at convergence.
+    np.testing.assert_allclose(plan.sum(axis=0), 12 / 5, rtol=1e-5)
+    np.testing.assert_allclose(plan.sum(axis=1), 1, rtol=1e-5)
+    # As few patches as one likes.
+    few = assign(scores_of(0, 3, 5), None, SinkhornConfig(dustbin="none", iterations=100))
+    np.testing.assert_allclose(plan_of(few).sum(axis=0), 3 / 5, rtol=1e-5)
+
+
+def test_row_and_column_are_superglue() -> None:
+    """Its log_optimal_transport, written out in torch from the paper (Sarlin et al., Eq. 7-9)."""
+    scores, alpha, rows, clusters = np.asarray(scores_of(1, 9, 4)), 0.8, 9, 4
+    couplings = torch.full((rows + 1, clusters + 1), alpha, dtype=torch.float64)
+    couplings[:-1, :-1] = torch.from_numpy(scores)
+    mu = torch.tensor([1.0] * rows + [clusters], dtype=torch.float64) / (rows + clusters)
+    nu = torch.tensor([1.0] * clusters + [rows], dtype=torch.float64) / (rows + clusters)
+    u, v = torch.zeros(rows + 1), torch.zeros(clusters + 1)
+    for _ in range(100):
+        u = mu.log() - torch.logsumexp(couplings + v, dim=1)
+        v = nu.log() - torch.logsumexp(couplings + u[:, None], dim=0)
+    expected = (couplings + u[:, None] + v).exp() * (rows + clusters)
+    config = SinkhornConfig(dustbin="row and column", iterations=100)
+    ours = plan_of(assign(jnp.asarray(scores), jnp.float32(alpha), config))
+    # Both have converged: rounding of logarithms. The dustbin's row is left out.
+    np.testing.assert_allclose(ours, expected[:-1], rtol=1e-5)
+
+
+def test_a_score_a_patch() -> None:
+    """As a column of scores like any other."""
+    scores, dustbin = scores_of(2, 3, 12, 4), scores_of(3, 3, 12)
+    ours = assign(scores, dustbin, SinkhornConfig(dustbin="token"))
+    full = jnp.concatenate([scores, dustbin[..., None]], axis=-1)
+    log_nu = jnp.log(jnp.array([1.0, 1, 1, 1, 8]))
+    expected = sinkhorn(full, jnp.zeros(12), log_nu)
+    np.testing.assert_allclose(ours.log_plan, expected.log_plan, atol=1e-6)  # rounding
+
+
+@pytest.mark.parametrize("logit", [-2.0, 0.0, 3.0])
+def test_learnt_mass(logit: float) -> None:
+    config = SinkhornConfig(dustbin="mass", iterations=100)
+    plan = plan_of(assign(scores_of(4, 12, 4), jnp.float32(logit), config))
+    share = 1 / (1 + np.exp(-logit))
+    # What float32 potentials allow at convergence.
+    np.testing.assert_allclose(plan.sum(axis=0)[-1], 12 * share, rtol=1e-5)
+    np.testing.assert_allclose(plan.sum(axis=0)[:-1], 12 * (1 - share) / 4, rtol=1e-5)
+    np.testing.assert_allclose(plan.sum(axis=1), 1, rtol=1e-5)
+
+
+def dustbin_gradient(at: jax.Array, **fields: Any) -> jax.Array:
+    """Of the plan's clusters, squared, for sharp scores."""
+    scores = scores_of(5, 20, 4, scale=3.0)
+
+    def loss(dustbin: jax.Array) -> jax.Array:
+        log_plan = assign(scores, dustbin, SinkhornConfig(**fields)).log_plan
+        return (jnp.exp(log_plan[..., :4]) ** 2).sum()
+
+    return jax.jit(jax.grad(loss))(at)
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 20])
+@pytest.mark.parametrize("z", [-10.0, 1.0, 10.0])
+def test_the_published_dustbin_is_dead(iterations: int, z: float) -> None:
+    # Sums of 20 float32 terms that cancel.
+    assert jnp.abs(dustbin_gradient(jnp.float32(z), iterations=iterations)) < 1e-5
+    plans = [
+        plan_of(assign(scores_of(5, 20, 4), jnp.float32(x), SinkhornConfig(iterations=iterations)))
+        for x in (0, z)
+    ]
+    np.testing.assert_allclose(*plans, atol=1e-5)  # rounding of logarithms of 10
+
+
+def test_other_dustbins_live() -> None:
+    """By margins of 100 and more over the rounding above."""
+    one, many = jnp.float32(1), jnp.ones(20)
+    assert jnp.abs(dustbin_gradient(many, dustbin="token")).max() > 0.03
+    assert jnp.abs(dustbin_gradient(one, dustbin="mass")) > 0.1
+    assert jnp.abs(dustbin_gradient(one, dustbin="row and column")) > 1e-3
+    assert jnp.abs(dustbin_gradient(one, column_tau=0.9, iterations=20)) > 0.03
+
+
+# Baselines, and what a step may be
+
+
+def test_softmax_and_dual_softmax_are_torchs() -> None:
+    scores, epsilon = scores_of(6, 2, 7, 3), 0.6
+    kernel = torch.from_numpy(np.asarray(scores)) / epsilon
+    bin_ = torch.cat([kernel, torch.full((2, 7, 1), 1.5 / epsilon)], dim=2)
+    config = SinkhornConfig(method="softmax", epsilon=epsilon)
+    # Rounding.
+    ours = plan_of(assign(scores, jnp.float32(1.5), config))
+    np.testing.assert_allclose(ours, bin_.softmax(dim=2), rtol=1e-5)
+    dual = SinkhornConfig(method="dual-softmax", dustbin="none", epsilon=epsilon)
+    result = assign(scores, None, dual)
+    expected = kernel.softmax(dim=2) * kernel.softmax(dim=1)
+    np.testing.assert_allclose(plan_of(result), expected, rtol=1e-5)
+    log_mu, log_nu = jnp.log(jnp.arange(1.0, 8)), jnp.log(jnp.array([4.0, 12, 12]))
+    weighted = sinkhorn(scores, log_mu, log_nu, config=SinkhornConfig(method="softmax"))
+    # Each row has the mass that it is given.
+    np.testing.assert_allclose(plan_of(weighted).sum(axis=2), [np.arange(1.0, 8)] * 2, rtol=1e-5)
+    assert (weighted.row_error < 1e-5).all()
+    assert weighted.iterations.tolist() == [0, 0]
+
+
+def capacity_step(problem: Problem, potentials: Potentials) -> Potentials:
+    """Columns take no more than their marginals, and may take less."""
+    column = jnp.minimum(problem.log_nu - problem.over_rows(potentials.row), 0)
+    return Potentials(problem.log_mu - problem.over_columns(column), column)
+
+
+def test_a_step_with_marginals_of_its_own() -> None:
+    """Optimal: no column above its capacity, and only full ones have a price."""
+    scores = scores_of(7, 20, 4, scale=2.0)
+    log_mu, log_nu = jnp.zeros(20), jnp.log(jnp.array([3.0, 4, 30, 30]))
+    for gradient in ("stop", "optimistix"):
+        # A tau below 1 says that totals may differ.
+        config = implicit(gradient=gradient, column_tau=0.5)
+        result = sinkhorn(scores, log_mu, log_nu, config=config, step=capacity_step)
+        assert result.converged
+        masses, price = plan_of(result).sum(axis=0), result.potentials.column
+        np.testing.assert_allclose(masses[:2], [3, 4], rtol=1e-4)  # ten times the tolerance
+        assert (masses[2:] < 29).all()
+        assert (price[:2] < -0.1).all()
+        np.testing.assert_array_equal(price[2:], 0)
+        np.testing.assert_allclose(plan_of(result).sum(axis=1), 1, rtol=1e-5)
+
+
 def test_optimal_as_epsilon_falls() -> None:
     """At small epsilon the plan is the assignment found by trying all permutations."""
-    import itertools
-
     scores = np.asarray(scores_of(3, 4, 4), np.float64)
     best = max(
         itertools.permutations(range(4)), key=lambda p: sum(scores[i, j] for i, j in enumerate(p))
@@ -74,63 +639,170 @@ def test_optimal_as_epsilon_falls() -> None:
     np.testing.assert_array_equal(np.asarray(plan.log_plan).argmax(axis=1), best)
 
 
-@given(
-    seed=st.integers(0, 1000),
-    scale=st.sampled_from([0.0, 1.0, 100.0, 1e4]),
-    rows=st.sampled_from([5, 17]),
+# Bad input
+
+
+@pytest.fixture
+def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As users run it: the shapes in annotations are checked in tests alone."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+MU, NU = jnp.zeros(6), jnp.log(jnp.array([1.0, 2.0, 3.0]))
+BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
+    "one axis": (lambda: sinkhorn(jnp.zeros(3), MU, NU), r"scores of shape \(3,\) and log_mu"),
+    "rows": (lambda: sinkhorn(jnp.zeros((5, 3)), MU, NU), r"\(5, 3\) and log_mu of \(6,\)"),
+    "columns": (lambda: sinkhorn(jnp.zeros((6, 4)), MU, NU), r"\(6, 4\) and log_nu of \(3,\)"),
+    "no axis": (lambda: sinkhorn(jnp.zeros((6, 3)), MU, MU[0]), r"log_nu of \(\)"),
+    "batches": (
+        lambda: sinkhorn(jnp.zeros((2, 6, 3)), jnp.zeros((3, 6)), NU),
+        r"\(2, 6, 3\) and log_mu of \(3, 6\)",
+    ),
+    "more axes": (
+        lambda: sinkhorn(jnp.zeros((6, 3)), MU, jnp.zeros((2, 3))),
+        r"\(6, 3\) and log_nu of \(2, 3\)",
+    ),
+    "epsilons": (
+        lambda: sinkhorn(jnp.zeros((6, 3)), MU, NU, epsilon=jnp.ones(3)),
+        r"epsilon found of shape \(3,\), expected a single number",
+    ),
+    "own step, implicit": (
+        lambda: sinkhorn(jnp.zeros((6, 3)), MU, NU, config=implicit(), step=sinkhorn_step),
+        "a step beside method 'sinkhorn' and gradient 'implicit'",
+    ),
+    "own step, newton": (
+        lambda: sinkhorn(
+            jnp.zeros((6, 3)),
+            MU,
+            NU,
+            config=SinkhornConfig(method="newton", gradient="stop"),
+            step=sinkhorn_step,
+        ),
+        "a step beside method 'newton'",
+    ),
+    "own step, relaxation": (
+        lambda: sinkhorn(
+            jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig(relaxation=1.5), step=sinkhorn_step
+        ),
+        "a step beside relaxation 1.5",
+    ),
+    "solver": (
+        lambda: sinkhorn(
+            jnp.zeros((6, 3)), MU, NU, solver=optimistix.FixedPointIteration(rtol=0, atol=1)
+        ),
+        "a solver beside gradient 'unrolled', expected 'optimistix'",
+    ),
+    "assign": (lambda: assign(jnp.zeros(6), jnp.float32(1)), r"assign: found scores of shape \(6,"),
+    "no mass": (lambda: assign(jnp.zeros((6, 6)), jnp.float32(1)), "6 patches for 6 clusters"),
+    "less mass": (lambda: assign(jnp.zeros((4, 6)), jnp.float32(1)), "4 patches for 6 clusters"),
+    "token, one": (
+        lambda: assign(jnp.zeros((6, 3)), jnp.float32(1), SinkhornConfig(dustbin="token")),
+        r"dustbin: found shape \(\), expected \(6,\) for 'token'",
+    ),
+    "column, many": (
+        lambda: assign(jnp.zeros((6, 3)), jnp.ones(6)),
+        r"dustbin: found shape \(6,\), expected \(\) for 'column'",
+    ),
+    "mass, none": (
+        lambda: assign(jnp.zeros((6, 3)), None, SinkhornConfig(dustbin="mass")),
+        r"dustbin: found shape None, expected \(\) for 'mass'",
+    ),
+    "none, one": (
+        lambda: assign(jnp.zeros((6, 3)), jnp.float32(1), SinkhornConfig(dustbin="none")),
+        r"dustbin: found shape \(\), expected None for 'none'",
+    ),
+}
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("traced", [False, True], ids=["eager", "traced"])
+@pytest.mark.parametrize("name", BAD_CALLS)
+def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
+    call, message = BAD_CALLS[name]
+    with pytest.raises(InputError, match=message) as raised:
+        jax.eval_shape(call) if traced else call()
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize(
+    ("scores", "log_mu", "log_nu", "epsilon", "message"),
+    [
+        (jnp.nan, MU, NU, 1.0, "scores found with NaN or infinity"),
+        (jnp.inf, MU, NU, 1.0, "scores found with NaN or infinity"),
+        (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "log_mu found with NaN or infinity"),
+        (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN or infinity"),
+        (0.0, MU, NU, 0.0, "epsilon found 0.0, expected more than 0"),
+        (0.0, MU, NU, -1.0, "epsilon found -1.0, expected more than 0"),
+        (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected more than 0"),
+        (0.0, MU, NU + 1e-3, 1.0, "found to sum to 6 and 6.006, expected the same"),
+        (0.0, jnp.stack([MU, MU - 1]), NU, 1.0, "found to sum to 2.20728 and 6, expected the same"),
+    ],
 )
-@settings(max_examples=20, deadline=None)
-def test_never_nan_for_finite_scores(seed: int, scale: float, rows: int) -> None:
-    def loss(scores: jax.Array) -> jax.Array:
-        return jnp.sin(jnp.exp(assign(scores, jnp.float32(1)).log_plan)).sum()
-
-    scores = scores_of(seed, rows, 4, scale=scale)
-    value, gradient = jax.value_and_grad(loss)(scores)
-    assert jnp.isfinite(value)
-    assert jnp.isfinite(gradient).all()
-
-
-@given(seed=st.integers(0, 1000), dustbin=st.floats(-20, 20))
-@settings(max_examples=20, deadline=None)
-def test_the_dustbins_constant_score_changes_nothing(seed: int, dustbin: float) -> None:
-    scores = scores_of(seed, 12, 4)
-    plans = [jnp.exp(assign(scores, jnp.float32(z)).log_plan) for z in (0.0, dustbin)]
-    # The potential absorbs it: rounding of logarithms of up to 20 is left.
-    np.testing.assert_allclose(plans[0], plans[1], atol=1e-5)
+def test_bad_numbers_raise(
+    scores: float, log_mu: Any, log_nu: Any, epsilon: Any, message: str
+) -> None:
+    full = jnp.zeros((2, 6, 3)).at[1, 2, 1].set(scores)
+    with pytest.raises(InputError, match=f"sinkhorn: .*{message}") as raised:
+        sinkhorn(full, log_mu, log_nu, epsilon=epsilon)
+    assert "\n" not in str(raised.value)
+    known = jnp.isfinite(scores)
+    if known and epsilon == 1:  # and where they are known while the scores are traced
+        with pytest.raises(InputError, match=message):
+            jax.jit(lambda scores: sinkhorn(scores, log_mu, log_nu))(full)
 
 
-def test_epsilon_may_be_traced_and_learnt() -> None:
-    scores = append_dustbin(scores_of(0, 10, 3), jnp.float32(1))
-    log_mu, log_nu = log_marginals(10, 3)
-
-    def entropy(epsilon: jax.Array) -> jax.Array:
-        log_plan = sinkhorn(scores, log_mu, log_nu, epsilon=epsilon).log_plan
-        return -(jnp.exp(log_plan) * log_plan).sum()
-
-    gradient = jax.grad(entropy)(jnp.float32(0.5))
-    step = 1e-2
-    difference = (entropy(jnp.float32(0.5 + step)) - entropy(jnp.float32(0.5 - step))) / (2 * step)
-    # Central differences: step^2 of curvature and 1e-6 / step of rounding.
-    np.testing.assert_allclose(gradient, difference, rtol=5e-3)
-    assert gradient > 0
-
-
-def test_marginal_error_by_hand() -> None:
-    plan = jnp.log(jnp.array([[0.5, 0.25], [0.5, 1.0]]))
-    rows, columns = marginal_error(plan, jnp.log(jnp.array([1.0, 1.5])), jnp.log(jnp.ones(2)))
-    np.testing.assert_allclose(rows, 0.25, atol=1e-6)
-    np.testing.assert_allclose(columns, 0.25, atol=1e-6)
-
-
-@pytest.mark.parametrize("rows", [3, 4])
-def test_a_dustbin_without_mass_raises_while_tracing(rows: int) -> None:
-    with pytest.raises(InputError, match=f"found {rows} patches for 4 clusters"):
-        jax.eval_shape(lambda s: assign(s, jnp.float32(1)).log_plan, jnp.zeros((rows, 4)))
+def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
+    config = SinkhornConfig(column_tau=0.5)
+    assert sinkhorn(jnp.zeros((6, 3)), MU, NU + 1, config=config).converged
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("iterations", 0), ("epsilon", 0.0), ("epsilon", float("nan"))]
+    ("fields", "message"),
+    [
+        ({"method": "simplex"}, "SinkhornConfig.method: found 'simplex'"),
+        ({"dustbin": "row"}, "SinkhornConfig.dustbin: found 'row'"),
+        ({"domain": "kernel"}, "SinkhornConfig.domain: found 'kernel'"),
+        ({"gradient": "exact"}, "SinkhornConfig.gradient: found 'exact'"),
+        ({"iterations": 0}, "SinkhornConfig.iterations: found 0"),
+        ({"epsilon": 0.0}, "SinkhornConfig.epsilon: found 0.0"),
+        ({"epsilon": float("nan")}, "SinkhornConfig.epsilon: found nan"),
+        ({"tolerance": 0.0, "gradient": "stop"}, "SinkhornConfig.tolerance: found 0.0"),
+        ({"row_tau": 0.0}, "SinkhornConfig.row_tau: found 0.0"),
+        ({"column_tau": 1.1}, "SinkhornConfig.column_tau: found 1.1"),
+        ({"relaxation": 2.0}, "SinkhornConfig.relaxation: found 2.0"),
+        ({"relaxation": 0.0}, "SinkhornConfig.relaxation: found 0.0"),
+        ({"anderson": 1}, "SinkhornConfig.anderson: found 1"),
+        ({"anderson": -2}, "SinkhornConfig.anderson: found -2"),
+        ({"gradient": "implicit"}, "found 'implicit' with a fixed number of iterations"),
+        ({"gradient": "optimistix"}, "found 'optimistix' with a fixed number of iterations"),
+        ({"tolerance": 1e-3}, "found 'unrolled' with a tolerance"),
+        ({"must_converge": True}, "must_converge: found no tolerance"),
+        ({"method": "newton"}, "method: found 'newton' with relaxation"),
+        (
+            {"method": "newton", "gradient": "stop", "relaxation": 1.5},
+            "method: found 'newton' with relaxation",
+        ),
+        (
+            {"method": "newton", "gradient": "stop", "row_tau": 0.5},
+            "method: found 'newton' with relaxation",
+        ),
+        (
+            {"method": "newton", "gradient": "optimistix", "tolerance": 1e-3},
+            "gradient 'optimistix', expected none of these",
+        ),
+        ({"method": "softmax", "anderson": 3}, "method: found 'softmax' with a tolerance"),
+        (
+            {"method": "dual-softmax", "gradient": "stop", "tolerance": 1e-3},
+            "method: found 'dual-softmax' with a tolerance",
+        ),
+        (
+            {"gradient": "optimistix", "tolerance": 1e-3, "anderson": 3},
+            "anderson: found with gradient 'optimistix'",
+        ),
+    ],
 )
-def test_bad_settings_raise(field: str, value: float) -> None:
-    with pytest.raises(InputError, match=f"SinkhornConfig.{field}: found {value}"):
-        SinkhornConfig(**{field: value})
+def test_bad_settings_raise(fields: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        SinkhornConfig(**fields)
+    assert "\n" not in str(raised.value)

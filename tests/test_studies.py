@@ -50,11 +50,11 @@ def size(study: ModuleType, **fields: int) -> Any:
 
 
 def plan_of(scores: np.ndarray, iterations: int, share: float | None = None) -> np.ndarray:
-    """(patches, clusters) to (patches, clusters + 1), the dustbin's mass as published or a share"""
+    """(patches, clusters) to (patches, clusters + 1), the dustbin's mass as published or so."""
     patches, clusters = scores.shape
     kernel = np.exp(np.append(scores, np.zeros((patches, 1)), axis=1))
-    share = (patches - clusters) / patches if share is None else share
-    nu = patches * np.append(np.full(clusters, (1 - share) / clusters), share)
+    bin_share = (patches - clusters) / patches if share is None else share
+    nu = patches * np.append(np.full(clusters, (1 - bin_share) / clusters), bin_share)
     u = np.ones(patches)
     for _ in range(iterations):
         v = nu / (kernel.T @ u)
