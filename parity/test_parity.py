@@ -33,7 +33,6 @@ QUICK = {
         "SwiGLU",
         "Sinkhorn: 3 iterations, epsilon 0.1",
         "loss",
-        "training CriSALAD's adapters and head",
     },
 }
 
