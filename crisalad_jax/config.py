@@ -163,14 +163,15 @@ class SinkhornConfig:
     iterations: int = 3
     """How many; with a tolerance, at most how many."""
     tolerance: float | None = None
-    """Stop where no potential changes more, which is the relative marginal error; float32 may
-    never get below 1e-5."""
+    """Stop where no potential changes more: the relative marginal error that the last step found,
+    and plain steps do not make it larger. float32 may never get below 1e-5."""
     must_converge: bool = False
     """Raise where the tolerance is not met, in place of only saying so in the result."""
     domain: Literal["scaling", "log"] = "scaling"
     """Scaling takes exponentials once; scores too far apart fall back to the log domain."""
     relaxation: float = 1.0
-    """Each half step goes so many times as far; above 1 speeds up slow convergence."""
+    """Each half step goes so many times as far, where the dual does not lose by it; above 1 speeds
+    up slow convergence."""
     anderson: int = 0
     """Anderson acceleration over so many past steps; 0 for none."""
     row_tau: float = 1.0

@@ -151,9 +151,10 @@ def sinkhorn_step(
 ) -> Potentials:
     """Meet the columns' marginals, then the rows': one published iteration (paper Eq. 5).
 
-    `relaxation` of w goes w times as far (Thibault et al., Algorithms 2021). A `tau` below 1
-    relaxes the marginals of a side to a Kullback-Leibler penalty of weight
-    epsilon * tau / (1 - tau) (Chizat et al., Math. Comp. 2018).
+    `relaxation` of w goes w times as far, in every entry where the dual does not lose by it
+    (Thibault et al., Algorithms 2021, with one w for all entries). A `tau` below 1 relaxes the
+    marginals of a side to a Kullback-Leibler penalty of weight epsilon * tau / (1 - tau) (Chizat
+    et al., Math. Comp. 2018).
     """
     column = column_tau * (problem.log_nu - problem.over_rows(potentials.row))
     column = _relaxed(potentials.column, column, relaxation)
@@ -162,7 +163,14 @@ def sinkhorn_step(
 
 
 def _relaxed(old: Array, new: Array, relaxation: float) -> Array:
-    return new if relaxation == 1 else old + relaxation * (new - old)
+    if relaxation == 1:
+        return new
+    change = new - old
+    if relaxation < 1:
+        return old + relaxation * change
+    # What the dual gains by this entry, over exp(new) and a positive factor: never less than 0.
+    gain = relaxation * change - jnp.exp((relaxation - 1) * change) + jnp.exp(-change)
+    return jnp.where(gain >= 0, old + relaxation * change, new)
 
 
 def newton_step(problem: Problem, potentials: Potentials) -> Potentials:
@@ -255,7 +263,7 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
     def advance(at: _Progress) -> _Progress:
         start = at.potentials if at.memory is None else at.memory.start
         moved = step(problem, start)
-        change = _distance(moved, start, config)
+        change = _distance(moved, start, problem.log_nu, config)
         memory = None if at.memory is None else _accelerate(at.memory, moved, at.iterations.max())
         if config.tolerance is None:
             return _Progress(moved, memory, at.iterations + 1, change)
@@ -282,12 +290,15 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
     return jax.lax.scan(lambda at, _: (advance(at), None), at, length=config.iterations)[0]
 
 
-def _distance(new: Potentials, old: Potentials, config: SinkhornConfig) -> Array:
+def _distance(new: Potentials, old: Potentials, log_nu: Array, config: SinkhornConfig) -> Array:
     """Largest change of a potential: of a balanced step, the relative error it mended."""
-    change = Potentials(new.row - old.row, new.column - old.column)
+    row, column = new.row - old.row, new.column - old.column
     if config.balanced:
-        change = _centre(change)
-    return jnp.maximum(jnp.abs(change.row).max(axis=-1), jnp.abs(change.column).max(axis=-1))
+        # A constant that only goes from side to side. By masses: where the rows were met there is
+        # none, to first order, and what is left is the error itself.
+        shift = (jax.nn.softmax(log_nu) * column).sum(axis=-1, keepdims=True)
+        row, column = row + shift, column - shift
+    return jnp.maximum(jnp.abs(row).max(axis=-1), jnp.abs(column).max(axis=-1))
 
 
 def _centre(potentials: Potentials) -> Potentials:
@@ -322,9 +333,11 @@ def _accelerate(memory: _Memory, moved: Potentials, count: Int[Array, ""]) -> _M
 
 
 class _Solution(NamedTuple):
+    """All floats: of a custom rule's whole numbers and flags JAX still asks for derivatives."""
+
     potentials: Potentials
-    iterations: Int[Array, "*batch"]
-    converged: Bool[Array, "*batch"]
+    iterations: Float[Array, "*batch"]
+    converged: Float[Array, "*batch"]
 
 
 class _Scaled(NamedTuple):
@@ -372,7 +385,8 @@ def _finish(problem: Problem, at: _Progress, config: SinkhornConfig) -> _Solutio
         # Left too far by the last step, rows could have more mass than a float can hold.
         row = config.row_tau * (problem.log_mu - problem.over_columns(potentials.column))
         potentials = Potentials(row, potentials.column)
-    return _Solution(potentials, at.iterations, met)
+    dtype = potentials.row.dtype
+    return _Solution(potentials, at.iterations.astype(dtype), met.astype(dtype))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5))
@@ -524,8 +538,8 @@ def _by_optimistix(
         )
         return _Solution(
             found.value,
-            jnp.asarray(found.stats["num_steps"], jnp.int32),
-            found.result == optimistix.RESULTS.successful,
+            jnp.asarray(found.stats["num_steps"], kernel.dtype),
+            (found.result == optimistix.RESULTS.successful).astype(kernel.dtype),
         )
 
     for _ in kernel.shape[:-2]:
@@ -563,12 +577,14 @@ def sinkhorn(
         InputError: shapes that do not fit, a step or solver that the configuration has no use for;
             and where values are known (outside of `jit`): scores that are not finite, masses that
             sum to different totals, an epsilon of 0 or less.
-        RuntimeError: `config.must_converge`, and a tolerance was not met.
+        RuntimeError: `config.must_converge`, and a tolerance was not met. Inside of `jit` it is
+            raised while the compiled program runs, among lines of JAX's own.
     """
     _check(scores, log_mu, log_nu, epsilon, config, step, solver)
     # Not to compile anew for an epsilon that is not read from there.
     config = dataclasses.replace(config, epsilon=1.0)
-    return _sinkhorn(scores, log_mu, log_nu, epsilon, config, step, solver)
+    result = _sinkhorn(scores, log_mu, log_nu, epsilon, config, step, solver)
+    return _converged(result, config) if config.must_converge else result
 
 
 @functools.partial(jax.jit, static_argnames=("config", "step", "solver"))
@@ -610,19 +626,26 @@ def _sinkhorn(
         scaled = _scale(kernel, config)
         solution = _unrolled(kernel, log_mu, log_nu, scaled, step, config)
     potentials = solution.potentials
-    if config.must_converge:
-        import equinox
-
-        potentials = equinox.error_if(
-            potentials,
-            ~solution.converged.all(),
-            f"Sinkhorn: no convergence to {config.tolerance} in {config.iterations} iterations",
-        )
+    iterations = jax.lax.stop_gradient(solution.iterations).astype(jnp.int32)
+    converged = jax.lax.stop_gradient(solution.converged) > 0
     log_plan = _log_plan(kernel, potentials)
     if config.balanced:
         potentials = _centre(potentials)
     errors = marginal_error(log_plan, log_mu, log_nu)
-    return SinkhornResult(log_plan, potentials, *errors, solution.iterations, solution.converged)
+    return SinkhornResult(log_plan, potentials, *errors, iterations, converged)
+
+
+def _converged(result: SinkhornResult, config: SinkhornConfig) -> SinkhornResult:
+    message = f"sinkhorn: no convergence to {config.tolerance} in {config.iterations} iterations"
+    if isinstance(result.converged, Tracer):
+        import equinox
+
+        log_plan = equinox.error_if(result.log_plan, ~result.converged.all(), message)
+        return result._replace(log_plan=log_plan)
+    missed = int((~result.converged).sum())
+    if missed:
+        raise RuntimeError(f"{message} for {missed} of {result.converged.size} problems")
+    return result
 
 
 def _softmax(kernel: Array, log_mu: Array, log_nu: Array, config: SinkhornConfig) -> SinkhornResult:
