@@ -570,7 +570,8 @@ def sinkhorn(
         epsilon: entropic regularisation, above 0.
         config: the variant, static.
         step: in place of the built-in step. Iteration, tolerance, acceleration and diagnostics
-            work as before; its gradient is "unrolled", "optimistix" or "stop".
+            work as before; its gradient is "unrolled", "optimistix" or "stop". Static: another
+            function object is compiled anew.
         solver: an optimistix solver, where `config.gradient` is "optimistix".
 
     Raises:
