@@ -1,9 +1,10 @@
 """Recall by Sinkhorn variant: short trainings of `tiny` on the synthetic city, several seeds.
 
-    python scripts/study_transport.py --out OUT [--data DIR]
+    python scripts/study_transport.py --runs RUNS [--data DIR] [--page docs/sinkhorn.md]
 
 With --data, also on DIR/sped_train (GSV-Cities layout), tested on DIR/sped_val (@UTM layout). Runs
-that OUT already holds are gone on with. Writes OUT/recall.md, OUT/recall.json and OUT/recall.png.
+that RUNS already holds are gone on with. Writes recall.md, recall.json and recall.png to --out, and
+with --page puts the table into that page. A run in the city takes one to two minutes on two cores.
 """
 
 import argparse
@@ -12,7 +13,7 @@ import pathlib
 import statistics
 from typing import Any
 
-import matplotlib.figure
+from fragments import COLOURS, INK, Study, Table, markdown, panels, save, splice
 
 from crisalad_jax.config import SinkhornConfig, TrainConfig, recipe
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
@@ -20,7 +21,6 @@ from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.demo import DemoConfig, demo_recipe
 from crisalad_jax.evaluation import evaluate
-from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.fit import fit, read_metrics
 from crisalad_jax.progress import progress_bar
 
@@ -38,6 +38,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 KS = (1, 5)
 WATCHED = ("column_error", "dustbin_share", "patches_per_cluster")
+DIGITS = {"R@1": 1, "R@5": 1, "column_error": 3, "dustbin_share": 2, "patches_per_cluster": 1}
+
+Runs = list[dict[str, float]]
+"""What each seed's run came to."""
 
 
 def with_transport(config: TrainConfig, fields: dict[str, Any]) -> TrainConfig:
@@ -61,80 +65,68 @@ def spread(values: list[float], digits: int) -> str:
     return f"{mean} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else mean
 
 
-def markdown(results: dict[str, dict[str, list[dict[str, float]]]]) -> str:
-    """One table a benchmark, a row a variant."""
-    text = ""
-    for benchmark, variants in results.items():
-        seeds = max(len(runs) for runs in variants.values())
-        text += (
-            f"{benchmark}, {seeds} seeds, mean and sample deviation:\n\n"
-            "| variant | R@1 | R@5 | mass error | share in the dustbin | patches a cluster |\n"
-            "| --- | ---: | ---: | ---: | ---: | ---: |\n"
-        )
-        for variant, runs in variants.items():
-            cells = [
-                spread([one[name] for one in runs], digits)
-                for name, digits in (("R@1", 1), ("R@5", 1), *zip(WATCHED, (3, 2, 1), strict=True))
-            ]
-            text += f"| {variant} | {' | '.join(cells)} |\n"
-        text += "\n"
-    return text.rstrip() + "\n"
-
-
-def draw(path: pathlib.Path, results: dict[str, dict[str, list[dict[str, float]]]]) -> None:
-    """Every run a dot, the mean a bar."""
-    figure = matplotlib.figure.Figure(figsize=(5 * len(results) + 3, 4.5), layout="constrained")
-    panels = figure.subplots(1, len(results), squeeze=False, sharey=True)[0]
-    for panel, (benchmark, variants) in zip(panels, results.items(), strict=True):
-        for row, runs in enumerate(variants.values()):
+def study_of(results: dict[str, dict[str, Runs]]) -> Study:
+    """A row a variant of each benchmark; every run a dot, the mean a bar."""
+    rows, seeds = [], 0
+    figure, axes = panels(len(results), tuple(results), width=5.5, height=4.2)
+    for axis, (benchmark, variants) in zip(axes, results.items(), strict=True):
+        for height, (variant, runs) in enumerate(variants.items()):
+            seeds = max(seeds, len(runs))
+            cells = (spread([one[name] for one in runs], DIGITS[name]) for name in DIGITS)
+            rows.append((benchmark, variant, *cells))
             values = [one["R@1"] for one in runs]
-            panel.plot(values, [row] * len(values), "o", color="tab:blue", alpha=0.6)
-            panel.plot([statistics.mean(values)] * 2, [row - 0.3, row + 0.3], color="black")
-        panel.set_yticks(range(len(variants)), list(variants))
-        panel.invert_yaxis()
-        panel.grid(axis="x", alpha=0.3)
-        panel.set_xlabel("Recall@1, %")
-        panel.set_title(benchmark)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+            axis.plot(values, [height] * len(values), "o", color=COLOURS[0], alpha=0.6)
+            axis.vlines(statistics.mean(values), height - 0.3, height + 0.3, color=INK)
+        axis.set_yticks(range(len(variants)), list(variants))
+        axis.grid(axis="x", alpha=0.3)
+        axis.set_xlabel("Recall@1, %", fontsize=9)
+    axes[0].invert_yaxis()
+    caption = (
+        f"`tiny` trained from nothing with each transport, {seeds} seeds, mean and sample standard "
+        "deviation: recall of images described one by one, the largest relative error of a "
+        "cluster's mass, the share of all mass in the dustbin, and the effective number of patches "
+        "in a cluster."
+    )
+    header = ("trained and tested on", "variant", "R@1", "R@5", "mass error", "dustbin", "patches")
+    return Study(Table(header, rows, caption, 2), results, figure)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Train and tabulate; see the top.")
-    parser.add_argument("--out", type=pathlib.Path, required=True)
+    parser.add_argument("--runs", type=pathlib.Path, required=True, help="where trainings are kept")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/sinkhorn"))
+    parser.add_argument("--page", type=pathlib.Path)
     parser.add_argument("--data", type=pathlib.Path, help="also train and test on its sped_*")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--epochs", type=int, default=12, help="in the city; 3 times that on sped")
     arguments = parser.parse_args()
     demo = DemoConfig(epochs=arguments.epochs)
     city = SyntheticCityConfig(train_places=demo.train_places, test_places=demo.test_places)
-    write_synthetic_city(arguments.out / "city", city)
-    root = arguments.out / "city"
-    sets = {"the synthetic city": (demo_recipe(demo), root / "train", root / "test")}
+    root = arguments.runs / "city"
+    write_synthetic_city(root, city)
+    sets = {"synthetic city": (demo_recipe(demo), root / "train", root / "test")}
     if arguments.data is not None:
         slow = dataclasses.replace(recipe("tiny"), epochs=3 * arguments.epochs)
-        sets["sped_val"] = (slow, arguments.data / "sped_train", arguments.data / "sped_val")
-    results: dict[str, dict[str, list[dict[str, float]]]] = {}
+        sets["sped"] = (slow, arguments.data / "sped_train", arguments.data / "sped_val")
+    results: dict[str, dict[str, Runs]] = {}
     total = len(sets) * len(VARIANTS) * len(arguments.seeds)
     with progress_bar("trainings", total, "runs", quiet=False) as bar:
         for number, (name, (start, train, test)) in enumerate(sets.items()):
-            places, benchmark = (
-                read_places(train, min_images=start.min_images),
-                open_benchmark(test),
-            )
+            places = read_places(train, min_images=start.min_images)
+            benchmark = open_benchmark(test)
             start = dataclasses.replace(start, validate_every=start.epochs)
             found = results.setdefault(name, {})
             for seed in arguments.seeds:
                 for variant, (label, fields) in enumerate(VARIANTS.items()):
                     config = dataclasses.replace(with_transport(start, fields), seed=seed)
-                    folder = arguments.out / "runs" / f"{number}_{variant}_{seed}"
+                    folder = arguments.runs / "runs" / f"{number}_{variant}_{seed}"
                     found.setdefault(label, []).append(run(config, places, benchmark, folder))
                     bar.advance(1, note=f"{name}, {label}, seed {seed}")
-    with atomic_path(arguments.out / "recall.md") as temporary:
-        temporary.write_text(markdown(results), encoding="utf-8")
-    write_json(arguments.out / "recall.json", results)
-    draw(arguments.out / "recall.png", results)
-    print(markdown(results))
+    study = study_of(results)
+    save("recall", study, arguments.out)
+    if arguments.page is not None:
+        splice(arguments.page, "recall", study.table)
+    print(markdown(study.table))
 
 
 if __name__ == "__main__":

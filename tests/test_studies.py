@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import io
 import itertools
+import json
 import pathlib
 import re
 import sys
@@ -215,7 +216,8 @@ def test_only_the_published_dustbin_is_dead(study: ModuleType) -> None:
 def test_the_page_shows_the_tables_as_written(scripts: Any, study: ModuleType) -> None:
     page = PAGE.read_text(encoding="utf-8")
     shown = re.findall(r"<!-- (\w+) -->\n(.*?)<!-- end of \1 -->", page, re.DOTALL)
-    assert {name for name, _ in shown} == {*study.STUDIES, "bench_fixed", "bench_converged"}
+    others = {"bench_fixed", "bench_converged", "recall"}
+    assert {name for name, _ in shown} == {*study.STUDIES, *others}
     for name, table in shown:
         assert table == (PAGE.parent / "sinkhorn" / f"{name}.md").read_text(encoding="utf-8")
         assert f"(sinkhorn/{name}.png)" in page
@@ -352,3 +354,43 @@ def test_the_benchmark_asks_for_the_loosest_tolerance_that_will_do(
     }
     assert errors[1.0] > 1e-3
     assert errors[met["tolerance"]] == met["error"]
+
+
+@pytest.fixture(scope="module")
+def recalls(scripts: Any) -> ModuleType:
+    return scripts("study_transport")
+
+
+def test_recalls_are_averaged_over_seeds(recalls: ModuleType) -> None:
+    def one(value: float) -> dict[str, float]:
+        return dict.fromkeys(recalls.DIGITS, value)
+
+    results = {"a": {"x": [one(50.0), one(60.0), one(70.0)]}, "b": {"x": [one(1.0), one(2.0)]}}
+    table = recalls.study_of(results).table
+    assert [row[:3] for row in table.rows] == [
+        ("a", "x", "60.0 ± 10.0"),
+        ("b", "x", "1.5 ± 0.7"),  # the root of 2 * 0.5^2
+    ]
+    assert len(table.rows[0]) == len(table.header)
+    assert "3 seeds" in table.caption
+
+
+@pytest.mark.slow
+def test_recall_by_variant_end_to_end(
+    recalls: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
+) -> None:
+    """And a second call finds the trainings done, to the same figures."""
+    kept = ("published, k = 3", "dustbin a token")
+    monkeypatch.setattr(recalls, "VARIANTS", {name: recalls.VARIANTS[name] for name in kept})
+    arguments = ["", "--runs", f"{tmp_path}/runs", "--out", f"{tmp_path}/out", "--seeds", "4"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--epochs", "1"])
+    tables = []
+    for _ in range(2):
+        recalls.main()
+        tables.append((tmp_path / "out" / "recall.md").read_text())
+    assert tables[0] == tables[1]
+    values = json.loads((tmp_path / "out" / "recall.json").read_text())["synthetic city"]
+    assert list(values) == list(kept)
+    assert all(0 < one["R@1"] <= one["R@5"] <= 100 for runs in values.values() for one in runs)
+    assert values[kept[0]][0] != values[kept[1]][0]
+    assert (tmp_path / "out" / "recall.png").stat().st_size > 10_000
