@@ -185,7 +185,7 @@ def test_salad() -> None:
 @pytest.mark.parametrize("case", range(5))
 def test_sinkhorn(case: int) -> None:
     golden = under(golden_of("sinkhorn"), f"{case}.")
-    config = SinkhornConfig(int(golden["num_iters"]), float(golden["reg"]))
+    config = SinkhornConfig(iterations=int(golden["num_iters"]), epsilon=float(golden["reg"]))
     scores, dust_bin = golden["scores"].requires_grad_(), torch.ones((), requires_grad=True)
     log_plan = assign(scores, dust_bin, config)
     # Scores over a regularisation of 0.1 are ten times as large, and so are their roundings.

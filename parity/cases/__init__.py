@@ -47,7 +47,7 @@ def _model(
 
 def _transport(iterations: int, epsilon: float) -> ModelConfig:
     model = _model()
-    sinkhorn = SinkhornConfig(iterations, epsilon)
+    sinkhorn = SinkhornConfig(iterations=iterations, epsilon=epsilon)
     return dataclasses.replace(model, salad=dataclasses.replace(model.salad, sinkhorn=sinkhorn))
 
 
