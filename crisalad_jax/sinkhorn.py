@@ -53,7 +53,8 @@ class SinkhornResult(NamedTuple):
     """The same for columns. Rows are updated last, so this is the error that iterations lower."""
     iterations: Int[Array, "*batch"]
     converged: Bool[Array, "*batch"]
-    """Whether the tolerance was met. Without one: whether the potentials are finite."""
+    """Whether the tolerance was met, and of balanced transport both errors are within it. Without a
+    tolerance: whether the potentials are finite."""
 
 
 @params
@@ -157,20 +158,25 @@ def sinkhorn_step(
     et al., Math. Comp. 2018).
     """
     column = column_tau * (problem.log_nu - problem.over_rows(potentials.row))
-    column = _relaxed(potentials.column, column, relaxation)
+    column = _further(potentials.column, column, relaxation, column_tau)
     row = row_tau * (problem.log_mu - problem.over_columns(column))
-    return Potentials(_relaxed(potentials.row, row, relaxation), column)
+    return Potentials(_further(potentials.row, row, relaxation, row_tau), column)
 
 
-def _relaxed(old: Array, new: Array, relaxation: float) -> Array:
+def _further(old: Array, new: Array, relaxation: float, tau: float) -> Array:
     if relaxation == 1:
         return new
     change = new - old
-    if relaxation < 1:
-        return old + relaxation * change
-    # What the dual gains by this entry, over exp(new) and a positive factor: never less than 0.
-    gain = relaxation * change - jnp.exp((relaxation - 1) * change) + jnp.exp(-change)
-    return jnp.where(gain >= 0, old + relaxation * change, new)
+    beyond = (relaxation - 1) * change
+    # What the dual gains by this entry, over its mass at `new`.
+    gain = jnp.exp(-change) - jnp.exp(beyond)
+    if tau == 1:
+        gain += relaxation * change
+    else:
+        penalty = tau / (1 - tau)
+        gain += penalty * (jnp.exp(change / penalty) - jnp.exp(-beyond / penalty))
+    # Infinity less infinity is no gain either.
+    return jnp.where(gain >= 0, new + beyond, new)
 
 
 def newton_step(problem: Problem, potentials: Potentials) -> Potentials:
@@ -178,7 +184,7 @@ def newton_step(problem: Problem, potentials: Potentials) -> Potentials:
 
     With the rows' marginals always met (Brauer et al., 2017), the Hessian is a weighted graph
     Laplacian between columns. Of full and shortened steps, and of Sinkhorn's own, the one that
-    leaves the smallest marginal error is taken, so that the error never grows.
+    leaves the smallest relative marginal error is taken, so that the error never grows.
     """
     column = potentials.column
     row = problem.log_mu - problem.over_columns(column)
@@ -192,13 +198,17 @@ def newton_step(problem: Problem, potentials: Potentials) -> Potentials:
     tries = jnp.concatenate([tries, (problem.log_nu - over_rows)[None]])
 
     def left(one: Array) -> Array:
-        masses = problem.over_rows(problem.log_mu - problem.over_columns(one)) + one
-        return jnp.abs(jnp.exp(masses) - jnp.exp(problem.log_nu)).sum(axis=-1)
+        return _column_error(problem, problem.log_mu - problem.over_columns(one), one)
 
     errors = jax.lax.map(left, tries)
     best = jnp.argmin(jnp.where(jnp.isnan(errors), jnp.inf, errors), axis=0)
     column = jnp.take_along_axis(tries, best[None, ..., None], axis=0)[0]
     return Potentials(problem.log_mu - problem.over_columns(column), column)
+
+
+def _column_error(problem: Problem, row: Array, column: Array) -> Float[Array, "*batch"]:
+    """Largest difference of the logarithms of a column's mass and of its marginal."""
+    return jnp.abs(problem.over_rows(row) + column - problem.log_nu).max(axis=-1)
 
 
 def _solve_columns(
@@ -251,20 +261,19 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
 
     A problem that has converged stays as it is: what comes out owes nothing to its batch.
     """
-    zeros = Potentials(jnp.zeros_like(problem.log_mu), jnp.zeros_like(problem.log_nu))
-    batch, dtype = problem.kernel.shape[:-2], problem.kernel.dtype
+    zeros = _zeros(problem.kernel)
     memory = None
     if config.anderson:
-        size = problem.kernel.shape[-2] + problem.kernel.shape[-1]
-        empty = jnp.zeros((*batch, config.anderson, size), dtype)
+        empty = jnp.concatenate(zeros, axis=-1)[..., None, :].repeat(config.anderson, axis=-2)
         memory = _Memory(zeros, empty, empty)
-    at = _Progress(zeros, memory, jnp.zeros(batch, jnp.int32), jnp.full(batch, jnp.inf, dtype))
+    none = zeros.row[..., 0]
+    at = _Progress(zeros, memory, none.astype(jnp.int32), none + jnp.inf)
 
     def advance(at: _Progress) -> _Progress:
         start = at.potentials if at.memory is None else at.memory.start
         moved = step(problem, start)
-        change = _distance(moved, start, problem.log_nu, config)
-        memory = None if at.memory is None else _accelerate(at.memory, moved, at.iterations.max())
+        change = _distance(problem, moved, start, config)
+        memory = None if at.memory is None else _accelerate(at.memory, moved, at.iterations.max(initial=0))
         if config.tolerance is None:
             return _Progress(moved, memory, at.iterations + 1, change)
         active = at.change > config.tolerance
@@ -290,13 +299,26 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
     return jax.lax.scan(lambda at, _: (advance(at), None), at, length=config.iterations)[0]
 
 
-def _distance(new: Potentials, old: Potentials, log_nu: Array, config: SinkhornConfig) -> Array:
-    """Largest change of a potential: of a balanced step, the relative error it mended."""
+def _zeros(kernel: Array) -> Potentials:
+    """To start from; made of the kernel, so that under `shard_map` they vary as it does."""
+    fixed = jax.lax.stop_gradient(kernel)
+    return Potentials(0 * fixed[..., :, 0], 0 * fixed[..., 0, :])
+
+
+def _distance(
+    problem: Problem, new: Potentials, old: Potentials, config: SinkhornConfig
+) -> Float[Array, "*batch"]:
+    """Largest change of a potential: of a balanced step, the relative error that it mended.
+
+    A step of Newton's may be small far from the solution: there it is the error that is left.
+    """
+    if config.method == "newton":
+        return _column_error(problem, *new)
     row, column = new.row - old.row, new.column - old.column
     if config.balanced:
         # A constant that only goes from side to side. By masses: where the rows were met there is
         # none, to first order, and what is left is the error itself.
-        shift = (jax.nn.softmax(log_nu) * column).sum(axis=-1, keepdims=True)
+        shift = (jax.nn.softmax(problem.log_nu) * column).sum(axis=-1, keepdims=True)
         row, column = row + shift, column - shift
     return jnp.maximum(jnp.abs(row).max(axis=-1), jnp.abs(column).max(axis=-1))
 
@@ -354,7 +376,7 @@ def _scale(kernel: Array, config: SinkhornConfig) -> _Scaled | None:
     row_max = jax.lax.stop_gradient(kernel.max(axis=-1))
     # With a floor under it, all that is computed of it is finite, needed or not.
     gibbs = jnp.maximum(jnp.exp(kernel - row_max[..., None]), GIBBS_FLOOR)
-    return _Scaled(gibbs.min() > GIBBS_FLOOR, row_max, gibbs)
+    return _Scaled(gibbs.min(initial=1) > GIBBS_FLOOR, row_max, gibbs)
 
 
 def _solve(
@@ -490,7 +512,10 @@ def _implicit_backward(
     """Solve the transposed linearised conditions (see docs/sinkhorn.md, "Implicit gradient")."""
     kernel, potentials = kept
     log_plan = _log_plan(kernel, potentials)
-    plan = jnp.exp(log_plan)
+    # All masses over the largest, which changes nothing of what comes out: relaxed ones may be more
+    # than a float can hold.
+    top = jax.lax.stop_gradient(log_plan.max(axis=(-2, -1), keepdims=True))
+    plan = jnp.exp(log_plan - top)
     shares = jax.nn.softmax(log_plan, axis=-1)
     product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
     row, column = towards.potentials
@@ -526,7 +551,7 @@ def _by_optimistix(
             # Centred, for a fixed point that is unique.
             return _centre(moved) if config.balanced else moved
 
-        start = Potentials(jnp.zeros_like(log_mu), jnp.zeros_like(log_nu))
+        start = _zeros(kernel)
         found = optimistix.fixed_point(
             again,
             solver,
@@ -571,15 +596,18 @@ def sinkhorn(
         config: the variant, static.
         step: in place of the built-in step. Iteration, tolerance, acceleration and diagnostics
             work as before; its gradient is "unrolled", "optimistix" or "stop". Static: another
-            function object is compiled anew.
+            function object is compiled anew. Values that are to be differentiated may be closed
+            over with "optimistix" alone. One that does not meet the marginals needs a `row_tau` or
+            `column_tau` below 1, to say so.
         solver: an optimistix solver, where `config.gradient` is "optimistix".
 
     Raises:
         InputError: shapes that do not fit, a step or solver that the configuration has no use for;
-            and where values are known (outside of `jit`): scores that are not finite, masses that
+            and where values are known (outside of `jit` and `grad`): scores that are not finite, masses that
             sum to different totals, an epsilon of 0 or less.
         RuntimeError: `config.must_converge`, and a tolerance was not met. Inside of `jit` it is
-            raised while the compiled program runs, among lines of JAX's own.
+            raised while the compiled program runs, among lines of JAX's own, and only if it uses
+            a value of the result.
     """
     _check(scores, log_mu, log_nu, epsilon, config, step, solver)
     # Not to compile anew for an epsilon that is not read from there.
@@ -633,6 +661,10 @@ def _sinkhorn(
     if config.balanced:
         potentials = _centre(potentials)
     errors = marginal_error(log_plan, log_mu, log_nu)
+    if config.balanced and config.tolerance is not None:
+        # The tolerance is one of logarithms, whose last places are a few epsilon.
+        most = math.expm1(config.tolerance) + 16 * jnp.finfo(wide).eps
+        converged &= jnp.maximum(*errors) <= most
     return SinkhornResult(log_plan, potentials, *errors, iterations, converged)
 
 
@@ -641,8 +673,7 @@ def _converged(result: SinkhornResult, config: SinkhornConfig) -> SinkhornResult
     if isinstance(result.converged, Tracer):
         import equinox
 
-        log_plan = equinox.error_if(result.log_plan, ~result.converged.all(), message)
-        return result._replace(log_plan=log_plan)
+        return equinox.error_if(result, ~result.converged.all(), message)
     missed = int((~result.converged).sum())
     if missed:
         raise RuntimeError(f"{message} for {missed} of {result.converged.size} problems")
