@@ -6,6 +6,7 @@ a comment says otherwise.
 """
 
 import dataclasses
+import math
 import re
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
@@ -36,7 +37,10 @@ def _require(condition: bool, message: str) -> None:
 def _require_positive(config: object, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
-        _require(value > 0, f"{type(config).__name__}.{name}: found {value}, expected more than 0")
+        _require(
+            0 < value < math.inf,
+            f"{type(config).__name__}.{name}: found {value}, expected more than 0, and finite",
+        )
 
 
 def _require_choice(config: object, *names: str) -> None:
@@ -156,8 +160,8 @@ class SinkhornConfig:
     """Alternating projections; Newton on the semi-dual; or baselines that transport nothing."""
     dustbin: Literal["none", "column", "row and column", "token", "mass"] = "column"
     """What takes the patches that belong nowhere: nothing; a column of one learnt score (as
-    published, which changes nothing); the same beside a row of it (SuperGlue); a score that the
-    network gives each patch; or a column of learnt mass."""
+    published, which changes nothing in plain iterations); the same beside a row of it (SuperGlue);
+    a score that the network gives each patch; or a column of learnt mass."""
     epsilon: float = 1.0
     """Entropic regularisation: scores are divided by it."""
     iterations: int = 3
@@ -170,13 +174,14 @@ class SinkhornConfig:
     domain: Literal["scaling", "log"] = "scaling"
     """Scaling takes exponentials once; scores too far apart fall back to the log domain."""
     relaxation: float = 1.0
-    """Each half step goes so many times as far, where the dual does not lose by it; above 1 speeds
-    up slow convergence."""
+    """Each half step goes so many times as far, 1 to 2, where the dual does not lose by it: faster
+    where convergence is slow."""
     anderson: int = 0
     """Anderson acceleration over so many past steps; 0 for none."""
     row_tau: float = 1.0
     """Below 1, rows' masses are not fixed but drawn to their marginals by a Kullback-Leibler
-    penalty of epsilon * tau / (1 - tau)."""
+    penalty of epsilon * tau / (1 - tau). With both sides free, high scores make masses that only
+    their logarithms can hold."""
     column_tau: float = 1.0
     """The same for columns."""
     gradient: Literal["unrolled", "implicit", "optimistix", "stop"] = "unrolled"
@@ -196,8 +201,8 @@ class SinkhornConfig:
                 f"SinkhornConfig.{name}: found {value}, expected more than 0 and at most 1",
             )
         _require(
-            0 < self.relaxation < 2,
-            f"SinkhornConfig.relaxation: found {self.relaxation}, expected between 0 and 2",
+            1 <= self.relaxation < 2,
+            f"SinkhornConfig.relaxation: found {self.relaxation}, expected from 1 to less than 2",
         )
         _require(
             self.anderson == 0 or self.anderson >= 2,
@@ -231,9 +236,10 @@ class SinkhornConfig:
             )
         if self.method in ("softmax", "dual-softmax"):
             _require(
-                self.balanced and plain and self.tolerance is None,
-                f"SinkhornConfig.method: found {self.method!r} with a tolerance, relaxation, "
-                "acceleration or relaxed marginals, expected none: it does not iterate",
+                self.balanced and plain and self.gradient == "unrolled",
+                f"SinkhornConfig.method: found {self.method!r} with relaxation, acceleration, "
+                f"relaxed marginals or gradient {self.gradient!r}, expected none of these and "
+                "gradient 'unrolled': it does not iterate",
             )
         _require(
             self.gradient != "optimistix" or not self.anderson,

@@ -273,7 +273,11 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
         start = at.potentials if at.memory is None else at.memory.start
         moved = step(problem, start)
         change = _distance(problem, moved, start, config)
-        memory = None if at.memory is None else _accelerate(at.memory, moved, at.iterations.max(initial=0))
+        memory = (
+            None
+            if at.memory is None
+            else _accelerate(at.memory, moved, at.iterations.max(initial=0))
+        )
         if config.tolerance is None:
             return _Progress(moved, memory, at.iterations + 1, change)
         active = at.change > config.tolerance
@@ -300,7 +304,7 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
 
 
 def _zeros(kernel: Array) -> Potentials:
-    """To start from; made of the kernel, so that under `shard_map` they vary as it does."""
+    """Made of the kernel, so that under `shard_map` they vary as it does."""
     fixed = jax.lax.stop_gradient(kernel)
     return Potentials(0 * fixed[..., :, 0], 0 * fixed[..., 0, :])
 
@@ -602,40 +606,47 @@ def sinkhorn(
         solver: an optimistix solver, where `config.gradient` is "optimistix".
 
     Raises:
-        InputError: shapes that do not fit, a step or solver that the configuration has no use for;
-            and where values are known (outside of `jit` and `grad`): scores that are not finite, masses that
-            sum to different totals, an epsilon of 0 or less.
+        InputError: shapes that do not fit, numbers that are not real, a step or solver that the
+            configuration has no use for, a step that returns anything but such potentials;
+            and where values are known (outside of `jit` and `grad`): scores that are not finite,
+            masses that sum to different totals, an epsilon of 0 or less or too small.
         RuntimeError: `config.must_converge`, and a tolerance was not met. Inside of `jit` it is
             raised while the compiled program runs, among lines of JAX's own, and only if it uses
             a value of the result.
     """
+    scores, log_mu, log_nu = jnp.asarray(scores), jnp.asarray(log_mu), jnp.asarray(log_nu)
     _check(scores, log_mu, log_nu, epsilon, config, step, solver)
     # Not to compile anew for an epsilon that is not read from there.
     config = dataclasses.replace(config, epsilon=1.0)
-    result = _sinkhorn(scores, log_mu, log_nu, epsilon, config, step, solver)
+    if solver is None:
+        result = _compiled(scores, log_mu, log_nu, epsilon, config, step)
+    else:
+        # A solver need not be hashable.
+        result = _solved(scores, log_mu, log_nu, epsilon, config, step, solver)
     return _converged(result, config) if config.must_converge else result
 
 
-@functools.partial(jax.jit, static_argnames=("config", "step", "solver"))
-def _sinkhorn(
+def _solved(
     scores: Array,
     log_mu: Array,
     log_nu: Array,
     epsilon: float | Array,
     config: SinkhornConfig,
     step: Step | None,
-    solver: Any,
+    solver: Any = None,
 ) -> SinkhornResult:
-    wide = jnp.promote_types(scores.dtype, jnp.float32)
+    wide = _wide(scores)
     kernel = scores.astype(wide) / jnp.asarray(epsilon, wide)
-    batch = kernel.shape[:-2]
-    log_mu = jnp.broadcast_to(log_mu.astype(wide), (*batch, kernel.shape[-2]))
-    log_nu = jnp.broadcast_to(log_nu.astype(wide), (*batch, kernel.shape[-1]))
+    # Broadcast so, they vary over devices as the kernel does.
+    zeros = _zeros(kernel)
+    log_mu, log_nu = log_mu.astype(wide) + zeros.row, log_nu.astype(wide) + zeros.column
     if config.method in ("softmax", "dual-softmax"):
         return _softmax(kernel, log_mu, log_nu, config)
-    if step is None and config.method == "newton":
+    if step is not None:
+        _check_step(step, Problem(kernel, log_mu, log_nu))
+    elif config.method == "newton":
         step = newton_step
-    elif step is None:
+    else:
         step = functools.partial(
             sinkhorn_step,
             relaxation=config.relaxation,
@@ -666,6 +677,9 @@ def _sinkhorn(
         most = math.expm1(config.tolerance) + 16 * jnp.finfo(wide).eps
         converged &= jnp.maximum(*errors) <= most
     return SinkhornResult(log_plan, potentials, *errors, iterations, converged)
+
+
+_compiled = jax.jit(_solved, static_argnames=("config", "step"))
 
 
 def _converged(result: SinkhornResult, config: SinkhornConfig) -> SinkhornResult:
@@ -712,10 +726,16 @@ def marginal_error(
 
 def append_dustbin(
     scores: Float[Array, "*batch rows clusters"],
-    dustbin: Float[Array, ""] | Float[Array, "*batch rows"],
+    dustbin: float | Float[Array, ""] | Float[Array, "*batch rows"],
 ) -> Float[Array, "*batch rows clusters+1"]:
-    """Append a column of the dustbin's score, one for all rows (paper Eq. 4) or one a row."""
-    column = dustbin.astype(scores.dtype)
+    """Append a column of the dustbin's score, one for all rows (paper Eq. 4) or one a row.
+
+    Raises:
+        InputError: neither a number nor as many as there are rows.
+    """
+    column = jnp.asarray(dustbin).astype(scores.dtype)
+    if column.shape not in ((), scores.shape[:-1]):
+        raise InputError(f"dustbin: found shape {column.shape}, expected () or {scores.shape[:-1]}")
     column = jnp.broadcast_to(column[..., None] if column.ndim else column, (*scores.shape[:-1], 1))
     return jnp.concatenate([scores, column], axis=-1)
 
@@ -740,7 +760,7 @@ def log_marginals(
 
 def assign(
     scores: Float[Array, "*batch patches clusters"],
-    dustbin: Float[Array, ""] | Float[Array, "*batch patches"] | None,
+    dustbin: float | Float[Array, ""] | Float[Array, "*batch patches"] | None,
     config: SinkhornConfig = SinkhornConfig(),
 ) -> SinkhornResult:
     """Assignment of patches to clusters as `config.dustbin` says, a dustbin in the last column.
@@ -754,19 +774,21 @@ def assign(
 
     Raises:
         InputError: no more patches than clusters, where the dustbin's mass is their difference;
-            scores without two axes; or a dustbin of another shape than the variant's.
+            scores without two axes, or of none; or a dustbin of another shape than the variant's.
     """
     kind = config.dustbin
-    if scores.ndim < 2:
+    if scores.ndim < 2 or 0 in scores.shape[-2:]:
         raise InputError(
             f"assign: found scores of shape {scores.shape}, expected (..., patches, clusters)"
         )
     rows, clusters = scores.shape[-2:]
+    if dustbin is not None:
+        dustbin = jnp.asarray(dustbin)
     wanted = {"none": None, "token": scores.shape[:-1]}.get(kind, ())
     found = None if dustbin is None else dustbin.shape
     if found != wanted:
         raise InputError(f"dustbin: found shape {found}, expected {wanted} for {kind!r}")
-    scores = scores.astype(jnp.promote_types(scores.dtype, jnp.float32))
+    scores = scores.astype(_wide(scores))
     log_mu = jnp.zeros(rows, scores.dtype)
     if dustbin is None:
         log_nu = jnp.full(clusters, math.log(rows / clusters), scores.dtype)
@@ -800,9 +822,8 @@ def _check(
 ) -> None:
     marginals = (("log_mu", log_mu, -2, "rows"), ("log_nu", log_nu, -1, "columns"))
     for name, marginal, axis, side in marginals:
-        if scores.ndim < 2 or not _spreads(
-            marginal.shape, (*scores.shape[:-2], scores.shape[axis])
-        ):
+        target = (*scores.shape[:-2], *scores.shape[axis:][:1])
+        if scores.ndim < 2 or 0 in scores.shape[-2:] or not _spreads(marginal.shape, target):
             raise InputError(
                 f"sinkhorn: found scores of shape {scores.shape} and {name} of {marginal.shape}, "
                 f"expected (..., rows, columns) and (..., {side})"
@@ -826,10 +847,13 @@ def _check(
             f"sinkhorn: found a step beside relaxation {config.relaxation}, expected 1: it is the "
             "built-in step that relaxation belongs to"
         )
-    known = {"scores": scores, "log_mu": log_mu, "log_nu": log_nu}
+    arrays = {"scores": scores, "log_mu": log_mu, "log_nu": log_nu}
+    for name, value in arrays.items():
+        if jnp.iscomplexobj(value):
+            raise InputError(f"sinkhorn: {name} found of {value.dtype}, expected real numbers")
     known = {
         name: np.asarray(value, np.float64)
-        for name, value in known.items()
+        for name, value in arrays.items()
         if not isinstance(value, Tracer)
     }
     for name, value in known.items():
@@ -837,8 +861,15 @@ def _check(
             raise InputError(
                 f"sinkhorn: {name} found with NaN or infinity, expected finite numbers"
             )
-    if not isinstance(epsilon, Tracer) and not float(epsilon) > 0:
-        raise InputError(f"sinkhorn: epsilon found {epsilon}, expected more than 0")
+    if not isinstance(epsilon, Tracer):
+        if not float(epsilon) > 0:
+            raise InputError(f"sinkhorn: epsilon found {epsilon}, expected more than 0")
+        largest = np.abs(known.get("scores", np.zeros(()))).max(initial=0) / float(epsilon)
+        if largest > jnp.finfo(_wide(scores)).max:
+            raise InputError(
+                f"sinkhorn: epsilon found {epsilon}, with which scores over it are up to "
+                f"{largest:.1e}, expected numbers that {_wide(scores)} can hold"
+            )
     if config.balanced and {"log_mu", "log_nu"} <= known.keys():
         totals = [np.exp(known[name]).sum(axis=-1) for name in ("log_mu", "log_nu")]
         # Sums of float32 logarithms.
@@ -850,6 +881,19 @@ def _check(
                 f"sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to {found}, "
                 "expected the same"
             )
+
+
+def _check_step(step: Step, problem: Problem) -> None:
+    expected = jax.eval_shape(_zeros, problem.kernel)
+    found = jax.eval_shape(step, problem, expected)
+    kinds = [[(x.shape, x.dtype) for x in jax.tree.leaves(one)] for one in (found, expected)]
+    if not isinstance(found, Potentials) or kinds[0] != kinds[1]:
+        raise InputError(f"sinkhorn: step found to return {found}, expected {expected}")
+
+
+def _wide(scores: Array) -> jnp.dtype:
+    """What is computed in: float32, or the scores' own precision above it."""
+    return jnp.promote_types(scores.dtype, jnp.float32)
 
 
 def _spreads(shape: tuple[int, ...], target: tuple[int, ...]) -> bool:
