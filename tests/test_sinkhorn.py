@@ -335,6 +335,43 @@ def test_any_leading_axes_jit_and_vmap_agree(config: SinkhornConfig) -> None:
         np.testing.assert_allclose(ours[0], theirs[0], atol=1e-5)
 
 
+def test_newton_meets_sharp_scores_in_float32() -> None:
+    """Where the first full step throws a column out of a float's reach."""
+    config = implicit(method="newton", tolerance=1e-3, iterations=400)
+    for scale in (10.0, 100.0):
+        result = assign(scores_of(0, 4, 30, 6, scale=scale), jnp.float32(0), config)
+        assert result.converged.all()
+        masses = plan_of(result).sum(axis=1)
+        # The tolerance, and rounding of logarithms of 500.
+        np.testing.assert_allclose(masses, [[1] * 6 + [24]] * 4, rtol=1.1e-3)
+
+
+def test_what_misses_a_marginal_has_not_converged() -> None:
+    """Totals that differ, where they are not known: rows are met, columns cannot be."""
+
+    def of(log_nu: jax.Array) -> SinkhornResult:
+        return sinkhorn(scores_of(0, 6, 3), MU, log_nu, config=implicit())
+
+    assert jax.jit(of)(NU).converged
+    result = jax.jit(of)(NU + 1)
+    assert result.column_error > 0.5
+    assert not result.converged
+
+
+def test_relaxed_masses_too_large_for_a_float_still_have_gradients() -> None:
+    """Of the logarithm of the plan."""
+    config = implicit(row_tau=0.9, column_tau=0.8, iterations=1000)
+    scores = scores_of(0, 12, 4, scale=1e3)
+
+    def of(scores: jax.Array) -> jax.Array:
+        return jnp.tanh(0.01 * assign(scores, 0.0, config).log_plan).sum()
+
+    assert jnp.isinf(jnp.exp(assign(scores, 0.0, config).log_plan)).any()
+    gradient = jax.grad(of)(scores)
+    assert jnp.isfinite(gradient).all()
+    assert jnp.abs(gradient).max() > 1e-3
+
+
 @pytest.mark.parametrize("gradient", ["unrolled", "implicit", "optimistix", "stop"])
 def test_counts_and_flags_may_be_used_while_differentiating(gradient: Any) -> None:
     config = SinkhornConfig() if gradient == "unrolled" else implicit(gradient=gradient)
@@ -348,6 +385,18 @@ def test_counts_and_flags_may_be_used_while_differentiating(gradient: Any) -> No
 
     used, plain = (jax.jit(jax.grad(of), static_argnums=1)(scores, use) for use in (True, False))
     np.testing.assert_allclose(used, plain, rtol=1e-5)  # a product and a quotient, rounded
+
+
+@pytest.mark.parametrize(
+    "config",
+    [SinkhornConfig(), implicit(anderson=3), implicit(method="newton")],
+    ids=["3", "anderson", "newton"],
+)
+def test_no_problems_at_all(config: SinkhornConfig) -> None:
+    def of(scores: jax.Array) -> jax.Array:
+        return assign(scores, jnp.float32(1), config).log_plan.sum()
+
+    assert jax.grad(of)(jnp.zeros((0, 6, 3))).shape == (0, 6, 3)
 
 
 def test_half_precision_is_widened() -> None:
@@ -398,6 +447,10 @@ for fields in ({}, {"gradient": "implicit", "tolerance": 1e-5, "iterations": 300
         result = assign(scores, jnp.float32(1), SinkhornConfig(**fields))
         return (weights * jnp.exp(result.log_plan)).sum(), result
 
+    mapped = jax.shard_map(
+        lambda x: of(x)[1].log_plan, mesh=over.mesh, in_specs=over.spec, out_specs=over.spec
+    )
+    np.testing.assert_allclose(jax.jit(mapped)(spread), of(scores)[1].log_plan, atol=1e-5)
     step = jax.jit(jax.grad(of, has_aux=True))
     for x in (1, 100):  # in range of the scaling domain, and out of it
         gradient, result = step(x * spread)
@@ -750,6 +803,30 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         ),
         "a solver beside gradient 'unrolled', expected 'optimistix'",
     ),
+    "no clusters": (
+        lambda: assign(jnp.zeros((6, 0)), 1.0),
+        r"assign: found scores of shape \(6, 0",
+    ),
+    "no columns": (
+        lambda: sinkhorn(jnp.zeros((6, 0)), MU, MU[:0]),
+        r"of shape \(6, 0\) and log_mu",
+    ),
+    "complex": (
+        lambda: sinkhorn(jnp.zeros((6, 3), complex), MU, NU),
+        "scores found of complex64, expected real numbers",
+    ),
+    "a step's tuple": (
+        lambda: sinkhorn(jnp.zeros((6, 3)), MU, NU, step=lambda _, at: tuple(at)),
+        "step found to return",
+    ),
+    "a step's shapes": (
+        lambda: sinkhorn(jnp.zeros((6, 3)), MU, NU, step=lambda _, at: at._replace(row=at.row[:2])),
+        r"step found to return Potentials\(row=.*shape=\(2,\)",
+    ),
+    "appended": (
+        lambda: append_dustbin(jnp.zeros((6, 3)), jnp.ones(5)),
+        r"dustbin: found shape \(5,\), expected \(\) or \(6,\)",
+    ),
     "assign": (lambda: assign(jnp.zeros(6), jnp.float32(1)), r"assign: found scores of shape \(6,"),
     "no mass": (lambda: assign(jnp.zeros((6, 6)), jnp.float32(1)), "6 patches for 6 clusters"),
     "less mass": (lambda: assign(jnp.zeros((4, 6)), jnp.float32(1)), "4 patches for 6 clusters"),
@@ -793,6 +870,7 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
         (0.0, MU, NU, 0.0, "epsilon found 0.0, expected more than 0"),
         (0.0, MU, NU, -1.0, "epsilon found -1.0, expected more than 0"),
         (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected more than 0"),
+        (1.0, MU, NU, 1e-40, r"up to 1\.0e\+40, expected numbers that float32 can hold"),
         (0.0, MU, NU + 1e-3, 1.0, "found to sum to 6 and 6.006, expected the same"),
         (0.0, jnp.stack([MU, MU - 1]), NU, 1.0, "found to sum to 2.20728 and 6, expected the same"),
     ],
@@ -825,11 +903,12 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
         ({"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         ({"epsilon": 0.0}, "SinkhornConfig.epsilon: found 0.0"),
         ({"epsilon": float("nan")}, "SinkhornConfig.epsilon: found nan"),
+        ({"epsilon": float("inf")}, "SinkhornConfig.epsilon: found inf"),
         ({"tolerance": 0.0, "gradient": "stop"}, "SinkhornConfig.tolerance: found 0.0"),
         ({"row_tau": 0.0}, "SinkhornConfig.row_tau: found 0.0"),
         ({"column_tau": 1.1}, "SinkhornConfig.column_tau: found 1.1"),
         ({"relaxation": 2.0}, "SinkhornConfig.relaxation: found 2.0"),
-        ({"relaxation": 0.0}, "SinkhornConfig.relaxation: found 0.0"),
+        ({"relaxation": 0.9}, "SinkhornConfig.relaxation: found 0.9"),
         ({"anderson": 1}, "SinkhornConfig.anderson: found 1"),
         ({"anderson": -2}, "SinkhornConfig.anderson: found -2"),
         ({"gradient": "implicit"}, "found 'implicit' with a fixed number of iterations"),
@@ -849,10 +928,10 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
             {"method": "newton", "gradient": "optimistix", "tolerance": 1e-3},
             "gradient 'optimistix', expected none of these",
         ),
-        ({"method": "softmax", "anderson": 3}, "method: found 'softmax' with a tolerance"),
+        ({"method": "softmax", "anderson": 3}, "method: found 'softmax' with relaxation"),
         (
             {"method": "dual-softmax", "gradient": "stop", "tolerance": 1e-3},
-            "method: found 'dual-softmax' with a tolerance",
+            "found 'dual-softmax' with .* or gradient 'stop', expected none of these",
         ),
         (
             {"gradient": "optimistix", "tolerance": 1e-3, "anderson": 3},
