@@ -2,10 +2,10 @@
 
     python scripts/study_transport.py --runs RUNS [--data DIR] [--page docs/sinkhorn.md]
 
-With --data, some of the variants also on photographs: trained on DIR/sped_train (GSV-Cities layout),
-tested on DIR/sped_val (@UTM layout). Runs that RUNS already holds are gone on with. Writes recall.md,
-recall.json and recall.png to --out, and with --page puts the table into that page. A run takes one
-to two minutes on two cores.
+With --data, some of the variants also on photographs: trained on DIR/sped_train (GSV-Cities
+layout), tested on DIR/sped_val (@UTM layout). Runs that RUNS already holds are gone on with. Writes
+recall.md, recall.json and recall.png to --out, and with --page puts the table into that page. A run
+takes one to two minutes on two cores.
 """
 
 import argparse
@@ -70,7 +70,7 @@ def spread(values: list[float], digits: int) -> str:
 def study_of(results: dict[str, dict[str, Runs]]) -> Study:
     """A row a variant of each benchmark; every run a dot, the mean a bar."""
     rows, seeds = [], 0
-    figure, axes = panels(len(results), tuple(results), width=5.5, height=4.2)
+    figure, axes = panels(len(results), tuple(results), width=5.5, height=4.2, sharey=False)
     for axis, (benchmark, variants) in zip(axes, results.items(), strict=True):
         for height, (variant, runs) in enumerate(variants.items()):
             seeds = max(seeds, len(runs))
@@ -80,9 +80,9 @@ def study_of(results: dict[str, dict[str, Runs]]) -> Study:
             axis.plot(values, [height] * len(values), "o", color=COLOURS[0], alpha=0.6)
             axis.vlines(statistics.mean(values), height - 0.3, height + 0.3, color=INK)
         axis.set_yticks(range(len(variants)), list(variants))
+        axis.invert_yaxis()
         axis.grid(axis="x", alpha=0.3)
         axis.set_xlabel("Recall@1, %", fontsize=9)
-    axes[0].invert_yaxis()
     caption = (
         f"`tiny` trained from nothing with each transport, {seeds} seeds, mean and sample standard "
         "deviation: recall of images described one by one, the largest relative error of a "
