@@ -6,4 +6,5 @@ source scripts/environment.sh "[dev]"
 ruff check .
 ruff format --check .
 pyright
-exec python -m pytest -m "not slow" "$@"
+# Two workers: much of the time is compiling, which one core does.
+exec python -m pytest -n 2 --dist loadfile -m "not slow" "$@"
