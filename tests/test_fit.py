@@ -6,6 +6,7 @@ import pathlib
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -19,11 +20,12 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GroupingResult, evaluate
 from crisalad_jax.fit import FitResult, MetricsLog, claim_run, fit, read_metrics
 from crisalad_jax.model import Crisalad, watch_transport
+from crisalad_jax.nn.salad import TransportStatistics
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.retrieval import Neighbours
 from crisalad_jax.serial import read_config
 from crisalad_jax.training import Metrics, train_step
-from tests.conftest import RECIPE, STEPS
+from tests.conftest import RECIPE, STEPS, random_params
 
 ENDLESS = dataclasses.replace(RECIPE, patience=None)
 
@@ -217,6 +219,41 @@ def test_validations_come_every_so_many_epochs_and_at_the_end(
     fit(config, places, tmp_path, validation=benchmark, initial=params, quiet=True)
     assert [line["epoch"] for line in metrics_of(tmp_path) if "R@5" in line] == [2, 3]
     assert len(seen) == 2
+
+
+def test_a_validation_watches_the_transport_on_the_first_queries(
+    tmp_path, places, params, benchmark, monkeypatch
+):
+    seen = []
+
+    def watch(params, images, model):
+        seen.append(images)
+        return TransportStatistics(*jnp.array([0.25, 0.5, 4.0]))
+
+    monkeypatch.setattr(crisalad_jax.fit, "watch_transport", watch)
+    monkeypatch.setattr(crisalad_jax.fit, "WATCHED_QUERIES", 2)
+    scripted(monkeypatch, [0.5])
+    run = crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
+    run.validate(benchmark, 1)
+    run.store.close()
+    first = [resize_image(read_image(q), RECIPE.model.image_size) for q in benchmark.queries[:2]]
+    np.testing.assert_array_equal(seen, [first])
+    (line,) = metrics_of(tmp_path)
+    logged = [line[name] for name in TransportStatistics._fields]
+    assert logged == [0.25, 0.5, 4.0]
+
+
+def test_without_salad_a_validation_has_no_transport_to_watch(
+    tmp_path, places, benchmark, monkeypatch
+):
+    scripted(monkeypatch, [0.5])
+    model = dataclasses.replace(RECIPE.model, aggregator="class-token")
+    config = dataclasses.replace(RECIPE, model=model)
+    run = crisalad_jax.fit._Run(config, places, tmp_path, random_params(model))
+    run.validate(benchmark, 1)
+    run.store.close()
+    (line,) = metrics_of(tmp_path)
+    assert line.keys() == {"step", "epoch", "R@1", "R@5", "R@10"}
 
 
 def test_without_validation_there_is_no_best(tmp_path, places, params):

@@ -138,13 +138,34 @@ def test_a_dustbin_of_fixed_mass_allows_more_clusters_than_patches() -> None:
     np.testing.assert_allclose(jnp.linalg.norm(tokens.local, axis=-1), 1, atol=1e-6)
 
 
-def test_statistics_by_hand() -> None:
-    """Scores all alike: every cluster has mass 1 of all ten patches, the dustbin 7 of 10."""
-    params = init_salad(jax.random.key(0), 12, CONFIG)
-    flat = jax.tree.map(jnp.zeros_like, params.score)
-    params = dataclasses.replace(params, score=flat, dust_bin=jnp.zeros(()))
-    patches = jnp.stack([features(10).patches] * 2)
-    found = transport_statistics(params, patches, CONFIG)
-    np.testing.assert_allclose(found.column_error, 0, atol=1e-6)
-    np.testing.assert_allclose(found.dustbin_share, 0.7, rtol=1e-6)
-    np.testing.assert_allclose(found.patches_per_cluster, 10, rtol=1e-5)
+@pytest.mark.parametrize("fields", [{}, {"row_tau": 0.7}], ids=str)
+def test_statistics_are_those_of_the_plan_without_dropout(fields) -> None:
+    """In numpy, of two unlike images and sharp scores; with relaxed rows, patches of any mass."""
+    config = with_sinkhorn(**fields)
+    assert config.dropout > 0
+    params = init_salad(jax.random.key(0), 12, config)
+    patches = jax.random.normal(jax.random.key(2), (2, 10, 12)) * jnp.array([[[20.0]], [[60.0]]])
+
+    @jax.jit
+    def both(patches: jax.Array):
+        log_plan = transport(params, patches, config, key=None).log_plan
+        return transport_statistics(params, patches, config), log_plan
+
+    found, log_plan = both(patches)
+    plan = np.exp(np.asarray(log_plan, np.float64))
+    # Three clusters of mass 1, and the dustbin has what is left of ten patches.
+    errors = np.abs(plan.sum(axis=1) / np.array([1, 1, 1, 7]) - 1).max(axis=1)
+    # float32 rounding of sums of ten masses, relative to 1; the errors themselves are some 0.1.
+    np.testing.assert_allclose(found.column_error, errors.mean(), atol=3e-6)
+    # The same rounding, of ratios and logarithms of order 1.
+    np.testing.assert_allclose(found.dustbin_share, plan[..., 3].sum() / plan.sum(), rtol=1e-5)
+    shares = plan[..., :3] / plan[..., :3].sum(axis=1, keepdims=True)
+    entropies = -np.where(shares > 0, shares * np.log(np.maximum(shares, 1e-300)), 0).sum(axis=1)
+    np.testing.assert_allclose(found.patches_per_cluster, np.exp(entropies).mean(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("dustbin", ["none", "column", "row and column", "token", "mass"])
+def test_a_dustbin_starts_at_1(dustbin: str) -> None:
+    """As published; where it has a parameter at all."""
+    start = init_salad(jax.random.key(0), 12, with_sinkhorn(dustbin=dustbin)).dust_bin
+    assert start is None if dustbin in ("none", "token") else start == 1
