@@ -343,7 +343,8 @@ def _accelerate(memory: _Memory, moved: Potentials, count: Int[Array, ""]) -> _M
     gram = jnp.einsum("...ik,...jk->...ij", moves, moves, precision=jax.lax.Precision.HIGHEST)
     filled = (jnp.arange(slots) <= count).astype(gram.dtype)
     scale = jnp.trace(gram, axis1=-2, axis2=-1)[..., None, None]
-    scale = jnp.maximum(scale, jnp.finfo(gram.dtype).tiny)
+    # A constant to the gradient: the weights do not depend on it, and at rest its square is 0.
+    scale = jax.lax.stop_gradient(jnp.maximum(scale, jnp.finfo(gram.dtype).tiny))
     # Empty slots get a weight of 0: their rows and columns are those of the identity.
     ridge = jnp.finfo(gram.dtype).eps * jnp.eye(slots, dtype=gram.dtype)
     gram = gram / scale + ridge + jnp.diag(1 - filled)

@@ -376,9 +376,6 @@ def test_anderson_is_the_plain_iteration_where_moves_are_too_long_to_square() ->
         np.testing.assert_array_equal(ours, plain)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="NaN: the derivative of a quotient by the least float squares it, to 0"
-)
 def test_anderson_at_rest_has_a_gradient() -> None:
     """Flat scores, where from the second step on every move is 0, and the memory full of them."""
     zeros, weights = jnp.zeros(4), scores_of(3, 4, 4)
