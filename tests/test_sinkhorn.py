@@ -295,7 +295,7 @@ def test_newtons_steps_by_hand() -> None:
         return mu[:, None] * shares / shares.sum(axis=1, keepdims=True)
 
     def error(one: np.ndarray, column: np.ndarray) -> float:
-        return np.abs(masses(one, column).sum(axis=0) - nu).sum()
+        return np.abs(np.log(masses(one, column).sum(axis=0) / nu)).max()
 
     def move(one: np.ndarray, column: np.ndarray) -> np.ndarray:
         plan = masses(one, column)
