@@ -8,8 +8,9 @@ rounding or to what the error that is asked for leaves. Where ott-jax's gradient
 traceback is printed and the failure counted.
 
 Fairness. The contenders take turns, `--rounds` times: a pause of a quarter of a second, in which
-the threads of the one before stop spinning (OpenMP's do so after each call), two calls that do not
-count, then `--calls` that do. A ratio is that of two medians of the same round; of the ratios the
+the threads of the one before stop spinning (OpenMP's do so after each call), as long again of calls
+that do not count, so that cores and caches are as warm for the quick as for the slow, then
+`--calls` that do. A ratio is that of two medians of the same round; of the ratios the
 median over rounds is shown, and the range. All use as many threads as they like.
 
 Memory is what a call needs at once beyond its inputs and the gradients that it returns. Of jax that
@@ -223,8 +224,9 @@ def race(contenders: list[Contender], rounds: int, calls: int) -> dict[str, Time
     for _ in range(rounds):
         for one in contenders:
             time.sleep(PAUSE)
-            one.call()
-            one.call()
+            warm = time.perf_counter() + PAUSE
+            while time.perf_counter() < warm:
+                one.call()
             times = []
             for _ in range(calls):
                 started = time.perf_counter()
@@ -468,7 +470,7 @@ def main() -> None:
     parser.add_argument("--errors", type=float, nargs="+", default=[1e-3, 1e-5])
     parser.add_argument("--std", type=float, default=3.0)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--calls", type=int, default=10)
+    parser.add_argument("--calls", type=int, default=20)
     parser.add_argument("--batches", type=int, default=8, help="to count failures in")
     arguments = parser.parse_args()
     if unknown := set(arguments.benches) - set(BENCHES):
