@@ -31,7 +31,7 @@ LAYERS = (
 LEAVES = {
     "config": {"errors"},
     "pytree": set(),
-    "sinkhorn": {"config", "errors"},
+    "sinkhorn": {"config", "errors", "pytree"},
     "losses": {"config", "errors"},
     "data": {"config", "errors", "files", "data"},
 }
