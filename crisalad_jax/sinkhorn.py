@@ -394,17 +394,19 @@ def _solve(
 ) -> _Solution:
     """Iterate in the configured domain; scaling falls back where the scores are too far apart."""
 
-    def solve(problem: Problem) -> _Solution:
-        return _finish(problem, _iterate(problem, step, config), config)
-
     logarithmic = Problem(kernel, log_mu, log_nu)
     if scaled is None:
-        return solve(logarithmic)
+        return _run(logarithmic, step, config)
     scaling = _ScalingProblem(kernel, log_mu, log_nu, scaled.row_max, scaled.gibbs)
-    return jax.lax.cond(scaled.fits, lambda: solve(scaling), lambda: solve(logarithmic))
+    return jax.lax.cond(
+        scaled.fits,
+        lambda: _run(scaling, step, config),
+        lambda: _run(logarithmic, step, config),
+    )
 
 
-def _finish(problem: Problem, at: _Progress, config: SinkhornConfig) -> _Solution:
+def _run(problem: Problem, step: Step, config: SinkhornConfig) -> _Solution:
+    at = _iterate(problem, step, config)
     finite = jnp.isfinite(at.change)
     met = finite if config.tolerance is None else at.change <= config.tolerance
     potentials = at.potentials
@@ -460,8 +462,7 @@ def _pull(
     """The iterations, and the function that takes their gradient back to the inputs."""
 
     def solve(*inputs: Array) -> tuple[Potentials, _Solution]:
-        problem = start(*inputs)
-        solution = _finish(problem, _iterate(problem, step, config), config)
+        solution = _run(start(*inputs), step, config)
         return solution.potentials, solution
 
     _, pull, solution = jax.vjp(solve, *inputs, has_aux=True)
@@ -526,14 +527,14 @@ def _implicit_backward(
     row, column = towards.potentials
     target = column - config.row_tau * product("...nk,...n->...k", shares, row)
     along_column = _solve_columns(plan, shares, target, config.row_tau, config.column_tau)
+    masses = plan.sum(axis=-2)
     if config.balanced:
         # Where the masses' totals change alone, rows are met and columns follow, as in iterations.
-        masses = plan.sum(axis=-2)
         shift = (masses * along_column).sum(axis=-1) / masses.sum(axis=-1)
         along_column = along_column - shift[..., None]
     along_row = config.row_tau * (row - product("...nk,...k->...n", plan, along_column))
     kernel_bar = -(shares * along_row[..., :, None] + plan * along_column[..., None, :])
-    return kernel_bar, along_row, plan.sum(axis=-2) * along_column
+    return kernel_bar, along_row, masses * along_column
 
 
 _implicit.defvjp(_implicit_forward, _implicit_backward)
@@ -624,7 +625,7 @@ def sinkhorn(
     else:
         # A solver need not be hashable.
         result = _solved(scores, log_mu, log_nu, epsilon, config, step, solver)
-    return _converged(result, config) if config.must_converge else result
+    return _require_converged(result, config) if config.must_converge else result
 
 
 def _solved(
@@ -683,7 +684,7 @@ def _solved(
 _compiled = jax.jit(_solved, static_argnames=("config", "step"))
 
 
-def _converged(result: SinkhornResult, config: SinkhornConfig) -> SinkhornResult:
+def _require_converged(result: SinkhornResult, config: SinkhornConfig) -> SinkhornResult:
     message = f"sinkhorn: no convergence to {config.tolerance} in {config.iterations} iterations"
     if isinstance(result.converged, Tracer):
         import equinox
@@ -789,27 +790,27 @@ def assign(
     found = None if dustbin is None else dustbin.shape
     if found != wanted:
         raise InputError(f"dustbin: found shape {found}, expected {wanted} for {kind!r}")
-    scores = scores.astype(_wide(scores))
-    log_mu = jnp.zeros(rows, scores.dtype)
+    full = scores.astype(_wide(scores))
+    log_mu = jnp.zeros(rows, full.dtype)
     if dustbin is None:
-        log_nu = jnp.full(clusters, math.log(rows / clusters), scores.dtype)
-        return sinkhorn(scores, log_mu, log_nu, epsilon=config.epsilon, config=config)
-    if kind == "mass":
-        share = jax.nn.log_sigmoid(jnp.stack([-dustbin, dustbin])).astype(scores.dtype)
+        log_nu = jnp.full(clusters, math.log(rows / clusters), full.dtype)
+    elif kind == "mass":
+        share = jax.nn.log_sigmoid(jnp.stack([-dustbin, dustbin])).astype(full.dtype)
         share = share + math.log(rows)
         log_nu = jnp.append(jnp.broadcast_to(share[0] - math.log(clusters), clusters), share[1])
-        full = append_dustbin(scores, jnp.zeros_like(dustbin))
-        return sinkhorn(full, log_mu, log_nu, epsilon=config.epsilon, config=config)
-    full = append_dustbin(scores, dustbin)
-    if kind != "row and column":
-        log_mu, log_nu = log_marginals(rows, clusters, scores.dtype)
-        return sinkhorn(full, log_mu, log_nu, epsilon=config.epsilon, config=config)
-    last = jnp.broadcast_to(dustbin.astype(full.dtype), (*full.shape[:-2], 1, clusters + 1))
-    full = jnp.concatenate([full, last], axis=-2)
-    log_mu = jnp.append(log_mu, math.log(clusters))
-    log_nu = jnp.zeros(clusters + 1, scores.dtype).at[-1].set(math.log(rows))
+        full = append_dustbin(full, jnp.zeros_like(dustbin))
+    elif kind == "row and column":
+        full = append_dustbin(full, dustbin)
+        last = jnp.broadcast_to(dustbin.astype(full.dtype), (*full.shape[:-2], 1, clusters + 1))
+        full = jnp.concatenate([full, last], axis=-2)
+        log_mu = jnp.append(log_mu, math.log(clusters))
+        log_nu = jnp.zeros(clusters + 1, full.dtype).at[-1].set(math.log(rows))
+    else:
+        full = append_dustbin(full, dustbin)
+        log_mu, log_nu = log_marginals(rows, clusters, full.dtype)
     result = sinkhorn(full, log_mu, log_nu, epsilon=config.epsilon, config=config)
-    return result._replace(log_plan=result.log_plan[..., :-1, :])
+    # All but the dustbin's own row.
+    return result._replace(log_plan=result.log_plan[..., :rows, :])
 
 
 def _check(
