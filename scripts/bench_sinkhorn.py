@@ -451,7 +451,7 @@ def draw(values: list[dict[str, Any]], title: Callable[[dict[str, Any]], str]) -
         one.invert_yaxis()
         one.set_xlim(0, 1.2 * max(medians))
         one.grid(visible=False)
-        one.set_xlabel("time over ours, forward and backward", fontsize=9)
+        one.set_xlabel("time over ours", fontsize=9)
     return figure
 
 
