@@ -35,8 +35,14 @@ def _require(condition: bool, message: str) -> None:
 
 
 def _require_positive(config: object, *names: str) -> None:
+    """Whole numbers too, where fields are annotated `int`."""
+    hints = get_type_hints(type(config))
     for name in names:
         value = getattr(config, name)
+        _require(
+            hints[name] is not int or isinstance(value, int),
+            f"{type(config).__name__}.{name}: found {value}, expected a whole number",
+        )
         _require(
             0 < value < math.inf,
             f"{type(config).__name__}.{name}: found {value}, expected more than 0, and finite",
@@ -205,7 +211,7 @@ class SinkhornConfig:
             f"SinkhornConfig.relaxation: found {self.relaxation}, expected from 1 to less than 2",
         )
         _require(
-            self.anderson == 0 or self.anderson >= 2,
+            isinstance(self.anderson, int) and (self.anderson == 0 or self.anderson > 1),
             f"SinkhornConfig.anderson: found {self.anderson}, expected 0 or at least 2",
         )
         self._check_pairs()

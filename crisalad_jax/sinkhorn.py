@@ -22,13 +22,13 @@ from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.pytree import params
 
-GIBBS_FLOOR = math.exp(-60)
+SCALING_RANGE = 60
 """Where scores in a row are further apart, over epsilon, the scaling domain does not do.
 
-Above it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
+Within it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
 exp(-87), is no part of such a sum's last place."""
 FALLBACK_BATCH = 4
-"""So many problems at a time are differentiated where the scaling domain would not do: memory for
+"""So many problems at a time are solved again where the scaling domain would not do: memory for
 a fallback is set aside whether or not it is taken."""
 UNROLLED = 8
 """Up to so many iterations are written out for the compiler; more are a scan."""
@@ -76,17 +76,27 @@ class Problem:
 
 @params
 class _ScalingProblem(Problem):
-    """In the scaling domain: exponentials once, then products of a matrix with vectors."""
+    """In the scaling domain: exponentials once, then products of a matrix with vectors.
+
+    The last column is apart. Mostly it is a dustbin that was appended: what is cut off there again
+    the compiler need not write out, and powers of two are left.
+    """
 
     row_max: Float[Array, "*batch rows"]
-    gibbs: Float[Array, "*batch rows columns"]
+    gibbs: Float[Array, "*batch rows columns-1"]
     """exp(kernel - row_max)."""
+    last: Float[Array, "*batch rows"]
 
     def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
-        return self.row_max + _products("...nk,...k->...n", self.gibbs, column)
+        scaled, top = _exponentials(column)
+        sums = _product("...nk,...k->...n", self.gibbs, scaled[..., :-1])
+        return self.row_max + jnp.log(sums + self.last * scaled[..., -1:]) + top
 
     def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
-        return _products("...nk,...n->...k", self.gibbs, row + self.row_max)
+        scaled, top = _exponentials(row + self.row_max)
+        sums = _product("...nk,...n->...k", self.gibbs, scaled)
+        last = (self.last * scaled).sum(axis=-1, keepdims=True)
+        return jnp.log(jnp.concatenate([sums, last], axis=-1)) + top
 
 
 @params
@@ -132,14 +142,14 @@ def _along(potential: Array, axis: int) -> Array:
     return jnp.expand_dims(potential, -3 - axis)
 
 
-def _products(equation: str, gibbs: Array, potential: Array) -> Array:
-    """Logarithm of the products of `gibbs` with exp(potential)."""
+# HIGHEST: in the tensor cores' default of 10 bits the iteration does not converge.
+_product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+
+
+def _exponentials(potential: Array) -> tuple[Array, Array]:
+    """Those of the potential less its largest entry, and that entry."""
     top = jax.lax.stop_gradient(potential.max(axis=-1, keepdims=True))
-    # HIGHEST: in the tensor cores' default of 10 bits the iteration does not converge.
-    sums = jnp.einsum(
-        equation, gibbs, jnp.exp(potential - top), precision=jax.lax.Precision.HIGHEST
-    )
-    return jnp.log(sums) + top
+    return jnp.exp(potential - top), top
 
 
 def sinkhorn_step(
@@ -222,7 +232,7 @@ def _solve_columns(
     """
     # The floor is for columns so far from all rows that their masses are 0.
     masses = jnp.maximum(plan.sum(axis=-2), jnp.finfo(plan.dtype).tiny ** 0.5)
-    weights = jnp.einsum("...nk,...nl->...kl", shares, plan, precision=jax.lax.Precision.HIGHEST)
+    weights = _product("...nk,...nl->...kl", shares, plan)
     weights = row_tau * weights * (1 - jnp.eye(masses.shape[-1], dtype=plan.dtype))
     slack = 1 / column_tau - row_tau
     # What keeps clusters that share no row from dividing by zero.
@@ -305,8 +315,8 @@ def _iterate(problem: Problem, step: Step, config: SinkhornConfig) -> _Progress:
 
 def _zeros(kernel: Array) -> Potentials:
     """Made of the kernel, so that under `shard_map` they vary as it does."""
-    fixed = jax.lax.stop_gradient(kernel)
-    return Potentials(0 * fixed[..., :, 0], 0 * fixed[..., 0, :])
+    row = 0 * jax.lax.stop_gradient(kernel)[..., 0]
+    return Potentials(row, jnp.repeat(row[..., :1], kernel.shape[-1], axis=-1))
 
 
 def _distance(
@@ -353,7 +363,7 @@ def _accelerate(memory: _Memory, moved: Potentials, count: Int[Array, ""]) -> _M
     )
     weights = weights[..., 0] * filled
     weights = weights / weights.sum(axis=-1, keepdims=True)
-    mixed = jnp.einsum("...i,...ik->...k", weights, images, precision=jax.lax.Precision.HIGHEST)
+    mixed = _product("...i,...ik->...k", weights, images)
     mixed = jnp.where(jnp.isfinite(mixed).all(axis=-1, keepdims=True), mixed, image)
     rows = moved.row.shape[-1]
     return _Memory(Potentials(mixed[..., :rows], mixed[..., rows:]), images, moves)
@@ -368,39 +378,46 @@ class _Solution(NamedTuple):
 
 
 class _Scaled(NamedTuple):
-    """The scores of the scaling domain, and whether they are close enough to one another for it."""
+    """The scores of the scaling domain."""
 
-    fits: Bool[Array, ""]
     row_max: Float[Array, "*batch rows"]
-    gibbs: Float[Array, "*batch rows columns"]
+    gibbs: Float[Array, "*batch rows columns-1"]
+    """exp(kernel - row_max); where that does not do, the kernel: one matrix for both."""
+    last: Float[Array, "*batch rows"]
 
 
-def _scale(kernel: Array, config: SinkhornConfig) -> _Scaled | None:
-    if config.domain == "log":
-        return None
-    row_max = jax.lax.stop_gradient(kernel.max(axis=-1))
-    # With a floor under it, all that is computed of it is finite, needed or not.
-    gibbs = jnp.maximum(jnp.exp(kernel - row_max[..., None]), GIBBS_FLOOR)
-    return _Scaled(gibbs.min(initial=1) > GIBBS_FLOOR, row_max, gibbs)
+def _scale(kernel: Array) -> tuple[Bool[Array, ""], _Scaled]:
+    """Whether the scores are close enough to one another for the scaling domain, and its own."""
+    clusters, last = _split(kernel)
+    fixed = jax.lax.stop_gradient((clusters, last))
+    row_max = jnp.maximum(fixed[0].max(axis=-1, initial=-jnp.inf), fixed[1])
+    row_min = jnp.minimum(fixed[0].min(axis=-1, initial=jnp.inf), fixed[1])
+    fits = (row_max - row_min).max(initial=0) < SCALING_RANGE
+
+    gibbs = jnp.where(fits, jnp.exp(clusters - row_max[..., None]), clusters)
+    return fits, _Scaled(row_max, gibbs, jnp.where(fits, jnp.exp(last - row_max), last))
+
+
+def _split(kernel: Array) -> tuple[Array, Array]:
+    """All columns but the last, and the last."""
+    return kernel[..., :-1], kernel[..., -1]
+
+
+def _join(clusters: Array, last: Array) -> Array:
+    return jnp.concatenate([clusters, last[..., None]], axis=-1)
 
 
 def _solve(
-    kernel: Array,
-    log_mu: Array,
-    log_nu: Array,
-    scaled: _Scaled | None,
-    step: Step,
-    config: SinkhornConfig,
+    kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
 ) -> _Solution:
     """Iterate in the configured domain; scaling falls back where the scores are too far apart."""
-
     logarithmic = Problem(kernel, log_mu, log_nu)
-    if scaled is None:
+    if config.domain == "log":
         return _run(logarithmic, step, config)
-    scaling = _ScalingProblem(kernel, log_mu, log_nu, scaled.row_max, scaled.gibbs)
+    fits, scaled = _scale(kernel)
     return jax.lax.cond(
-        scaled.fits,
-        lambda: _run(scaling, step, config),
+        fits,
+        lambda: _run(_ScalingProblem(kernel, log_mu, log_nu, *scaled), step, config),
         lambda: _run(logarithmic, step, config),
     )
 
@@ -418,50 +435,84 @@ def _run(problem: Problem, step: Step, config: SinkhornConfig) -> _Solution:
     return _Solution(potentials, at.iterations.astype(dtype), met.astype(dtype))
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5))
-def _unrolled(
-    kernel: Array,
-    log_mu: Array,
-    log_nu: Array,
-    scaled: _Scaled | None,
-    step: Step,
-    config: SinkhornConfig,
-) -> _Solution:
-    """The solution, differentiated through its iterations, which are done again for that.
+class _Inputs(NamedTuple):
+    """What is differentiated."""
 
-    By itself JAX would keep what either domain needs for its gradient: many matrices.
+    kernel: Float[Array, "*batch rows columns"]
+    log_mu: Float[Array, "*batch rows"]
+    log_nu: Float[Array, "*batch columns"]
+
+
+class _Towards(NamedTuple):
+    """Gradients of what comes out."""
+
+    log_plan: Float[Array, "*batch rows columns"]
+    potentials: Potentials
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
+def _unrolled(inputs: _Inputs, step: Step, config: SinkhornConfig) -> Any:
+    """The plan's logarithm and the `_Solution`, differentiated through the iterations.
+
+    By itself JAX would keep what either domain needs for its gradient: many matrices. Here it is
+    one, as the plan is part of the rule: its gradient is added to where it comes in.
     """
-    return _solve(kernel, log_mu, log_nu, scaled, step, config)
+    solution = _solve(*inputs, step, config)
+    return _log_plan(inputs.kernel, solution.potentials), solution
 
 
 def _unrolled_forward(
-    kernel: Array,
-    log_mu: Array,
-    log_nu: Array,
-    scaled: _Scaled | None,
-    step: Step,
-    config: SinkhornConfig,
-) -> tuple[_Solution, Any]:
-    inputs = (kernel, log_mu, log_nu)
-    if scaled is None:
-        solution, pull = _pull(Problem, inputs, step, config)
-        return solution, (inputs, None, pull)
+    inputs: _Inputs, step: Step, config: SinkhornConfig
+) -> tuple[tuple[Array, _Solution], Any]:
+    differentiable, inputs = inputs, jax.lax.stop_gradient(inputs)
 
-    def start(gibbs: Array, kernel: Array, log_mu: Array, log_nu: Array) -> Problem:
-        return _ScalingProblem(kernel, log_mu, log_nu, scaled.row_max, gibbs)
+    def out(log_plan: Array, solution: _Solution, *kept: Any) -> tuple[Any, Any]:
+        return _replayed(differentiable, log_plan, solution, step, config), (differentiable, *kept)
+
+    if config.domain == "log":
+        solution, pull = _pull(_logarithmic, (inputs,), step, config)
+        return out(_log_plan(inputs.kernel, solution.potentials), solution, None, pull)
+    fits, scaled = _scale(inputs.kernel)
+
+    def start(inputs: _Inputs, gibbs: Array, last: Array) -> Problem:
+        return _ScalingProblem(*inputs, scaled.row_max, gibbs, last)
 
     # The kernel as well: a step of the user's own may read it.
-    found, pull = _pull(start, (scaled.gibbs, *inputs), step, config)
-    solution = jax.lax.cond(scaled.fits, lambda: found, lambda: _solve(*inputs, None, step, config))
-    return solution, (inputs, scaled, pull)
+    found, pull = _pull(start, (inputs, scaled.gibbs, scaled.last), step, config)
+
+    def again() -> _Solution:
+        def one(at: tuple[_Scaled, Array, Array]) -> _Solution:
+            scaled, *marginals = at
+            return _run(Problem(_join(scaled.gibbs, scaled.last), *marginals), step, config)
+
+        batch = found.converged.shape
+        at = _flat((scaled, inputs.log_mu, inputs.log_nu), batch)
+        out = jax.lax.map(one, at, batch_size=FALLBACK_BATCH)
+        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
+
+    solution = jax.lax.cond(fits, lambda: found, again)
+    clusters, last = _split(inputs.kernel)
+    row, column = solution.potentials
+    clusters = clusters + row[..., None] + column[..., None, :-1]
+    log_plan = _join(clusters, last + row + column[..., -1:])
+    return out(log_plan, solution, (fits, scaled), pull)
+
+
+def _logarithmic(inputs: _Inputs) -> Problem:
+    return Problem(*inputs)
+
+
+def _flat(tree: Any, batch: tuple[int, ...]) -> Any:
+    """With one axis for all of the batch."""
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), tree)
 
 
 def _pull(
-    start: Callable[..., Problem], inputs: tuple[Array, ...], step: Step, config: SinkhornConfig
+    start: Callable[..., Problem], inputs: tuple[Any, ...], step: Step, config: SinkhornConfig
 ) -> tuple[_Solution, Any]:
     """The iterations, and the function that takes their gradient back to the inputs."""
 
-    def solve(*inputs: Array) -> tuple[Potentials, _Solution]:
+    def solve(*inputs: Any) -> tuple[Potentials, _Solution]:
         solution = _run(start(*inputs), step, config)
         return solution.potentials, solution
 
@@ -470,30 +521,122 @@ def _pull(
 
 
 def _unrolled_backward(
-    step: Step, config: SinkhornConfig, kept: Any, towards: _Solution
-) -> tuple[Array, Array, Array, None]:
+    step: Step, config: SinkhornConfig, kept: Any, towards: tuple[Array, _Solution]
+) -> tuple[_Inputs]:
     inputs, scaled, pull = kept
-    if scaled is None:
-        return *pull(towards.potentials), None
-
-    def scaling() -> tuple[Array, ...]:
-        gibbs, kernel, *marginals = pull(towards.potentials)
-        return scaled.gibbs * gibbs + kernel, *marginals
-
-    def logarithmic() -> tuple[Array, ...]:
-        def one(at: tuple[tuple[Array, ...], Potentials]) -> tuple[Array, ...]:
-            return _pull(Problem, at[0], step, config)[1](at[1])
-
-        everything = (inputs, towards.potentials)
-        batch = inputs[0].shape[:-2]
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), everything)
-        out = jax.lax.map(one, flat, batch_size=FALLBACK_BATCH)
-        return tuple(x.reshape(*batch, *x.shape[1:]) for x in out)
-
-    return *jax.lax.cond(scaled.fits, scaling, logarithmic), None
+    log_plan, solution = towards
+    both = _Towards(log_plan, solution.potentials)
+    return (_pull_back(inputs, both, scaled, pull, step, config),)
 
 
 _unrolled.defvjp(_unrolled_forward, _unrolled_backward)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5))
+def _pull_back(
+    inputs: _Inputs,
+    towards: _Towards,
+    scaled: tuple[Bool[Array, ""], _Scaled] | None,
+    pull: Any,
+    step: Step,
+    config: SinkhornConfig,
+) -> Any:
+    """The gradients of the inputs, as `_Inputs`."""
+    row, column = towards.potentials
+    clusters, last = _split(towards.log_plan)
+    row = row + clusters.sum(axis=-1) + last
+    column = column + _join(clusters.sum(axis=-2), last.sum(axis=-1))
+    into = Potentials(row, column)
+    if scaled is None:
+        (bars,) = pull(into)
+        return bars._replace(kernel=towards.log_plan + bars.kernel)
+    fits, parts = scaled
+    (kernel, *marginals), of_gibbs, of_last = pull(into)
+    direct = _split(kernel)
+    bars = [direct[0] + parts.gibbs * of_gibbs, direct[1] + parts.last * of_last, *marginals]
+    bars = [jnp.where(fits, bar, 0) for bar in bars]
+    bars[:2] = clusters + bars[0], last + bars[1]
+    batch = row.shape[:-1]
+    at, flat = _flat((parts, inputs.log_mu, inputs.log_nu, into), batch), _flat(bars, batch)
+
+    def mend(state: tuple[Array, Any]) -> tuple[Array, Any]:
+        index, bars = state
+        parts, log_mu, log_nu, into = jax.tree.map(lambda x: x[index], at)
+        one = _Inputs(_join(parts.gibbs, parts.last), log_mu, log_nu)
+        _, pull = _pull(_logarithmic, (one,), step, config)
+        ((kernel, *marginals),) = pull(into)
+        new = [*_split(kernel), *marginals]
+        return index + 1, jax.tree.map(lambda x, y: x.at[index].add(y), bars, new)
+
+    # In place and one by one, where a branch would have memory of its own.
+    problems = math.prod(batch)
+    index = jnp.where(fits, problems, 0)
+    if problems:
+        _, flat = jax.lax.while_loop(lambda state: state[0] < problems, mend, (index, flat))
+    clusters, last, log_mu, log_nu = (x.reshape(y.shape) for x, y in zip(flat, bars, strict=True))
+    return _Inputs(_join(clusters, last), log_mu, log_nu)
+
+
+def _pull_back_forward(
+    inputs: _Inputs,
+    towards: _Towards,
+    scaled: tuple[Bool[Array, ""], _Scaled] | None,
+    pull: Any,
+    step: Step,
+    config: SinkhornConfig,
+) -> tuple[Any, tuple[_Inputs, _Towards]]:
+    return _pull_back(inputs, towards, scaled, pull, step, config), (inputs, towards)
+
+
+def _pull_back_backward(
+    step: Step, config: SinkhornConfig, kept: tuple[_Inputs, _Towards], towards: _Inputs
+) -> tuple[_Inputs, _Towards, None, None]:
+    def plain(inputs: _Inputs, towards: _Towards) -> _Inputs:
+        return _replay(inputs, step, config)(towards)[0]
+
+    return *jax.vjp(plain, *kept)[1](towards), None, None
+
+
+def _replay(inputs: _Inputs, step: Step, config: SinkhornConfig) -> Any:
+    """What takes gradients back to the inputs by JAX alone, in the log domain.
+
+    It is for gradients of gradients. By JAX's own rules those of scans kept in `pull` go wrong, and
+    what the scaling domain makes of scores that do not fit would be in them.
+    """
+
+    def solve(inputs: _Inputs) -> _Towards:
+        potentials = _run(_logarithmic(inputs), step, config).potentials
+        return _Towards(_log_plan(inputs.kernel, potentials), potentials)
+
+    return jax.vjp(solve, inputs)[1]
+
+
+_pull_back.defvjp(_pull_back_forward, _pull_back_backward)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _replayed(
+    inputs: _Inputs, log_plan: Array, solution: _Solution, step: Step, config: SinkhornConfig
+) -> Any:
+    """The plan and the solution, of these inputs, as they are."""
+    return log_plan, solution
+
+
+def _replayed_forward(
+    inputs: _Inputs, log_plan: Array, solution: _Solution, step: Step, config: SinkhornConfig
+) -> tuple[Any, _Inputs]:
+    return (log_plan, solution), inputs
+
+
+def _replayed_backward(
+    step: Step, config: SinkhornConfig, inputs: _Inputs, towards: tuple[Array, _Solution]
+) -> tuple[_Inputs, None, None]:
+    log_plan, solution = towards
+    (bars,) = _replay(inputs, step, config)(_Towards(log_plan, solution.potentials))
+    return bars, None, None
+
+
+_replayed.defvjp(_replayed_forward, _replayed_backward)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
@@ -501,7 +644,7 @@ def _implicit(
     kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
 ) -> Any:
     """The `_Solution`, differentiated by the optimality conditions: no iteration is remembered."""
-    return _solve(kernel, log_mu, log_nu, _scale(kernel, config), step, config)
+    return _solve(kernel, log_mu, log_nu, step, config)
 
 
 def _implicit_forward(
@@ -523,16 +666,15 @@ def _implicit_backward(
     top = jax.lax.stop_gradient(log_plan.max(axis=(-2, -1), keepdims=True))
     plan = jnp.exp(log_plan - top)
     shares = jax.nn.softmax(log_plan, axis=-1)
-    product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
     row, column = towards.potentials
-    target = column - config.row_tau * product("...nk,...n->...k", shares, row)
+    target = column - config.row_tau * _product("...nk,...n->...k", shares, row)
     along_column = _solve_columns(plan, shares, target, config.row_tau, config.column_tau)
     masses = plan.sum(axis=-2)
     if config.balanced:
         # Where the masses' totals change alone, rows are met and columns follow, as in iterations.
         shift = (masses * along_column).sum(axis=-1) / masses.sum(axis=-1)
         along_column = along_column - shift[..., None]
-    along_row = config.row_tau * (row - product("...nk,...k->...n", plan, along_column))
+    along_row = config.row_tau * (row - _product("...nk,...k->...n", plan, along_column))
     kernel_bar = -(shares * along_row[..., :, None] + plan * along_column[..., None, :])
     return kernel_bar, along_row, masses * along_column
 
@@ -656,21 +798,21 @@ def _solved(
             column_tau=config.column_tau,
         )
     solution: Any  # what custom_vjp returns has no type for the checker
-    if config.gradient == "implicit":
-        solution = _implicit(kernel, log_mu, log_nu, step, config)
-    elif config.gradient == "optimistix":
-        solution = _by_optimistix(kernel, log_mu, log_nu, step, config, solver)
-    elif config.gradient == "stop":
-        fixed = jax.lax.stop_gradient(kernel)
-        marginals = jax.lax.stop_gradient((log_mu, log_nu))
-        solution = _solve(fixed, *marginals, _scale(fixed, config), step, config)
+    if config.gradient == "unrolled":
+        both: Any = _unrolled(_Inputs(kernel, log_mu, log_nu), step, config)
+        log_plan, solution = both
     else:
-        scaled = _scale(kernel, config)
-        solution = _unrolled(kernel, log_mu, log_nu, scaled, step, config)
+        if config.gradient == "implicit":
+            solution = _implicit(kernel, log_mu, log_nu, step, config)
+        elif config.gradient == "optimistix":
+            solution = _by_optimistix(kernel, log_mu, log_nu, step, config, solver)
+        else:
+            fixed = jax.lax.stop_gradient((kernel, log_mu, log_nu))
+            solution = _solve(*fixed, step, config)
+        log_plan = _log_plan(kernel, solution.potentials)
     potentials = solution.potentials
     iterations = jax.lax.stop_gradient(solution.iterations).astype(jnp.int32)
     converged = jax.lax.stop_gradient(solution.converged) > 0
-    log_plan = _log_plan(kernel, potentials)
     if config.balanced:
         potentials = _centre(potentials)
     errors = marginal_error(log_plan, log_mu, log_nu)

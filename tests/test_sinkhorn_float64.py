@@ -19,7 +19,13 @@ from ott.problems.linear.linear_problem import LinearProblem
 from ott.solvers.linear.sinkhorn import Sinkhorn
 
 from crisalad_jax.config import SinkhornConfig
-from crisalad_jax.sinkhorn import Potentials, Problem, SinkhornResult, sinkhorn
+from crisalad_jax.sinkhorn import (
+    SCALING_RANGE,
+    Potentials,
+    Problem,
+    SinkhornResult,
+    sinkhorn,
+)
 
 TIGHT = 1e-12
 """What float64 potentials of order 10, rounded at 2e-15, can be asked to come to rest at."""
@@ -372,12 +378,13 @@ def test_a_step_may_read_the_kernel(domain: Any) -> None:
     "config",
     [
         SinkhornConfig(),
+        SinkhornConfig(iterations=9),  # a scan
         SinkhornConfig(domain="log"),
         to_rest(),
         pytest.param(to_rest(row_tau=0.9, column_tau=0.7), marks=pytest.mark.slow),
         pytest.param(to_rest(gradient="optimistix"), marks=pytest.mark.slow),
     ],
-    ids=["scaling", "log", "implicit", "relaxed", "optimistix"],
+    ids=["scaling", "many", "log", "implicit", "relaxed", "optimistix"],
 )
 def test_gradient_of_the_gradient(config: SinkhornConfig) -> None:
     """Of a gradient's product with a fixed direction, with respect to every input."""
@@ -389,6 +396,19 @@ def test_gradient_of_the_gradient(config: SinkhornConfig) -> None:
 
     # As for the gradient; this one is of order 1e3.
     assert_close(jax.jit(jax.grad(slope))(inputs()), differences(slope, inputs()), 1e-6)
+
+
+def test_gradient_of_the_gradient_where_scaling_does_not_do() -> None:
+    at, direction = inputs(), inputs(seed=5)
+    far = SCALING_RANGE * at.epsilon + jnp.ptp(at.scores)
+    at = at._replace(scores=at.scores.at[1, 2].add(-far))
+
+    def slope(at: Inputs) -> Any:
+        gradient = jax.grad(functools.partial(loss, config=SinkhornConfig()))(at)
+        return sum(jnp.vdot(a, b) for a, b in zip(gradient, direction, strict=True))
+
+    # As above.
+    assert_close(jax.jit(jax.grad(slope))(at), differences(slope, at), 1e-6)
 
 
 @pytest.mark.parametrize(
