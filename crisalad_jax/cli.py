@@ -16,6 +16,7 @@ import rich.console
 import rich.table
 import tyro
 
+from crisalad_jax import platform
 from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.config import ModelConfig, TrainConfig, choose, recipe
 from crisalad_jax.convert import convert, read_backbone
@@ -527,7 +528,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options["default"] = Train(
                 data=tyro.MISSING, out=tyro.MISSING, settings=_train_defaults(given[1:])
             )
-        run(_parse(kind, given, options))
+        chosen = _parse(kind, given, options)
+        platform.set_up()
+        run(chosen)
     except InputError as error:
         print("crisalad:", *str(error).splitlines(), file=sys.stderr)
         return 2

@@ -15,6 +15,7 @@ from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, alone, among, relate, tokenise
 from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.platform import on_every_device, over_devices
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.retrieval import Neighbours, recalls, search
 
@@ -72,12 +73,22 @@ def read_tokens(
         on_bad_image=on_bad_image,
         cache=cache,
     )
+    params = on_every_device(params, batch_size)
     with progress_bar(label, len(paths), "images", quiet=quiet) as bar:
-        for batch in batches:
-            used = int((batch.indices >= 0).sum())
-            tokens = jax.device_get(tokenise(params, batch.images, config))
-            parts.append(tuple(leaf[:used] for leaf in (*tokens, batch.valid)))
+
+        def collect(tokens: Tokens, valid: Bool[np.ndarray, " image"], used: int) -> None:
+            parts.append(tuple(leaf[:used] for leaf in (*jax.device_get(tokens), valid)))
             bar.advance(used)
+
+        ahead = None
+        for batch in batches:
+            tokens = tokenise(params, over_devices(batch.images), config)
+            # While the device is at this one, the one before comes back.
+            if ahead is not None:
+                collect(*ahead)
+            ahead = (tokens, batch.valid, int((batch.indices >= 0).sum()))
+        if ahead is not None:
+            collect(*ahead)
     return FolderTokens(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
 
+from crisalad_jax import platform
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.nn.aggregators import Aggregator, aggregate, init_aggregator, join
@@ -44,7 +45,7 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     )
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@functools.partial(platform.jit, static_argnames="config")
 def describe(
     params: Crisalad,
     images: Images,
@@ -76,7 +77,7 @@ def describe(
     return relate(params, tokens, config, mask=mask, key=encoder_key)
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@functools.partial(platform.jit, static_argnames="config")
 def tokenise(
     params: Crisalad, images: Images, config: ModelConfig, *, key: PRNGKeyArray | None = None
 ) -> Tokens:
@@ -100,7 +101,7 @@ def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features
     return jax.vmap(look)(images)
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@functools.partial(platform.jit, static_argnames="config")
 def watch_transport(params: Crisalad, images: Images, config: ModelConfig) -> TransportStatistics:
     """Statistics of SALAD's transport on a batch of images, without dropout.
 
@@ -113,7 +114,7 @@ def watch_transport(params: Crisalad, images: Images, config: ModelConfig) -> Tr
     return transport_statistics(params.aggregator, patches, config.salad)
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@functools.partial(platform.jit, static_argnames="config")
 def relate(
     params: Crisalad,
     tokens: Tokens,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
+from crisalad_jax import platform
 from crisalad_jax.config import ModelConfig, MultiSimilarityConfig, OptimiserConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.losses import multi_similarity_loss
@@ -143,7 +144,7 @@ def init_state(params: Crisalad, trains: str, config: StepConfig) -> tuple[Train
     return TrainState(jnp.zeros((), jnp.int32), trainable, optimiser), frozen
 
 
-@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
+@functools.partial(platform.jit, static_argnames="config", donate_argnames="state")
 def train_step(
     state: TrainState,
     frozen: PyTree,

@@ -7,11 +7,7 @@ jax and torch find one. Before anything is timed, plans and gradients are checke
 rounding or to what the error that is asked for leaves. Where ott-jax's gradient raises, its
 traceback is printed and the failure counted.
 
-Fairness. The contenders take turns, `--rounds` times: a pause of a quarter of a second, in which
-the threads of the one before stop spinning (OpenMP's do so after each call), as long again of calls
-that do not count, so that cores and caches are as warm for the quick as for the slow, then
-`--calls` that do. A ratio is that of two medians of the same round; of the ratios the
-median over rounds is shown, and the range. All use as many threads as they like.
+`racing.py` says how they are timed.
 
 Memory is what a call needs at once beyond its inputs and the gradients that it returns. Of jax that
 is what the compiled program sets aside (`temp_size_in_bytes`), of torch the peak of the allocations
@@ -22,21 +18,16 @@ import argparse
 import functools
 import itertools
 import math
-import os
 import pathlib
-import statistics
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
-
-# On a GPU jax would take most of the memory at once, and leave torch too little.
-os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
 from fragments import COLOURS, Study, Table, markdown, panels, save, splice
+from racing import machine, megabytes, race, ratio, times, torch_memory, wait
 
 from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.sinkhorn import append_dustbin, assign, log_marginals
@@ -48,7 +39,6 @@ try:
 except ImportError:
     OttSinkhorn = None
 
-PAUSE = 0.25
 DUSTBIN = 1.0
 TOLERANCES = tuple(10 ** (-i / 2) for i in range(2, 15))
 """Asked for from the loosest on, until the error that is measured is small enough."""
@@ -79,15 +69,6 @@ class Contender(NamedTuple):
     """With respect to the scores, in their layout."""
     memory: Callable[[], int]
     """In bytes."""
-
-
-class Timed(NamedTuple):
-    rounds: list[float]
-    """The median of each round, in ms: absolute times stay in the JSON file."""
-
-    @property
-    def median(self) -> float:
-        return statistics.median(self.rounds)
 
 
 LogPlan = Callable[[jax.Array, jax.Array], jax.Array]
@@ -171,10 +152,6 @@ def by_torch(name: str, inputs: Inputs, iterations: int, compiled: bool) -> Cont
     if compiled:
         loss = torch.compile(loss, dynamic=False)
 
-    def wait() -> None:
-        if device == "cuda":
-            torch.cuda.synchronize()
-
     def call() -> tuple[torch.Tensor, ...]:
         found = torch.autograd.grad(loss(*leaves), leaves)
         wait()
@@ -185,20 +162,7 @@ def by_torch(name: str, inputs: Inputs, iterations: int, compiled: bool) -> Cont
             return published(scores, dustbin, iterations).exp().mT.cpu().numpy()
 
     def memory() -> int:
-        returned = 4 * (scores.numel() + 1)
-        if device == "cuda":
-            before = torch.cuda.memory_allocated()
-            torch.cuda.reset_peak_memory_stats()
-            call()
-            return torch.cuda.max_memory_allocated() - before - returned
-        activities = [torch.profiler.ProfilerActivity.CPU]
-        with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
-            kept = call()
-        events: list[Any] = profile.profiler.kineto_results.events()  # pyright: ignore
-        events = [event for event in events if event.name() == "[memory]"]
-        sizes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
-        del kept
-        return max(itertools.accumulate(sizes)) - returned
+        return torch_memory(call) - 4 * (scores.numel() + 1)
 
     return Contender(name, call, plan, lambda: call()[0].mT.cpu().numpy(), memory)
 
@@ -217,37 +181,6 @@ def check(contenders: list[Contender], tolerance: float = 1e-4) -> None:
             # 1e-2.
             if not off < tolerance:
                 raise RuntimeError(f"{name}: {part} differs from {first[0]}'s by {off:.1e}")
-
-
-def race(contenders: list[Contender], rounds: int, calls: int) -> dict[str, Timed]:
-    timed = {one.name: Timed([]) for one in contenders}
-    for _ in range(rounds):
-        for one in contenders:
-            time.sleep(PAUSE)
-            warm = time.perf_counter() + PAUSE
-            while time.perf_counter() < warm:
-                one.call()
-            times = []
-            for _ in range(calls):
-                started = time.perf_counter()
-                one.call()
-                times.append(1e3 * (time.perf_counter() - started))
-            timed[one.name].rounds.append(statistics.median(times))
-    return timed
-
-
-def ratio(slow: Timed, fast: Timed) -> tuple[float, float, float]:
-    """How many times faster: median over the rounds, least, most."""
-    found = [a / b for a, b in zip(slow.rounds, fast.rounds, strict=True)]
-    return statistics.median(found), min(found), max(found)
-
-
-def times(value: tuple[float, float, float]) -> str:
-    return f"{value[0]:.2f} ({value[1]:.2f} to {value[2]:.2f})"
-
-
-def megabytes(size: float) -> str:
-    return f"{size / 1e6:.1f}"
 
 
 def fixed(arguments: argparse.Namespace) -> Study:
@@ -273,7 +206,7 @@ def fixed(arguments: argparse.Namespace) -> Study:
             )
             contenders.append(by_ott("ott-jax, unrolled", solver).on(inputs))
         check(contenders)
-        timed = race(contenders, arguments.rounds, arguments.calls)
+        timed = race({one.name: one.call for one in contenders}, arguments.rounds, arguments.calls)
         memory = {one.name: one.memory() for one in contenders}
         torches = ("torch eager", "torch.compile")
         best = min(torches, key=lambda name: timed[name].median)
@@ -307,12 +240,10 @@ def fixed(arguments: argparse.Namespace) -> Study:
 
 
 def describe(arguments: argparse.Namespace) -> str:
-    device = jax.devices()[0].device_kind
     return (
         f"B = {arguments.images}, m = {arguments.clusters}, iid scores of standard deviation "
-        f"{arguments.std:g}, float32, {device}, {os.cpu_count()} cores, jax {jax.__version__}, "
-        f"torch {torch.__version__}; medians and ranges of {arguments.rounds} rounds of "
-        f"{arguments.calls} calls"
+        f"{arguments.std:g}, float32, {machine()}; medians and ranges of "
+        f"{arguments.rounds} rounds of {arguments.calls} calls"
     )
 
 
@@ -397,7 +328,7 @@ def converged(arguments: argparse.Namespace) -> Study:
         if entered:
             # Of sharp plans, gradients move several times as much as masses.
             check(entered, 30 * target)
-        timed = race(entered, arguments.rounds, arguments.calls)
+        timed = race({one.name: one.call for one in entered}, arguments.rounds, arguments.calls)
         theirs = [name for name in timed if name.startswith("ott")]
         best = min(theirs, key=lambda name: timed[name].median, default=None)
         for one in entered:

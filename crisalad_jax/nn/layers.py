@@ -1,5 +1,6 @@
 """The small layers: linear, layer norm, convolutions on a patch grid, GELU, dropout, L2."""
 
+import functools
 import math
 
 import jax
@@ -117,21 +118,45 @@ def layer_norm(
     params: LayerNorm, x: Float[Array, "*batch dim"], *, epsilon: float
 ) -> Float[Array, "*batch dim"]:
     """Normalise the last axis to mean 0 and variance 1, in float32, and return the type of `x`."""
-    wide = widen(x)
-    mean = wide.mean(axis=-1, keepdims=True)
-    centred = wide - mean
-    variance = jnp.square(centred).mean(axis=-1, keepdims=True)
-    y = centred * jax.lax.rsqrt(variance + epsilon) * params.weight + params.bias
+    y = _standardise(widen(x), epsilon) * params.weight + params.bias
     return y.astype(x.dtype)
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _standardise(x: Array, epsilon: float) -> Array:
+    """Mean 0 and variance 1 along the last axis.
+
+    The derivative is told to JAX because by itself it would keep three arrays for it, not one.
+    """
+    return _standardised(x, epsilon)[0]
+
+
+def _standardised(x: Array, epsilon: float) -> tuple[Array, Array]:
+    centred = x - x.mean(axis=-1, keepdims=True)
+    scale = jax.lax.rsqrt(jnp.square(centred).mean(axis=-1, keepdims=True) + epsilon)
+    return centred * scale, scale
+
+
+@_standardise.defjvp
+def _standardise_jvp(
+    epsilon: float, primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[Array, Array]:
+    y, scale = _standardised(*primals, epsilon)
+    (change,) = tangents
+    along = (y * change).mean(axis=-1, keepdims=True)
+    return y, scale * (change - change.mean(axis=-1, keepdims=True) - y * along)
+
+
+# prevent_cse=False: in a scan nothing can undo the saving.
+@functools.partial(jax.checkpoint, prevent_cse=False)
 def depthwise_conv(
     params: DepthwiseConv, x: Float[Array, "height width dim"]
 ) -> Float[Array, "height width dim"]:
     """Convolve every channel with its own filter (cross-correlation, as torch), zero padding.
 
     A sum of k x k shifted products: for small filters XLA fuses it into one pass over `x`, where
-    its grouped convolution is many times slower on a CPU.
+    its grouped convolution is many times slower on a CPU. For the gradient `x` is kept, not all its
+    shifts.
     """
     size = params.weight.shape[0]
     height, width, _ = x.shape
@@ -166,10 +191,28 @@ def batch_norm(
     return ((wide - params.running_mean) * scale + params.bias).astype(x.dtype)
 
 
+@jax.custom_jvp
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Exact GELU. The erf form: `jax.nn.gelu`'s erfc form takes twice as long on a CPU."""
+    """Exact GELU. The erf form: `jax.nn.gelu`'s erfc form takes twice as long on a CPU.
+
+    The derivative is told to JAX because by itself it would keep three arrays for it, not one.
+    """
     wide = widen(x)
-    return (0.5 * wide * (1 + jax.lax.erf(wide * math.sqrt(0.5)))).astype(x.dtype)
+    return (wide * _normal_cdf(wide)).astype(x.dtype)
+
+
+def _normal_cdf(x: Array) -> Array:
+    return 0.5 * (1 + jax.lax.erf(x * math.sqrt(0.5)))
+
+
+@gelu.defjvp
+def _gelu_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (change,) = primals, tangents
+    wide = widen(x)
+    below = _normal_cdf(wide)
+    density = jnp.exp(-0.5 * jnp.square(wide)) / math.sqrt(2 * math.pi)
+    slope = (below + wide * density).astype(x.dtype)
+    return (wide * below).astype(x.dtype), slope * change
 
 
 def dropout(

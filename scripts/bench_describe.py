@@ -1,0 +1,274 @@
+"""Images described a second, beside the same model in torch, in one run.
+
+    python scripts/bench_describe.py [--out docs/performance] [--page docs/performance.md]
+        [--presets b14 ...] [--sizes 224x224 ...] [--batches 8 16] [--dtype bfloat16]
+
+The other side is the reference of the parity checks, with the same random weights. Needs torch (the
+`dev` extra). On a GPU if both jax and torch find one. Before anything is timed, descriptors are
+checked to be equal to rounding. `racing.py` says how contenders are timed.
+
+Ours takes 8-bit images, as from a file, and normalises them; torch gets them normalised. "over
+devices" is how the command line runs it: the CPU made into a device for each core, the images
+spread over them.
+
+Memory is what a call needs at once beyond parameters and images: of jax what the compiled program
+sets aside and its output, of torch the peak of what it allocates. The share of the machine is the
+model's operations (two a multiply-accumulate of `crisalad info`) a second over those of the better
+library's product of two square matrices.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from fragments import COLOURS, Study, Table, markdown, panels, save, splice
+from racing import (
+    Timed,
+    machine,
+    megabytes,
+    product_rate,
+    race,
+    ratio,
+    times,
+    torch_memory,
+    wait,
+)
+
+# After racing, which says how many devices there are.
+import jax  # isort: skip
+import torch  # isort: skip
+
+from crisalad_jax import platform
+from crisalad_jax.config import PRESETS, ModelConfig
+from crisalad_jax.costs import part_costs
+from crisalad_jax.model import Crisalad, describe
+from crisalad_jax.nn.pixels import normalise
+from parity.cases.case import build, convert, random
+from parity.reference.model import Crisalad as TorchCrisalad
+
+TOLERANCES = {"float32": 1e-5, "bfloat16": 2e-2}
+"""Of descriptors, which are unit vectors: parity measures 1e-6 and 5e-3 at this size."""
+TORCHES = ("torch eager", "torch.compile")
+
+
+class Contender(NamedTuple):
+    name: str
+    call: Callable[[], Any]
+    memory: Callable[[], int]
+
+
+class Sides(NamedTuple):
+    """The same model and images for both libraries."""
+
+    theirs: TorchCrisalad
+    ours: Crisalad
+    config: ModelConfig
+    images: np.ndarray
+    """(image, height, width, 3), 8-bit."""
+    normalised: torch.Tensor
+    """(image, 3, height, width), where torch computes."""
+
+
+def sides(config: ModelConfig, name: str, batch: int, dtype: str) -> Sides:
+    model = build(config, dtype, random(name, 0))
+    ours = convert(model)[0]
+    images = np.random.default_rng(0).integers(
+        0, 256, (batch, *config.image_size, 3), dtype=np.uint8
+    )
+    floats = jax.jit(jax.vmap(lambda image: normalise(image, config.normalisation)))(images)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    normalised = torch.from_numpy(np.array(floats)).permute(0, 3, 1, 2).contiguous().to(device)
+    return Sides(model.to(device), ours, model.config, images, normalised)
+
+
+def by_torch(both: Sides, compiled: bool) -> Contender:
+    model = torch.compile(both.theirs, dynamic=False) if compiled else both.theirs
+
+    def call() -> np.ndarray:
+        with torch.inference_mode():
+            found = model(both.normalised)
+        wait()
+        return found
+
+    return Contender(TORCHES[compiled], call, lambda: torch_memory(call))
+
+
+def by_us(both: Sides, spread: bool) -> Contender:
+    count = len(both.images) if spread else 1
+    params = platform.on_every_device(both.ours, count)
+    images = platform.over_devices(both.images) if spread else jax.device_put(both.images)
+    devices = len(images.sharding.device_set)
+
+    def call() -> jax.Array:
+        return jax.block_until_ready(describe(params, images, both.config))
+
+    def memory() -> int:
+        options = platform.compiler_options()
+        program = jax.jit(
+            describe.__wrapped__,  # pyright: ignore[reportFunctionMemberAccess]
+            static_argnames="config",
+            compiler_options=options,
+        )
+        analysis: Any = program.lower(params, images, both.config).compile().memory_analysis()
+        return devices * (analysis.temp_size_in_bytes + analysis.output_size_in_bytes)
+
+    return Contender("ours, over devices" if spread else "ours", call, memory)
+
+
+def first_calls(contenders: Sequence[Contender], tolerance: float) -> dict[str, float]:
+    """Seconds until each one's first result, compiling included; the results are equal.
+
+    Raises:
+        RuntimeError: they are not.
+    """
+    seconds, expected = {}, None
+    for one in contenders:
+        started = time.perf_counter()
+        found = one.call()
+        seconds[one.name] = time.perf_counter() - started
+        found = np.asarray(found.float().cpu() if isinstance(found, torch.Tensor) else found)
+        expected = found if expected is None else expected
+        off = np.abs(found.astype(np.float64) - expected).max()
+        if not off < tolerance:
+            raise RuntimeError(f"{one.name}: differs from {contenders[0].name} by {off:.1e}")
+    return seconds
+
+
+HEADER = (
+    *("model", "images", "contender", "times faster", "share of the machine"),
+    *("first call, s", "MB"),
+)
+
+
+class Lines(NamedTuple):
+    """What comes of one race."""
+
+    values: list[dict[str, Any]]
+    rows: list[tuple[str, ...]]
+
+
+def lines(
+    title: str,
+    batch: int,
+    contenders: Sequence[Contender],
+    timed: dict[str, Timed],
+    first: dict[str, float],
+    operations: float,
+    rate: float,
+) -> Lines:
+    """The table's rows; `operations` are those of a call, `rate` the machine's a second."""
+    best = min((n for n in TORCHES if n in timed), key=lambda name: timed[name].median)
+    found = Lines([], [])
+    for one in contenders:
+        faster = ratio(timed[best], timed[one.name])
+        seconds = 1e-3 * timed[one.name].median
+        share, memory = operations / seconds / rate, one.memory()
+        found.values.append(
+            {
+                "model": title,
+                "batch": batch,
+                "contender": one.name,
+                "ms": timed[one.name].rounds,
+                "images per second": batch / seconds,
+                "faster than the better torch": faster,
+                "share of the machine": share,
+                "first call": first[one.name],
+                "memory": memory,
+            }
+        )
+        cells = (times(faster), f"{100 * share:.0f} %", f"{first[one.name]:.1f}", megabytes(memory))
+        if torch.cuda.is_available():
+            cells = (f"{cells[0]}, {batch / seconds:.0f} images/s", *cells[1:])
+        found.rows.append((title, f"{batch}", one.name, *cells))
+    return found
+
+
+def draw(values: list[dict[str, Any]]) -> Any:
+    """Times faster than the better torch, a panel a model."""
+    titles = tuple(dict.fromkeys(f"{v['model']}, {v['batch']} images" for v in values))
+    names = list(dict.fromkeys(value["contender"] for value in values))
+    figure, axes = panels(len(titles), titles, width=2.9, height=2.4, sharey=False)
+    for one, title in zip(axes, titles, strict=True):
+        chosen = [v for v in values if f"{v['model']}, {v['batch']} images" == title]
+        medians = [value["faster than the better torch"][0] for value in chosen]
+        colours = [COLOURS[names.index(value["contender"])] for value in chosen]
+        places = range(len(chosen))
+        one.barh(places, medians, color=colours)
+        for place, median in zip(places, medians, strict=True):
+            one.annotate(f" {median:.2f}", (median, place), va="center", fontsize=8)
+        one.axvline(1, color="#757575", linewidth=0.8)
+        one.set_yticks(places, [value["contender"] for value in chosen], fontsize=8)
+        one.invert_yaxis()
+        one.set_xlim(0, 1.25 * max(medians))
+        one.grid(visible=False)
+        one.set_xlabel("times the better torch's speed", fontsize=8)
+    return figure
+
+
+def caption(what: str, arguments: argparse.Namespace) -> str:
+    return (
+        f"{what}, {arguments.dtype}, {machine()}; medians and ranges of {arguments.rounds} rounds "
+        f"of {arguments.calls} calls. Times faster: than the better of torch eager and "
+        "torch.compile."
+    )
+
+
+def flags(description: str, presets: list[str], batches: list[int]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/performance"))
+    parser.add_argument("--page", type=pathlib.Path, help="also put the table into this page")
+    parser.add_argument("--presets", nargs="+", default=presets, choices=list(PRESETS))
+    parser.add_argument("--batches", type=int, nargs="+", default=batches)
+    parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--calls", type=int, default=2)
+    return parser
+
+
+def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:
+    save(name, study, arguments.out)
+    if arguments.page is not None:
+        splice(arguments.page, name, study.table)
+    print(markdown(study.table), flush=True)
+
+
+def at_size(config: ModelConfig, size: str | None) -> ModelConfig:
+    if size is None:
+        return config
+    height, width = map(int, size.split("x"))
+    return dataclasses.replace(config, image_size=(height, width))
+
+
+def main() -> None:
+    parser = flags(__doc__ or "", ["tiny", "s14", "b14"], [8, 16])
+    parser.add_argument("--sizes", nargs="+", default=[None], help="such as 322x322")
+    arguments = parser.parse_args()
+    rate = product_rate(arguments.dtype)
+    values, rows = [], []
+    for preset, size, batch in itertools.product(
+        arguments.presets, arguments.sizes, arguments.batches
+    ):
+        config = at_size(PRESETS[preset], size)
+        both = sides(config, preset, batch, arguments.dtype)
+        contenders = [by_torch(both, False), by_torch(both, True), by_us(both, False)]
+        if len(jax.local_devices()) > 1:
+            contenders.append(by_us(both, True))
+        first = first_calls(contenders, TOLERANCES[arguments.dtype])
+        timed = race({one.name: one.call for one in contenders}, arguments.rounds, arguments.calls)
+        operations = 2 * batch * sum(cost.macs for cost in part_costs(config, images=batch))
+        title = f"{preset} at {config.image_size[0]} x {config.image_size[1]}"
+        found = lines(title, batch, contenders, timed, first, operations, rate)
+        values += found.values
+        rows += found.rows
+        torch.compiler.reset()
+    table = Table(HEADER, rows, caption("Descriptors of a batch", arguments), 3)
+    leave("bench_describe", Study(table, values, draw(values)), arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""Images trained on a second, beside the same step in torch, in one run.
+
+    python scripts/bench_train.py [--out docs/performance] [--page docs/performance.md]
+        [--presets b14 ...] [--batches 8 16] [--dtype bfloat16]
+
+The step is that of the preset's recipe: the paper's (frozen backbone; adapters and head train), and
+for `tiny` all of the model. It is the whole of it: forward with dropout, mining, loss, backward,
+AdamW. Batches are of 4 images a place. Weights, images and the rest are as in `bench_describe.py`.
+
+Before anything is timed, losses without dropout are checked to be equal; that 20 steps are, the
+parity checks show. The operations are counted as twice the forward's for what passes the gradient
+on, and three times for what trains too.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from bench_describe import (
+    HEADER,
+    TOLERANCES,
+    TORCHES,
+    Contender,
+    Sides,
+    by_torch,
+    caption,
+    draw,
+    flags,
+    leave,
+    lines,
+    sides,
+)
+from fragments import Study, Table
+from racing import product_rate, race, torch_memory, wait
+
+# After racing, which says how many devices there are.
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+import torch  # isort: skip
+
+from crisalad_jax import platform
+from crisalad_jax.config import TrainConfig, recipe
+from crisalad_jax.costs import part_costs
+from crisalad_jax.losses import multi_similarity_loss
+from crisalad_jax.model import describe
+from crisalad_jax.training import StepConfig, init_state, train_step
+from parity.reference.losses import multi_similarity_loss as torch_loss
+from parity.reference.training import clip_gradients, freeze
+
+IMAGES_PER_PLACE = 4
+STEPS = 1000
+"""Length of the schedule: longer than any race."""
+
+
+def labels(both: Sides) -> np.ndarray:
+    return (np.arange(len(both.images)) // IMAGES_PER_PLACE).astype(np.int32)
+
+
+def torch_step(both: Sides, config: TrainConfig, compiled: bool) -> Contender:
+    parameters = freeze(both.theirs, config.trains)
+    model = torch.compile(both.theirs, dynamic=False) if compiled else both.theirs
+    places = torch.from_numpy(labels(both)).long().to(both.normalised.device)
+    optimiser = torch.optim.AdamW(parameters, lr=config.optimiser.learning_rate)
+
+    def call() -> float:
+        both.theirs.train()
+        optimiser.zero_grad()
+        loss = torch_loss(model(both.normalised), places, config.loss).loss
+        loss.backward()
+        if config.optimiser.clip_norm is not None:
+            clip_gradients(parameters, config.optimiser.clip_norm)
+        optimiser.step()
+        wait()
+        return loss.item()
+
+    return Contender(TORCHES[compiled], call, lambda: torch_memory(call))
+
+
+def our_step(both: Sides, config: TrainConfig) -> Contender:
+    step = StepConfig(both.config, config.loss, config.optimiser, STEPS)
+    state, frozen = init_state(both.ours, config.trains, step)
+    state = jax.tree.map(jnp.copy, state)
+    rest = (
+        frozen,
+        *jax.device_put((both.images, labels(both), np.ones(len(both.images), bool))),
+        jax.random.key(0),
+    )
+
+    def call() -> float:
+        nonlocal state
+        state, metrics = train_step(state, *rest, step)
+        return float(metrics.loss)
+
+    def memory() -> int:
+        program = jax.jit(
+            train_step.__wrapped__,  # pyright: ignore[reportFunctionMemberAccess]
+            static_argnames="config",
+            donate_argnames="state",
+            compiler_options=platform.compiler_options(),
+        )
+        analysis: Any = program.lower(state, *rest, step).compile().memory_analysis()
+        return analysis.temp_size_in_bytes
+
+    return Contender("ours", call, memory)
+
+
+def check(both: Sides, config: TrainConfig, tolerance: float) -> None:
+    """The losses without dropout are equal.
+
+    Raises:
+        RuntimeError: they are not.
+    """
+    theirs = by_torch(both, compiled=False).call()
+    places = labels(both)
+    expected = float(torch_loss(theirs.float().cpu(), torch.from_numpy(places), config.loss).loss)
+    ours = describe(both.ours, jax.device_put(both.images), both.config)
+    everyone = jnp.ones(len(places), bool)
+    found = float(multi_similarity_loss(ours, jnp.asarray(places), config.loss, valid=everyone)[0])
+    if not abs(found - expected) < tolerance * expected:
+        raise RuntimeError(f"ours: loss {found} differs from torch's {expected}")
+
+
+def operations(config: TrainConfig, batch: int) -> float:
+    """Of one step, in products alone."""
+    total = 0
+    for cost in part_costs(config.model, images=batch):
+        frozen = config.trains != "all" and cost.part.startswith("backbone")
+        # Nothing that trains is before the embedding.
+        passes = 1 if frozen and "embedding" in cost.part else 2 if frozen else 3
+        total += 2 * batch * passes * cost.macs
+    return total
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    started = time.perf_counter()
+    call()
+    return time.perf_counter() - started
+
+
+def main() -> None:
+    parser = flags(__doc__ or "", ["tiny", "s14", "b14"], [8, 16])
+    arguments: argparse.Namespace = parser.parse_args()
+    rate = product_rate(arguments.dtype)
+    values, rows = [], []
+    for preset in arguments.presets:
+        config = recipe(preset)
+        for batch in arguments.batches:
+            both = sides(config.model, preset, batch, arguments.dtype)
+            # A descriptor's tolerance times the 40 of the loss's exponent.
+            check(both, config, 40 * TOLERANCES[arguments.dtype])
+            contenders = [
+                torch_step(both, config, False),
+                torch_step(both, config, True),
+                our_step(both, config),
+            ]
+            first = {one.name: seconds(one.call) for one in contenders}
+            timed = race(
+                {one.name: one.call for one in contenders}, arguments.rounds, arguments.calls
+            )
+            title = f"{preset} at {config.model.image_size[0]} x {config.model.image_size[1]}"
+            found = lines(title, batch, contenders, timed, first, operations(config, batch), rate)
+            values += found.values
+            rows += found.rows
+            torch.compiler.reset()
+    table = Table(HEADER, rows, caption("A training step", arguments), 3)
+    leave("bench_train", Study(table, values, draw(values)), arguments)
+
+
+if __name__ == "__main__":
+    main()
