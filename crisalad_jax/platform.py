@@ -5,6 +5,7 @@ import functools
 import math
 import os
 import pathlib
+import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -13,26 +14,28 @@ import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-# oneDNN's products one by one. By default jaxlib turns attention as a whole into a call of another
-# library, which takes several times as long (scripts/bench_describe.py has figures).
-_CPU_OPTIONS: dict[str, bool | str] = {
+# By default jaxlib gives attention as a whole, and other products, to a library (YNN) that takes
+# longer than Eigen's products do, one by one (docs/performance.md).
+_CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_experimental_ynn_fusion_type": ""}
+# oneDNN's take a few percent less again, but a program with them cannot be kept in a file.
+_ONEDNN_OPTIONS: dict[str, bool | str] = {
     "xla_cpu_use_onednn": True,
     "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
-    "xla_cpu_experimental_ynn_fusion_type": "",
 }
 _Tree = TypeVar("_Tree")
 
 
 @functools.cache
-def compiler_options() -> dict[str, bool | str]:
+def compiler_options(*, kept: bool) -> dict[str, bool | str]:
     """Options of XLA that make this package's programs faster on the default platform.
 
-    Those are left out that this version of jaxlib does not know.
+    Those are left out that this version of jaxlib does not know, and with `kept` those under which
+    a program cannot be kept in the compile cache.
     """
     if jax.default_backend() != "cpu":
         return {}
     known = {}
-    for name, value in _CPU_OPTIONS.items():
+    for name, value in (_CPU_OPTIONS if kept else _CPU_OPTIONS | _ONEDNN_OPTIONS).items():
         try:
             jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
         except Exception:  # jaxlib's own class, and which one has changed
@@ -41,16 +44,20 @@ def compiler_options() -> dict[str, bool | str]:
     return known
 
 
-def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+def jit(
+    function: Callable[..., Any], *, runs_long: bool = False, **options: Any
+) -> Callable[..., Any]:
     """`jax.jit` with `compiler_options`, where the call is not inside of another transformation.
 
-    There the options of the outermost `jit` hold, and JAX takes no others.
+    There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long` is
+    compiled for the shortest run even where the compile cache is on, which it then cannot enter.
     """
     inner = jax.jit(function, **options)
 
     @functools.cache
     def outermost() -> Any:
-        return jax.jit(function, compiler_options=compiler_options(), **options)
+        kept = not runs_long and jax.config.jax_compilation_cache_dir is not None  # pyright: ignore
+        return jax.jit(function, compiler_options=compiler_options(kept=kept), **options)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -81,6 +88,7 @@ def set_up() -> None:
         jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(root) / "crisalad-jax"))
         # What takes less is compiled as soon as it is read.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        warnings.filterwarnings("ignore", "Error writing .* onednn-fusion")  # see `jit`
 
 
 def _cores() -> int:

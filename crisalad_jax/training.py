@@ -144,7 +144,7 @@ def init_state(params: Crisalad, trains: str, config: StepConfig) -> tuple[Train
     return TrainState(jnp.zeros((), jnp.int32), trainable, optimiser), frozen
 
 
-@functools.partial(platform.jit, static_argnames="config", donate_argnames="state")
+@functools.partial(platform.jit, runs_long=True, static_argnames="config", donate_argnames="state")
 def train_step(
     state: TrainState,
     frozen: PyTree,

@@ -108,7 +108,7 @@ def by_us(both: Sides, spread: bool) -> Contender:
         return jax.block_until_ready(describe(params, images, both.config))
 
     def memory() -> int:
-        options = platform.compiler_options()
+        options = platform.compiler_options(kept=False)
         program = jax.jit(
             describe.__wrapped__,  # pyright: ignore[reportFunctionMemberAccess]
             static_argnames="config",

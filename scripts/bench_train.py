@@ -98,7 +98,7 @@ def our_step(both: Sides, config: TrainConfig) -> Contender:
             train_step.__wrapped__,  # pyright: ignore[reportFunctionMemberAccess]
             static_argnames="config",
             donate_argnames="state",
-            compiler_options=platform.compiler_options(),
+            compiler_options=platform.compiler_options(kept=False),
         )
         analysis: Any = program.lower(state, *rest, step).compile().memory_analysis()
         return analysis.temp_size_in_bytes

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crisalad_jax import platform
 from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import (
     CrossImageConfig,
@@ -96,6 +97,13 @@ def write_town(root: pathlib.Path) -> pathlib.Path:
             seed = 500 + round(east / 40)
             write_picture(root / "images" / "test" / part / name, seed, noise=20.0)
     return root
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """No test fills the user's compile cache, nor changes for others how this process computes."""
+    monkeypatch.setattr(platform, "set_up", lambda: None)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from crisalad_jax.errors import InputError
 
 OnBadImage = Literal["skip", "stop"]
 BATCHES_AHEAD = 2
+THREADS = min(os.cpu_count() or 2, 16)
+"""OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
 
 _Image = UInt8[np.ndarray, "h w 3"]
 
@@ -81,7 +83,7 @@ def training_batches(
     epoch: int,
     start_step: int = 0,
     on_bad_image: OnBadImage = "stop",
-    threads: int = 2,
+    threads: int = THREADS,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Batches of one epoch, places_per_batch x images_per_place images each, place after place.
@@ -145,7 +147,7 @@ def image_batches(
     image_size: tuple[int, int],
     batch_size: int,
     on_bad_image: OnBadImage = "stop",
-    threads: int = 2,
+    threads: int = THREADS,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Batches of the images in `paths`, in order; the last one is padded to `batch_size`.

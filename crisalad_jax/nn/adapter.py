@@ -6,6 +6,7 @@ an untrained adapter changes nothing.
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ViTConfig
@@ -116,7 +117,7 @@ def adapter(
     before them take no part in the convolutions, which act on them as the identity, so with the
     skip they count twice, as in CricaVPR. The MLP adapter has neither convolutions nor skip.
     """
-    hidden = jax.nn.relu(linear(params.down, tokens))
+    hidden = jax.nn.relu(checkpoint_name(linear(params.down, tokens), "down"))
     if isinstance(params, MlpAdapter):
         return linear(params.up, hidden)
     special = tokens.shape[0] - grid[0] * grid[1]
@@ -133,7 +134,9 @@ def _separable(
     params: DepthwiseAdapter, x: Float[Array, "height width dim"]
 ) -> Float[Array, "height width dim"]:
     # No activation between the two convolutions, as in Xception.
-    return jax.nn.relu(linear(params.pointwise, depthwise_conv(params.depthwise, x)))
+    return jax.nn.relu(
+        checkpoint_name(linear(params.pointwise, depthwise_conv(params.depthwise, x)), "mixed")
+    )
 
 
 def _multi_resolution(

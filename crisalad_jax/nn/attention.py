@@ -7,6 +7,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.nn.layers import Linear, dropout, linear
@@ -38,7 +39,7 @@ def attention(
     tokens, dim = x.shape
     # With the heads in front every product is a plain batched matmul. Queries are columns: so is
     # what becomes of them, and the softmax runs down columns, which is faster on a CPU.
-    qkv = linear(params.qkv, x).reshape(tokens, 3, heads, dim // heads)
+    qkv = checkpoint_name(linear(params.qkv, x), "qkv").reshape(tokens, 3, heads, dim // heads)
     queries = (qkv[:, 0] / math.sqrt(dim // heads)).transpose(1, 2, 0)
     keys, values = qkv[:, 1].transpose(1, 0, 2), qkv[:, 2].transpose(1, 0, 2)
     wide = jnp.promote_types(x.dtype, jnp.float32)

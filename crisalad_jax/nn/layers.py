@@ -147,16 +147,13 @@ def _standardise_jvp(
     return y, scale * (change - change.mean(axis=-1, keepdims=True) - y * along)
 
 
-# prevent_cse=False: in a scan nothing can undo the saving.
-@functools.partial(jax.checkpoint, prevent_cse=False)
 def depthwise_conv(
     params: DepthwiseConv, x: Float[Array, "height width dim"]
 ) -> Float[Array, "height width dim"]:
     """Convolve every channel with its own filter (cross-correlation, as torch), zero padding.
 
     A sum of k x k shifted products: for small filters XLA fuses it into one pass over `x`, where
-    its grouped convolution is many times slower on a CPU. For the gradient `x` is kept, not all its
-    shifts.
+    its grouped convolution is many times slower on a CPU.
     """
     size = params.weight.shape[0]
     height, width, _ = x.shape

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
 from crisalad_jax.config import PATCH_SIZE, ViTConfig
@@ -27,6 +28,9 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.pytree import params
 
 NORM_EPSILON = 1e-6
+KEPT = ("qkv", "attended", "hidden", "down", "mixed")
+"""What a block keeps for its gradient, beside its input: the large products' results, by the names
+that they are given. The rest is made again: normalisations, softmax, activations, small products."""
 
 
 @params
@@ -165,13 +169,16 @@ def embed(
 def run_blocks(
     params: ViT, tokens: Float[Array, "token dim"], grid: tuple[int, int], config: ViTConfig
 ) -> Float[Array, "token dim"]:
-    """All blocks in turn, by one compiled body."""
+    """All blocks in turn, by one compiled body, of whose work the gradient keeps `KEPT`."""
 
     def body(
         carry: Float[Array, "token dim"], one: Block
     ) -> tuple[Float[Array, "token dim"], None]:
         return block(one, carry, grid, config), None
 
+    policy = jax.checkpoint_policies.save_only_these_names(*KEPT)
+    # prevent_cse=False: in a scan nothing can undo the saving.
+    body = jax.checkpoint(body, prevent_cse=False, policy=policy)
     stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
     for stack in stacks:
         tokens, _ = jax.lax.scan(body, tokens, stack)
@@ -185,6 +192,7 @@ def block(
     normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
     attended = attention(params.attn, normed, config.heads, key=None)
     tokens = (widen(tokens) + params.ls1 * widen(attended)).astype(tokens.dtype)
+    tokens = checkpoint_name(tokens, "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
     update = feed_forward(params.mlp, normed)
     if params.adapter is not None:
@@ -195,7 +203,7 @@ def block(
 def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
     """GELU network, or SwiGLU (Shazeer 2020) where the parameters are its."""
     if isinstance(params, Mlp):
-        return linear(params.fc2, gelu(linear(params.fc1, x)))
+        return linear(params.fc2, gelu(checkpoint_name(linear(params.fc1, x), "hidden")))
     gate, value = jnp.split(linear(params.w12, x), 2, axis=-1)
     return linear(params.w3, jax.nn.silu(gate) * value)
 
