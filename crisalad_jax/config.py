@@ -212,7 +212,7 @@ class SinkhornConfig:
         )
         _require(
             isinstance(self.anderson, int) and (self.anderson == 0 or self.anderson > 1),
-            f"SinkhornConfig.anderson: found {self.anderson}, expected 0 or at least 2",
+            f"SinkhornConfig.anderson: found {self.anderson}, expected 0 or a whole number from 2",
         )
         self._check_pairs()
 

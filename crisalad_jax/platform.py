@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import math
 import os
 import pathlib
 import warnings
@@ -51,13 +50,17 @@ def jit(
 
     There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long` is
     compiled for the shortest run even where the compile cache is on, which it then cannot enter.
+    What comes back has `lower` too.
     """
     inner = jax.jit(function, **options)
 
     @functools.cache
-    def outermost() -> Any:
-        kept = not runs_long and jax.config.jax_compilation_cache_dir is not None  # pyright: ignore
+    def with_options(kept: bool) -> Any:
         return jax.jit(function, compiler_options=compiler_options(kept=kept), **options)
+
+    def outermost() -> Any:
+        caches = jax.config.jax_compilation_cache_dir is not None  # pyright: ignore
+        return with_options(caches and not runs_long)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -66,6 +69,7 @@ def jit(
         traced = any(isinstance(leaf, Tracer) for leaf in leaves)
         return (inner if traced else outermost())(*args, **kwargs)
 
+    call.__dict__["lower"] = lambda *args, **kwargs: outermost().lower(*args, **kwargs)
     return call
 
 
@@ -88,7 +92,7 @@ def set_up() -> None:
         jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(root) / "crisalad-jax"))
         # What takes less is compiled as soon as it is read.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-        warnings.filterwarnings("ignore", "Error writing .* onednn-fusion")  # see `jit`
+    warnings.filterwarnings("ignore", "Error writing .* onednn-fusion")  # see `jit`
 
 
 def _cores() -> int:
@@ -101,7 +105,8 @@ def _cores() -> int:
 def _mesh(count: int) -> Mesh:
     """As many local devices as share `count` images alike."""
     devices = jax.local_devices()
-    return Mesh(np.array(devices[: math.gcd(count, len(devices))]), ("image",))
+    most = max(n for n in range(1, len(devices) + 1) if count % n == 0)
+    return Mesh(np.array(devices[:most]), ("image",))
 
 
 def over_devices(images: np.ndarray) -> jax.Array:
@@ -112,7 +117,7 @@ def over_devices(images: np.ndarray) -> jax.Array:
 def on_every_device(tree: _Tree, count: int) -> _Tree:
     """Arrays that programs on batches of `count` images read: on all the devices of such a batch.
 
-    The virtual devices of a CPU share one copy.
+    The virtual devices of a CPU share one copy: that of a numpy array must stay as it is.
     """
     sharding = NamedSharding(_mesh(count), PartitionSpec())
 

@@ -28,8 +28,8 @@ SCALING_RANGE = 60
 Within it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
 exp(-87), is no part of such a sum's last place."""
 FALLBACK_BATCH = 4
-"""So many problems at a time are solved again where the scaling domain would not do: memory for
-a fallback is set aside whether or not it is taken."""
+"""So many problems at a time are solved again where the scaling domain would not do and a gradient
+through the iterations is asked for: memory for it is set aside whether or not it is taken."""
 UNROLLED = 8
 """Up to so many iterations are written out for the compiler; more are a scan."""
 
@@ -82,6 +82,8 @@ class _ScalingProblem(Problem):
     the compiler need not write out, and powers of two are left.
     """
 
+    fits: Bool[Array, ""]
+    """Where False, what comes out is finite and of no use."""
     row_max: Float[Array, "*batch rows"]
     gibbs: Float[Array, "*batch rows columns-1"]
     """exp(kernel - row_max)."""
@@ -90,13 +92,16 @@ class _ScalingProblem(Problem):
     def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
         scaled, top = _exponentials(column)
         sums = _product("...nk,...k->...n", self.gibbs, scaled[..., :-1])
-        return self.row_max + jnp.log(sums + self.last * scaled[..., -1:]) + top
+        return self.row_max + self._log(sums + self.last * scaled[..., -1:]) + top
 
     def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
         scaled, top = _exponentials(row + self.row_max)
         sums = _product("...nk,...n->...k", self.gibbs, scaled)
         last = (self.last * scaled).sum(axis=-1, keepdims=True)
-        return jnp.log(jnp.concatenate([sums, last], axis=-1)) + top
+        return self._log(jnp.concatenate([sums, last], axis=-1)) + top
+
+    def _log(self, sums: Array) -> Array:
+        return jnp.log(jnp.where(self.fits, sums, 1))
 
 
 @params
@@ -417,7 +422,7 @@ def _solve(
     fits, scaled = _scale(kernel)
     return jax.lax.cond(
         fits,
-        lambda: _run(_ScalingProblem(kernel, log_mu, log_nu, *scaled), step, config),
+        lambda: _run(_ScalingProblem(kernel, log_mu, log_nu, fits, *scaled), step, config),
         lambda: _run(logarithmic, step, config),
     )
 
@@ -475,7 +480,7 @@ def _unrolled_forward(
     fits, scaled = _scale(inputs.kernel)
 
     def start(inputs: _Inputs, gibbs: Array, last: Array) -> Problem:
-        return _ScalingProblem(*inputs, scaled.row_max, gibbs, last)
+        return _ScalingProblem(*inputs, fits, scaled.row_max, gibbs, last)
 
     # The kernel as well: a step of the user's own may read it.
     found, pull = _pull(start, (inputs, scaled.gibbs, scaled.last), step, config)
@@ -504,7 +509,8 @@ def _logarithmic(inputs: _Inputs) -> Problem:
 
 def _flat(tree: Any, batch: tuple[int, ...]) -> Any:
     """With one axis for all of the batch."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), tree)
+    count = math.prod(batch)
+    return jax.tree.map(lambda x: x.reshape(count, *x.shape[len(batch) :]), tree)
 
 
 def _pull(

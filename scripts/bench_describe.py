@@ -108,13 +108,7 @@ def by_us(both: Sides, spread: bool) -> Contender:
         return jax.block_until_ready(describe(params, images, both.config))
 
     def memory() -> int:
-        options = platform.compiler_options(kept=False)
-        program = jax.jit(
-            describe.__wrapped__,  # pyright: ignore[reportFunctionMemberAccess]
-            static_argnames="config",
-            compiler_options=options,
-        )
-        analysis: Any = program.lower(params, images, both.config).compile().memory_analysis()
+        analysis: Any = describe.lower(params, images, both.config).compile().memory_analysis()  # pyright: ignore
         return devices * (analysis.temp_size_in_bytes + analysis.output_size_in_bytes)
 
     return Contender("ours, over devices" if spread else "ours", call, memory)

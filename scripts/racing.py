@@ -1,4 +1,4 @@
-"""Programs timed side by side in one run, and what a machine can do at most.
+"""Programs timed side by side in one run, and a measure of what the machine can do.
 
 Fairness. The contenders take turns, `rounds` times: a pause of a quarter of a second, in which the
 threads of the one before stop spinning (OpenMP's do so after each call), as long again of calls
@@ -11,18 +11,23 @@ import itertools
 import os
 import pathlib
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 # On a GPU jax would take most of the memory at once, and leave torch too little.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-# As the command line does.
+# As the command line does, where all cores may be used.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(os.cpu_count()))
 
 import jax
 import jax.numpy as jnp
 import torch
+
+# First calls are from nothing, whatever ran before.
+_KERNELS = tempfile.TemporaryDirectory(prefix="inductor-")
+os.environ["TORCHINDUCTOR_CACHE_DIR"] = _KERNELS.name
 
 PAUSE = 0.25
 GEMM = 4096

@@ -35,9 +35,10 @@ def in_a_program(source: str, home: pathlib.Path, **environment: str) -> str:
 
 @pytest.fixture
 def _options_anew() -> Any:
-    platform.compiler_options.cache_clear()
+    options = platform.compiler_options  # a test may put another in its place
+    options.cache_clear()
     yield
-    platform.compiler_options.cache_clear()
+    options.cache_clear()
 
 
 @pytest.mark.usefixtures("_options_anew")
@@ -49,19 +50,42 @@ def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.Monk
 
 
 @pytest.mark.usefixtures("_options_anew")
-def test_an_accelerator_has_options_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_accelerator_has_no_options(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert platform.compiler_options(kept=True) == platform.compiler_options(kept=False) == {}
 
 
-@pytest.mark.usefixtures("_options_anew")
-@pytest.mark.parametrize("runs_long", [False, True])
-def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch, runs_long: bool) -> None:
-    """One of a wrong type stops it."""
+def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that it does not know stops it."""
     monkeypatch.setattr(platform, "compiler_options", lambda **_: {"xla_no_such_option": True})
-    function = platform.jit(lambda x: x + 1, runs_long=runs_long)
+    function = platform.jit(lambda x: x + 1)
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
         function(jnp.ones(3))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
+        function.lower(jnp.ones(3)).compile()  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def test_programs_can_be_kept_where_a_cache_would_and_they_do_not_run_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = []
+
+    def options(*, kept: bool) -> dict[str, bool]:
+        asked.append(kept)
+        return {}
+
+    monkeypatch.setattr(platform, "compiler_options", options)
+    short, long = platform.jit(lambda x: x + 1), platform.jit(lambda x: x + 2, runs_long=True)
+    before = jax.config.jax_compilation_cache_dir
+    try:
+        for place in (None, "/dev/null/nowhere"):
+            jax.config.update("jax_compilation_cache_dir", place)
+            short.lower(1.0)
+            long.lower(1.0)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+    # The long one's answer is the same, and is not asked for again.
+    assert asked == [False, False, True]
 
 
 WAYS: dict[str, Callable[[Any], Any]] = {
@@ -112,7 +136,7 @@ print(count, len(spread.sharding.device_set), len(found.local.sharding.device_se
 """
 
 
-@pytest.mark.parametrize(("devices", "used"), [(1, 1), (3, 3), (4, 2)])
+@pytest.mark.parametrize(("devices", "used"), [(1, 1), (3, 3), (4, 3)])
 def test_images_are_spread_and_parameters_shared(
     devices: int, used: int, tmp_path: pathlib.Path
 ) -> None:
@@ -128,7 +152,9 @@ from crisalad_jax import platform
 platform.set_up()
 print(len(jax.devices()), len(os.sched_getaffinity(0)), jax.config.jax_compilation_cache_dir)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-platform.jit(lambda x: x @ x)(jax.numpy.ones((64, 64))).block_until_ready()
+def squared(x):
+    return x @ x
+platform.jit(squared)(jax.numpy.ones((64, 64))).block_until_ready()
 """
 
 
@@ -138,7 +164,7 @@ def test_a_device_a_core_and_programs_are_kept(tmp_path: pathlib.Path) -> None:
     devices, cores, place = in_a_program(SET_UP, tmp_path).split()
     assert devices == cores
     assert place == str(cache)
-    assert list(cache.iterdir())
+    assert list(cache.glob("jit_squared-*"))
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")

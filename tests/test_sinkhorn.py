@@ -534,6 +534,28 @@ def test_counts_and_flags_may_be_used_while_differentiating(gradient: Any) -> No
     np.testing.assert_allclose(used, plain, rtol=1e-5)  # a product and a quotient, rounded
 
 
+@pytest.mark.parametrize("apart", [1.0, 100.0])
+def test_one_column_has_a_plan_and_a_gradient(apart: float) -> None:
+    """All mass goes there, whatever the scores."""
+    scores = apart * scores_of(0, 2, 6, 1)
+
+    def of(scores: jax.Array) -> jax.Array:
+        return sinkhorn(scores, jnp.zeros(6), jnp.log(jnp.array([6.0]))).log_plan
+
+    # Potentials of the scores' size cancel them.
+    np.testing.assert_allclose(of(scores), np.zeros((2, 6, 1)), atol=1e-6 * apart)
+    gradient = jax.grad(lambda scores: (scores_of(1, 2, 6, 1) * of(scores)).sum())(scores)
+    np.testing.assert_allclose(gradient, np.zeros((2, 6, 1)), atol=1e-6)
+
+
+def test_no_nan_on_the_way_where_scaling_does_not_do() -> None:
+    """What the unused domain computes is finite: a hunt for NaNs finds none."""
+    scores = jnp.zeros((12, 4)).at[3, 2].set(-80.0)
+    with jax.debug_nans(True):
+        gradient = jax.grad(lambda s: jnp.exp(assign(s, jnp.float32(1)).log_plan).max())(scores)
+    assert np.isfinite(gradient).all()
+
+
 @pytest.mark.parametrize(
     "config",
     [SinkhornConfig(), implicit(anderson=3), implicit(method="newton")],

@@ -208,8 +208,8 @@ def _gelu_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
     wide = widen(x)
     below = _normal_cdf(wide)
     density = jnp.exp(-0.5 * jnp.square(wide)) / math.sqrt(2 * math.pi)
-    slope = (below + wide * density).astype(x.dtype)
-    return (wide * below).astype(x.dtype), slope * change
+    slope = below + wide * density
+    return (wide * below).astype(x.dtype), (slope * widen(change)).astype(x.dtype)
 
 
 def dropout(

@@ -29,8 +29,8 @@ from crisalad_jax.pytree import params
 
 NORM_EPSILON = 1e-6
 KEPT = ("qkv", "attended", "hidden", "down", "mixed")
-"""What a block keeps for its gradient, beside its input: the large products' results, by the names
-that they are given. The rest is made again: normalisations, softmax, activations, small products."""
+"""What a block keeps for its gradient, beside its input: results of its large products and the
+tokens between its halves, by their names. The rest is made again: softmax, activations and such."""
 
 
 @params
@@ -204,7 +204,7 @@ def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[A
     """GELU network, or SwiGLU (Shazeer 2020) where the parameters are its."""
     if isinstance(params, Mlp):
         return linear(params.fc2, gelu(checkpoint_name(linear(params.fc1, x), "hidden")))
-    gate, value = jnp.split(linear(params.w12, x), 2, axis=-1)
+    gate, value = jnp.split(checkpoint_name(linear(params.w12, x), "hidden"), 2, axis=-1)
     return linear(params.w3, jax.nn.silu(gate) * value)
 
 

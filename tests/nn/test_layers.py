@@ -5,6 +5,7 @@ Bounds of 1e-6 relative to outputs of order 1 are a few units of float32's last 
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +87,33 @@ def test_layer_norm_equals_torch() -> None:
         LayerNorm(jnp.asarray(weight), jnp.asarray(bias)), jnp.asarray(x), epsilon=1e-2
     )
     np.testing.assert_allclose(ours, expected, atol=5e-6)
+
+
+def test_derivatives_that_jax_is_told_are_torchs() -> None:
+    """Of GELU and of layer norm; of their gradients too, for which nothing is told."""
+    x, towards, again = (normal(seed, 5, 7) for seed in (3, 4, 5))
+    params = LayerNorm(jnp.asarray(normal(6, 7)), jnp.asarray(normal(7, 7)))
+    weight, bias = torch.tensor(np.array(params.weight)), torch.tensor(np.array(params.bias))
+
+    def torch_norm(x: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.layer_norm(x, (7,), weight, bias, 1e-6)
+
+    pairs = (
+        (gelu, torch.nn.functional.gelu),
+        (lambda x: layer_norm(params, x, epsilon=1e-6), torch_norm),
+    )
+    for ours, theirs in pairs:
+        at = torch.tensor(x, requires_grad=True)
+        (first,) = torch.autograd.grad(theirs(at), at, torch.tensor(towards), create_graph=True)
+        (second,) = torch.autograd.grad(first, at, torch.tensor(again))
+
+        def gradient(x: jax.Array, ours: Any = ours) -> jax.Array:
+            return jax.vjp(ours, x)[1](jnp.asarray(towards))[0]
+
+        found, pull = jax.vjp(gradient, jnp.asarray(x))
+        # Numbers of order 10, a dozen roundings each.
+        np.testing.assert_allclose(found, first.detach(), atol=1e-5)
+        np.testing.assert_allclose(pull(jnp.asarray(again))[0], second, atol=1e-5)
 
 
 def test_layer_norm_of_bfloat16_is_computed_in_float32() -> None:
