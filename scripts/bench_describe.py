@@ -186,7 +186,7 @@ def draw(values: list[dict[str, Any]]) -> Any:
     """Times faster than the better torch, a panel a model."""
     titles = tuple(dict.fromkeys(f"{v['model']}, {v['batch']} images" for v in values))
     names = list(dict.fromkeys(value["contender"] for value in values))
-    figure, axes = panels(len(titles), titles, width=2.9, height=2.4, sharey=False)
+    figure, axes = panels(len(titles), titles, width=3.4, height=2.4, sharey=False)
     for one, title in zip(axes, titles, strict=True):
         chosen = [v for v in values if f"{v['model']}, {v['batch']} images" == title]
         medians = [value["faster than the better torch"][0] for value in chosen]
