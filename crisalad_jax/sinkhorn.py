@@ -403,6 +403,15 @@ def _scale(kernel: Array) -> tuple[Bool[Array, ""], _Scaled]:
     return fits, _Scaled(row_max, gibbs, jnp.where(fits, jnp.exp(last - row_max), last))
 
 
+def _scaling(problem: Problem, fits: Bool[Array, ""], scaled: _Scaled) -> Problem:
+    return _ScalingProblem(problem.kernel, problem.log_mu, problem.log_nu, fits, *scaled)
+
+
+def _unscaled(scaled: _Scaled, log_mu: Array, log_nu: Array) -> Problem:
+    """In the log domain, where the scores do not fit."""
+    return Problem(_join(scaled.gibbs, scaled.last), log_mu, log_nu)
+
+
 def _split(kernel: Array) -> tuple[Array, Array]:
     """All columns but the last, and the last."""
     return kernel[..., :-1], kernel[..., -1]
@@ -412,18 +421,15 @@ def _join(clusters: Array, last: Array) -> Array:
     return jnp.concatenate([clusters, last[..., None]], axis=-1)
 
 
-def _solve(
-    kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
-) -> _Solution:
+def _solve(problem: Problem, step: Step, config: SinkhornConfig) -> _Solution:
     """Iterate in the configured domain; scaling falls back where the scores are too far apart."""
-    logarithmic = Problem(kernel, log_mu, log_nu)
     if config.domain == "log":
-        return _run(logarithmic, step, config)
-    fits, scaled = _scale(kernel)
+        return _run(problem, step, config)
+    fits, scaled = _scale(problem.kernel)
     return jax.lax.cond(
         fits,
-        lambda: _run(_ScalingProblem(kernel, log_mu, log_nu, fits, *scaled), step, config),
-        lambda: _run(logarithmic, step, config),
+        lambda: _run(_scaling(problem, fits, scaled), step, config),
+        lambda: _run(problem, step, config),
     )
 
 
@@ -440,14 +446,6 @@ def _run(problem: Problem, step: Step, config: SinkhornConfig) -> _Solution:
     return _Solution(potentials, at.iterations.astype(dtype), met.astype(dtype))
 
 
-class _Inputs(NamedTuple):
-    """What is differentiated."""
-
-    kernel: Float[Array, "*batch rows columns"]
-    log_mu: Float[Array, "*batch rows"]
-    log_nu: Float[Array, "*batch columns"]
-
-
 class _Towards(NamedTuple):
     """Gradients of what comes out."""
 
@@ -456,55 +454,50 @@ class _Towards(NamedTuple):
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
-def _unrolled(inputs: _Inputs, step: Step, config: SinkhornConfig) -> Any:
+def _unrolled(problem: Problem, step: Step, config: SinkhornConfig) -> Any:
     """The plan's logarithm and the `_Solution`, differentiated through the iterations.
 
     By itself JAX would keep what either domain needs for its gradient: many matrices. Here it is
     one, as the plan is part of the rule: its gradient is added to where it comes in.
     """
-    solution = _solve(*inputs, step, config)
-    return _log_plan(inputs.kernel, solution.potentials), solution
+    solution = _solve(problem, step, config)
+    return _log_plan(problem.kernel, solution.potentials), solution
 
 
 def _unrolled_forward(
-    inputs: _Inputs, step: Step, config: SinkhornConfig
+    problem: Problem, step: Step, config: SinkhornConfig
 ) -> tuple[tuple[Array, _Solution], Any]:
-    differentiable, inputs = inputs, jax.lax.stop_gradient(inputs)
+    differentiable, problem = problem, jax.lax.stop_gradient(problem)
 
     def out(log_plan: Array, solution: _Solution, *kept: Any) -> tuple[Any, Any]:
         return _replayed(differentiable, log_plan, solution, step, config), (differentiable, *kept)
 
     if config.domain == "log":
-        solution, pull = _pull(_logarithmic, (inputs,), step, config)
-        return out(_log_plan(inputs.kernel, solution.potentials), solution, None, pull)
-    fits, scaled = _scale(inputs.kernel)
+        solution, pull = _pull(step, config, problem)
+        return out(_log_plan(problem.kernel, solution.potentials), solution, None, pull)
+    fits, scaled = _scale(problem.kernel)
 
-    def start(inputs: _Inputs, gibbs: Array, last: Array) -> Problem:
-        return _ScalingProblem(*inputs, fits, scaled.row_max, gibbs, last)
+    def start(problem: Problem, gibbs: Array, last: Array) -> Problem:
+        return _scaling(problem, fits, scaled._replace(gibbs=gibbs, last=last))
 
     # The kernel as well: a step of the user's own may read it.
-    found, pull = _pull(start, (inputs, scaled.gibbs, scaled.last), step, config)
+    found, pull = _pull(step, config, problem, scaled.gibbs, scaled.last, start=start)
 
     def again() -> _Solution:
         def one(at: tuple[_Scaled, Array, Array]) -> _Solution:
-            scaled, *marginals = at
-            return _run(Problem(_join(scaled.gibbs, scaled.last), *marginals), step, config)
+            return _run(_unscaled(*at), step, config)
 
         batch = found.converged.shape
-        at = _flat((scaled, inputs.log_mu, inputs.log_nu), batch)
+        at = _flat((scaled, problem.log_mu, problem.log_nu), batch)
         out = jax.lax.map(one, at, batch_size=FALLBACK_BATCH)
         return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
     solution = jax.lax.cond(fits, lambda: found, again)
-    clusters, last = _split(inputs.kernel)
+    clusters, last = _split(problem.kernel)
     row, column = solution.potentials
     clusters = clusters + row[..., None] + column[..., None, :-1]
     log_plan = _join(clusters, last + row + column[..., -1:])
     return out(log_plan, solution, (fits, scaled), pull)
-
-
-def _logarithmic(inputs: _Inputs) -> Problem:
-    return Problem(*inputs)
 
 
 def _flat(tree: Any, batch: tuple[int, ...]) -> Any:
@@ -514,9 +507,15 @@ def _flat(tree: Any, batch: tuple[int, ...]) -> Any:
 
 
 def _pull(
-    start: Callable[..., Problem], inputs: tuple[Any, ...], step: Step, config: SinkhornConfig
+    step: Step,
+    config: SinkhornConfig,
+    *inputs: Any,
+    start: Callable[..., Problem] = lambda problem: problem,
 ) -> tuple[_Solution, Any]:
-    """The iterations, and the function that takes their gradient back to the inputs."""
+    """The iterations, and the function that takes their gradient back to the inputs.
+
+    `start` makes the problem of the inputs.
+    """
 
     def solve(*inputs: Any) -> tuple[Potentials, _Solution]:
         solution = _run(start(*inputs), step, config)
@@ -528,11 +527,11 @@ def _pull(
 
 def _unrolled_backward(
     step: Step, config: SinkhornConfig, kept: Any, towards: tuple[Array, _Solution]
-) -> tuple[_Inputs]:
-    inputs, scaled, pull = kept
+) -> tuple[Problem]:
+    problem, scaled, pull = kept
     log_plan, solution = towards
     both = _Towards(log_plan, solution.potentials)
-    return (_pull_back(inputs, both, scaled, pull, step, config),)
+    return (_pull_back(problem, both, scaled, pull, step, config),)
 
 
 _unrolled.defvjp(_unrolled_forward, _unrolled_backward)
@@ -540,14 +539,14 @@ _unrolled.defvjp(_unrolled_forward, _unrolled_backward)
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5))
 def _pull_back(
-    inputs: _Inputs,
+    problem: Problem,
     towards: _Towards,
     scaled: tuple[Bool[Array, ""], _Scaled] | None,
     pull: Any,
     step: Step,
     config: SinkhornConfig,
 ) -> Any:
-    """The gradients of the inputs, as `_Inputs`."""
+    """The gradients of the problem, in its form."""
     row, column = towards.potentials
     clusters, last = _split(towards.log_plan)
     row = row + clusters.sum(axis=-1) + last
@@ -555,23 +554,22 @@ def _pull_back(
     into = Potentials(row, column)
     if scaled is None:
         (bars,) = pull(into)
-        return bars._replace(kernel=towards.log_plan + bars.kernel)
+        return dataclasses.replace(bars, kernel=towards.log_plan + bars.kernel)
     fits, parts = scaled
-    (kernel, *marginals), of_gibbs, of_last = pull(into)
-    direct = _split(kernel)
-    bars = [direct[0] + parts.gibbs * of_gibbs, direct[1] + parts.last * of_last, *marginals]
+    of_problem, of_gibbs, of_last = pull(into)
+    bars = _apart(of_problem)
+    bars[0] += parts.gibbs * of_gibbs
+    bars[1] += parts.last * of_last
     bars = [jnp.where(fits, bar, 0) for bar in bars]
     bars[:2] = clusters + bars[0], last + bars[1]
     batch = row.shape[:-1]
-    at, flat = _flat((parts, inputs.log_mu, inputs.log_nu, into), batch), _flat(bars, batch)
+    at, flat = _flat((parts, problem.log_mu, problem.log_nu, into), batch), _flat(bars, batch)
 
     def mend(state: tuple[Array, Any]) -> tuple[Array, Any]:
         index, bars = state
-        parts, log_mu, log_nu, into = jax.tree.map(lambda x: x[index], at)
-        one = _Inputs(_join(parts.gibbs, parts.last), log_mu, log_nu)
-        _, pull = _pull(_logarithmic, (one,), step, config)
-        ((kernel, *marginals),) = pull(into)
-        new = [*_split(kernel), *marginals]
+        *one, into = jax.tree.map(lambda x: x[index], at)
+        _, pull = _pull(step, config, _unscaled(*one))
+        new = _apart(*pull(into))
         return index + 1, jax.tree.map(lambda x, y: x.at[index].add(y), bars, new)
 
     # In place and one by one, where a branch would have memory of its own.
@@ -580,41 +578,46 @@ def _pull_back(
     if problems:
         _, flat = jax.lax.while_loop(lambda state: state[0] < problems, mend, (index, flat))
     clusters, last, log_mu, log_nu = (x.reshape(y.shape) for x, y in zip(flat, bars, strict=True))
-    return _Inputs(_join(clusters, last), log_mu, log_nu)
+    return Problem(_join(clusters, last), log_mu, log_nu)
+
+
+def _apart(problem: Problem) -> list[Array]:
+    """All columns but the last, the last, and the marginals."""
+    return [*_split(problem.kernel), problem.log_mu, problem.log_nu]
 
 
 def _pull_back_forward(
-    inputs: _Inputs,
+    problem: Problem,
     towards: _Towards,
     scaled: tuple[Bool[Array, ""], _Scaled] | None,
     pull: Any,
     step: Step,
     config: SinkhornConfig,
-) -> tuple[Any, tuple[_Inputs, _Towards]]:
-    return _pull_back(inputs, towards, scaled, pull, step, config), (inputs, towards)
+) -> tuple[Any, tuple[Problem, _Towards]]:
+    return _pull_back(problem, towards, scaled, pull, step, config), (problem, towards)
 
 
 def _pull_back_backward(
-    step: Step, config: SinkhornConfig, kept: tuple[_Inputs, _Towards], towards: _Inputs
-) -> tuple[_Inputs, _Towards, None, None]:
-    def plain(inputs: _Inputs, towards: _Towards) -> _Inputs:
-        return _replay(inputs, step, config)(towards)[0]
+    step: Step, config: SinkhornConfig, kept: tuple[Problem, _Towards], towards: Problem
+) -> tuple[Problem, _Towards, None, None]:
+    def plain(problem: Problem, towards: _Towards) -> Problem:
+        return _replay(problem, step, config)(towards)[0]
 
     return *jax.vjp(plain, *kept)[1](towards), None, None
 
 
-def _replay(inputs: _Inputs, step: Step, config: SinkhornConfig) -> Any:
-    """What takes gradients back to the inputs by JAX alone, in the log domain.
+def _replay(problem: Problem, step: Step, config: SinkhornConfig) -> Any:
+    """What takes gradients back to the problem by JAX alone, in the log domain.
 
     It is for gradients of gradients. By JAX's own rules those of scans kept in `pull` go wrong, and
     what the scaling domain makes of scores that do not fit would be in them.
     """
 
-    def solve(inputs: _Inputs) -> _Towards:
-        potentials = _run(_logarithmic(inputs), step, config).potentials
-        return _Towards(_log_plan(inputs.kernel, potentials), potentials)
+    def solve(problem: Problem) -> _Towards:
+        potentials = _run(problem, step, config).potentials
+        return _Towards(_log_plan(problem.kernel, potentials), potentials)
 
-    return jax.vjp(solve, inputs)[1]
+    return jax.vjp(solve, problem)[1]
 
 
 _pull_back.defvjp(_pull_back_forward, _pull_back_backward)
@@ -622,23 +625,23 @@ _pull_back.defvjp(_pull_back_forward, _pull_back_backward)
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
 def _replayed(
-    inputs: _Inputs, log_plan: Array, solution: _Solution, step: Step, config: SinkhornConfig
+    problem: Problem, log_plan: Array, solution: _Solution, step: Step, config: SinkhornConfig
 ) -> Any:
-    """The plan and the solution, of these inputs, as they are."""
+    """The plan and the solution, of this problem, as they are."""
     return log_plan, solution
 
 
 def _replayed_forward(
-    inputs: _Inputs, log_plan: Array, solution: _Solution, step: Step, config: SinkhornConfig
-) -> tuple[Any, _Inputs]:
-    return (log_plan, solution), inputs
+    problem: Problem, log_plan: Array, solution: _Solution, step: Step, config: SinkhornConfig
+) -> tuple[Any, Problem]:
+    return (log_plan, solution), problem
 
 
 def _replayed_backward(
-    step: Step, config: SinkhornConfig, inputs: _Inputs, towards: tuple[Array, _Solution]
-) -> tuple[_Inputs, None, None]:
+    step: Step, config: SinkhornConfig, problem: Problem, towards: tuple[Array, _Solution]
+) -> tuple[Problem, None, None]:
     log_plan, solution = towards
-    (bars,) = _replay(inputs, step, config)(_Towards(log_plan, solution.potentials))
+    (bars,) = _replay(problem, step, config)(_Towards(log_plan, solution.potentials))
     return bars, None, None
 
 
@@ -650,7 +653,7 @@ def _implicit(
     kernel: Array, log_mu: Array, log_nu: Array, step: Step, config: SinkhornConfig
 ) -> Any:
     """The `_Solution`, differentiated by the optimality conditions: no iteration is remembered."""
-    return _solve(kernel, log_mu, log_nu, step, config)
+    return _solve(Problem(kernel, log_mu, log_nu), step, config)
 
 
 def _implicit_forward(
@@ -805,7 +808,7 @@ def _solved(
         )
     solution: Any  # what custom_vjp returns has no type for the checker
     if config.gradient == "unrolled":
-        both: Any = _unrolled(_Inputs(kernel, log_mu, log_nu), step, config)
+        both: Any = _unrolled(Problem(kernel, log_mu, log_nu), step, config)
         log_plan, solution = both
     else:
         if config.gradient == "implicit":
@@ -814,7 +817,7 @@ def _solved(
             solution = _by_optimistix(kernel, log_mu, log_nu, step, config, solver)
         else:
             fixed = jax.lax.stop_gradient((kernel, log_mu, log_nu))
-            solution = _solve(*fixed, step, config)
+            solution = _solve(Problem(*fixed), step, config)
         log_plan = _log_plan(kernel, solution.potentials)
     potentials = solution.potentials
     iterations = jax.lax.stop_gradient(solution.iterations).astype(jnp.int32)

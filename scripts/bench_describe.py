@@ -22,13 +22,12 @@ import dataclasses
 import itertools
 import pathlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from fragments import COLOURS, Study, Table, markdown, panels, save, splice
+from fragments import Study, Table, bars, markdown, save, splice
 from racing import (
-    Timed,
     machine,
     megabytes,
     product_rate,
@@ -114,23 +113,26 @@ def by_us(both: Sides, spread: bool) -> Contender:
     return Contender("ours, over devices" if spread else "ours", call, memory)
 
 
-def first_calls(contenders: Sequence[Contender], tolerance: float) -> dict[str, float]:
-    """Seconds until each one's first result, compiling included; the results are equal.
+def seconds(call: Callable[[], Any]) -> float:
+    started = time.perf_counter()
+    call()
+    return time.perf_counter() - started
+
+
+def check(contenders: Sequence[Contender], tolerance: float) -> None:
+    """The descriptors are equal.
 
     Raises:
         RuntimeError: they are not.
     """
-    seconds, expected = {}, None
+    expected = None
     for one in contenders:
-        started = time.perf_counter()
         found = one.call()
-        seconds[one.name] = time.perf_counter() - started
         found = np.asarray(found.float().cpu() if isinstance(found, torch.Tensor) else found)
         expected = found if expected is None else expected
         off = np.abs(found.astype(np.float64) - expected).max()
         if not off < tolerance:
             raise RuntimeError(f"{one.name}: differs from {contenders[0].name} by {off:.1e}")
-    return seconds
 
 
 HEADER = (
@@ -139,96 +141,85 @@ HEADER = (
 )
 
 
-class Lines(NamedTuple):
-    """What comes of one race."""
+class Case(NamedTuple):
+    """One race."""
 
-    values: list[dict[str, Any]]
-    rows: list[tuple[str, ...]]
-
-
-def lines(
-    title: str,
-    batch: int,
-    contenders: Sequence[Contender],
-    timed: dict[str, Timed],
-    first: dict[str, float],
-    operations: float,
-    rate: float,
-) -> Lines:
-    """The table's rows; `operations` are those of a call, `rate` the machine's a second."""
-    best = min((n for n in TORCHES if n in timed), key=lambda name: timed[name].median)
-    found = Lines([], [])
-    for one in contenders:
-        faster = ratio(timed[best], timed[one.name])
-        seconds = 1e-3 * timed[one.name].median
-        share, memory = operations / seconds / rate, one.memory()
-        found.values.append(
-            {
-                "model": title,
-                "batch": batch,
-                "contender": one.name,
-                "ms": timed[one.name].rounds,
-                "images per second": batch / seconds,
-                "faster than the better torch": faster,
-                "share of the machine": share,
-                "first call": first[one.name],
-                "memory": memory,
-            }
-        )
-        cells = (times(faster), f"{100 * share:.0f} %", f"{first[one.name]:.1f}", megabytes(memory))
-        if torch.cuda.is_available():
-            cells = (f"{cells[0]}, {batch / seconds:.0f} images/s", *cells[1:])
-        found.rows.append((title, f"{batch}", one.name, *cells))
-    return found
+    title: str
+    batch: int
+    contenders: Sequence[Contender]
+    first: dict[str, float]
+    """Seconds of each one's first call, compiling included."""
+    operations: float
+    """Of a call."""
 
 
-def draw(values: list[dict[str, Any]]) -> Any:
-    """Times faster than the better torch, a panel a model."""
-    titles = tuple(dict.fromkeys(f"{v['model']}, {v['batch']} images" for v in values))
-    names = list(dict.fromkeys(value["contender"] for value in values))
-    figure, axes = panels(len(titles), titles, width=3.4, height=2.4, sharey=False)
-    for one, title in zip(axes, titles, strict=True):
-        chosen = [v for v in values if f"{v['model']}, {v['batch']} images" == title]
-        medians = [value["faster than the better torch"][0] for value in chosen]
-        colours = [COLOURS[names.index(value["contender"])] for value in chosen]
-        places = range(len(chosen))
-        one.barh(places, medians, color=colours)
-        for place, median in zip(places, medians, strict=True):
-            one.annotate(f" {median:.2f}", (median, place), va="center", fontsize=8)
-        one.axvline(1, color="#757575", linewidth=0.8)
-        one.set_yticks(places, [value["contender"] for value in chosen], fontsize=8)
-        one.invert_yaxis()
-        one.set_xlim(0, 1.25 * max(medians))
-        one.grid(visible=False)
-        one.set_xlabel("times the better torch's speed", fontsize=8)
-    return figure
-
-
-def caption(what: str, arguments: argparse.Namespace) -> str:
-    return (
+def compare(name: str, what: str, cases: Iterable[Case], arguments: argparse.Namespace) -> None:
+    """Run the races, one after the other as they are made, and leave table, numbers and picture."""
+    rate = product_rate(arguments.dtype)
+    values, rows = [], []
+    for case in cases:
+        calls = {one.name: one.call for one in case.contenders}
+        timed = race(calls, arguments.rounds, arguments.calls)
+        best = min(TORCHES, key=lambda name: timed[name].median)
+        for one in case.contenders:
+            faster = ratio(timed[best], timed[one.name])
+            per_second = 1e3 / timed[one.name].median
+            share, memory = case.operations * per_second / rate, one.memory()
+            values.append(
+                {
+                    "model": case.title,
+                    "batch": case.batch,
+                    "contender": one.name,
+                    "ms": timed[one.name].rounds,
+                    "images per second": case.batch * per_second,
+                    "faster than the better torch": faster,
+                    "share of the machine": share,
+                    "first call": case.first[one.name],
+                    "memory": memory,
+                }
+            )
+            speed = times(faster)
+            if torch.cuda.is_available():
+                speed += f", {case.batch * per_second:.0f} images/s"
+            first = f"{case.first[one.name]:.1f}"
+            cells = (speed, f"{100 * share:.0f} %", first, megabytes(memory))
+            rows.append((case.title, f"{case.batch}", one.name, *cells))
+        torch.compiler.reset()
+    caption = (
         f"{what}, {arguments.dtype}, {machine()}; medians and ranges of {arguments.rounds} rounds "
         f"of {arguments.calls} calls. Times faster: than the better of torch eager and "
         "torch.compile."
     )
+    table = Table(HEADER, rows, caption, 3)
+    save(name, Study(table, values, draw(values)), arguments.out)
+    if arguments.page is not None:
+        splice(arguments.page, name, table)
+    print(markdown(table), flush=True)
 
 
-def flags(description: str, presets: list[str], batches: list[int]) -> argparse.ArgumentParser:
+def draw(values: list[dict[str, Any]]) -> Any:
+    return bars(
+        values,
+        lambda value: f"{value['model']}, {value['batch']} images",
+        "faster than the better torch",
+        "times the better torch's speed",
+    )
+
+
+def title(preset: str, config: ModelConfig) -> str:
+    return f"{preset} at {config.image_size[0]} x {config.image_size[1]}"
+
+
+def flags(description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/performance"))
     parser.add_argument("--page", type=pathlib.Path, help="also put the table into this page")
-    parser.add_argument("--presets", nargs="+", default=presets, choices=list(PRESETS))
-    parser.add_argument("--batches", type=int, nargs="+", default=batches)
+    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
+    parser.add_argument("--batches", type=int, nargs="+", default=[8, 16])
     parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--calls", type=int, default=2)
     return parser
-
-
-def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:
-    save(name, study, arguments.out)
-    if arguments.page is not None:
-        splice(arguments.page, name, study.table)
-    print(markdown(study.table), flush=True)
 
 
 def at_size(config: ModelConfig, size: str | None) -> ModelConfig:
@@ -238,12 +229,7 @@ def at_size(config: ModelConfig, size: str | None) -> ModelConfig:
     return dataclasses.replace(config, image_size=(height, width))
 
 
-def main() -> None:
-    parser = flags(__doc__ or "", ["tiny", "s14", "b14"], [8, 16])
-    parser.add_argument("--sizes", nargs="+", default=[None], help="such as 322x322")
-    arguments = parser.parse_args()
-    rate = product_rate(arguments.dtype)
-    values, rows = [], []
+def cases(arguments: argparse.Namespace) -> Iterator[Case]:
     for preset, size, batch in itertools.product(
         arguments.presets, arguments.sizes, arguments.batches
     ):
@@ -252,16 +238,17 @@ def main() -> None:
         contenders = [by_torch(both, False), by_torch(both, True), by_us(both, False)]
         if len(jax.local_devices()) > 1:
             contenders.append(by_us(both, True))
-        first = first_calls(contenders, TOLERANCES[arguments.dtype])
-        timed = race({one.name: one.call for one in contenders}, arguments.rounds, arguments.calls)
+        first = {one.name: seconds(one.call) for one in contenders}
+        check(contenders, TOLERANCES[arguments.dtype])
         operations = 2 * batch * sum(cost.macs for cost in part_costs(config, images=batch))
-        title = f"{preset} at {config.image_size[0]} x {config.image_size[1]}"
-        found = lines(title, batch, contenders, timed, first, operations, rate)
-        values += found.values
-        rows += found.rows
-        torch.compiler.reset()
-    table = Table(HEADER, rows, caption("Descriptors of a batch", arguments), 3)
-    leave("bench_describe", Study(table, values, draw(values)), arguments)
+        yield Case(title(preset, config), batch, contenders, first, operations)
+
+
+def main() -> None:
+    parser = flags(__doc__ or "")
+    parser.add_argument("--sizes", nargs="+", default=[None], help="such as 322x322")
+    arguments = parser.parse_args()
+    compare("bench_describe", "Descriptors of a batch", cases(arguments), arguments)
 
 
 if __name__ == "__main__":

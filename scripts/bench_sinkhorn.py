@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
-from fragments import COLOURS, Study, Table, markdown, panels, save, splice
+from fragments import Study, Table, bars, markdown, save, splice
 from racing import machine, megabytes, race, ratio, times, torch_memory, wait
 
 from crisalad_jax.config import SinkhornConfig
@@ -229,7 +229,12 @@ def fixed(arguments: argparse.Namespace) -> Study:
             cells = (times(slower), times(faster), megabytes(memory[one.name]))
             share = f"{memory[one.name] / least:.2f}"
             rows.append((f"{iterations}", f"{patches}", one.name, *cells, share))
-    figure = draw(values, lambda v: f"k = {v['iterations']}, N = {v['patches']}")
+    figure = bars(
+        values,
+        lambda v: f"k = {v['iterations']}, N = {v['patches']}",
+        "over ours",
+        "time over ours",
+    )
     header = ("k", "N", "contender", "time over ours", "times faster", "MB", "share of MB")
     caption = (
         f"A fixed number of iterations k, forward and backward, {describe(arguments)}: time over "
@@ -347,9 +352,11 @@ def converged(arguments: argparse.Namespace) -> Study:
                     cells[2] = times(line["faster than ott-jax"])
             rows.append((f"{target:g}", f"{patches}", name, *cells))
             values.append(line)
-    figure = draw(
+    figure = bars(
         [line for line in values if "ms" in line],
         lambda line: f"to {line['target']:g}, N = {line['patches']}",
+        "over ours",
+        "time over ours",
     )
     header = (
         *("error", "N", "contender", "measured"),
@@ -364,26 +371,6 @@ def converged(arguments: argparse.Namespace) -> Study:
         f"{arguments.batches} batches, how many raise or are not finite."
     )
     return Study(Table(header, rows, caption, 3), values, figure)
-
-
-def draw(values: list[dict[str, Any]], title: Callable[[dict[str, Any]], str]) -> Any:
-    titles = tuple(dict.fromkeys(title(value) for value in values))
-    names = list(dict.fromkeys(value["contender"] for value in values))
-    figure, axes = panels(len(titles), titles, width=3.2, height=3.2, sharey=False)
-    for one, name in zip(axes, titles, strict=True):
-        chosen = [value for value in values if title(value) == name]
-        medians = [value["over ours"][0] for value in chosen]
-        colours = [COLOURS[names.index(value["contender"])] for value in chosen]
-        places = range(len(chosen))
-        one.barh(places, medians, color=colours)
-        for place, median in zip(places, medians, strict=True):
-            one.annotate(f" {median:.2f}", (median, place), va="center", fontsize=8)
-        one.set_yticks(places, [value["contender"] for value in chosen], fontsize=8)
-        one.invert_yaxis()
-        one.set_xlim(0, 1.2 * max(medians))
-        one.grid(visible=False)
-        one.set_xlabel("time over ours", fontsize=9)
-    return figure
 
 
 BENCHES = {"bench_fixed": fixed, "bench_converged": converged}

@@ -13,26 +13,24 @@ on, and three times for what trains too.
 """
 
 import argparse
-import time
-from collections.abc import Callable
+import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from bench_describe import (
-    HEADER,
     TORCHES,
+    Case,
     Contender,
     Sides,
     by_torch,
-    caption,
-    draw,
+    compare,
     flags,
-    leave,
-    lines,
+    seconds,
     sides,
+    title,
 )
-from fragments import Study, Table
-from racing import product_rate, race, torch_memory, wait
+from racing import torch_memory, wait
 
 # After racing, which says how many devices there are.
 import jax  # isort: skip
@@ -131,38 +129,23 @@ def operations(config: TrainConfig, batch: int) -> float:
     return total
 
 
-def seconds(call: Callable[[], Any]) -> float:
-    started = time.perf_counter()
-    call()
-    return time.perf_counter() - started
+def cases(arguments: argparse.Namespace) -> Iterator[Case]:
+    for preset, batch in itertools.product(arguments.presets, arguments.batches):
+        config = recipe(preset)
+        both = sides(config.model, preset, batch, arguments.dtype)
+        check(both, config, LOSS_TOLERANCES[arguments.dtype])
+        contenders = [
+            torch_step(both, config, False),
+            torch_step(both, config, True),
+            our_step(both, config),
+        ]
+        first = {one.name: seconds(one.call) for one in contenders}
+        yield Case(title(preset, config.model), batch, contenders, first, operations(config, batch))
 
 
 def main() -> None:
-    parser = flags(__doc__ or "", ["tiny", "s14", "b14"], [8, 16])
-    arguments: argparse.Namespace = parser.parse_args()
-    rate = product_rate(arguments.dtype)
-    values, rows = [], []
-    for preset in arguments.presets:
-        config = recipe(preset)
-        for batch in arguments.batches:
-            both = sides(config.model, preset, batch, arguments.dtype)
-            check(both, config, LOSS_TOLERANCES[arguments.dtype])
-            contenders = [
-                torch_step(both, config, False),
-                torch_step(both, config, True),
-                our_step(both, config),
-            ]
-            first = {one.name: seconds(one.call) for one in contenders}
-            timed = race(
-                {one.name: one.call for one in contenders}, arguments.rounds, arguments.calls
-            )
-            title = f"{preset} at {config.model.image_size[0]} x {config.model.image_size[1]}"
-            found = lines(title, batch, contenders, timed, first, operations(config, batch), rate)
-            values += found.values
-            rows += found.rows
-            torch.compiler.reset()
-    table = Table(HEADER, rows, caption("A training step", arguments), 3)
-    leave("bench_train", Study(table, values, draw(values)), arguments)
+    arguments = flags(__doc__ or "").parse_args()
+    compare("bench_train", "A training step", cases(arguments), arguments)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What a study leaves: a table in Markdown, its numbers, a picture; and the page that shows it."""
 
 import pathlib
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
@@ -81,3 +82,31 @@ def panels(
         one.grid(axis="y", color=PALE, linewidth=0.8)
         one.set_axisbelow(True)
     return figure, axes
+
+
+def bars(
+    values: list[dict[str, Any]],
+    title: Callable[[dict[str, Any]], str],
+    length: str,
+    label: str,
+) -> Figure:
+    """A panel for each title, in it a bar for each contender, as long as the first of `length`."""
+    titles = tuple(dict.fromkeys(map(title, values)))
+    names = list(dict.fromkeys(value["contender"] for value in values))
+    figure, axes = panels(len(titles), titles, width=3.4, height=2.8, sharey=False)
+    for one, name in zip(axes, titles, strict=True):
+        chosen = [value for value in values if title(value) == name]
+        lengths = [value[length][0] for value in chosen]
+        places = range(len(chosen))
+        one.barh(
+            places, lengths, color=[COLOURS[names.index(value["contender"])] for value in chosen]
+        )
+        for place, end in zip(places, lengths, strict=True):
+            one.annotate(f" {end:.2f}", (end, place), va="center", fontsize=8)
+        one.axvline(1, color=GREY, linewidth=0.8)
+        one.set_yticks(places, [value["contender"] for value in chosen], fontsize=8)
+        one.invert_yaxis()
+        one.set_xlim(0, 1.25 * max(lengths))
+        one.grid(visible=False)
+        one.set_xlabel(label, fontsize=9)
+    return figure
