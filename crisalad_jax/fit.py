@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from crisalad_jax.checkpoint import StateStore, save_weights
 from crisalad_jax.config import TrainConfig
@@ -28,10 +29,12 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
+from crisalad_jax.platform import on_every_device, over_devices
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.training import (
     StepConfig,
+    TrainState,
     init_state,
     learning_rate_schedule,
     merge_params,
@@ -158,9 +161,8 @@ class _Run:
         self._schedule = learning_rate_schedule(config.optimiser, self.steps)
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         params = init_crisalad(init_key, config.model) if initial is None else initial
-        state, self._frozen = init_state(params, config.trains, self._compiled)
-        # A step takes over the buffers of its state; `initial` stays the caller's.
-        self.state = jax.tree.map(jnp.copy, state)
+        state, frozen = init_state(params, config.trains, self._compiled)
+        self.state, self._frozen = self._place(state), self._share(frozen)
         claim_run(out, config)
         self.store = StateStore(out / "state")
         self.record = _Record(
@@ -178,9 +180,18 @@ class _Run:
                         f"{out}: the run started from other {what} than are given now; "
                         "expected the same, or another folder"
                     )
-            self.step, self.state, self.record = saved.step, saved.state, _Record(**saved.record)
+            self.step, self.record = saved.step, _Record(**saved.record)
+            self.state = self._place(saved.state)
         self._log = MetricsLog(out / "metrics.jsonl", keep_up_to=self.step)
         self._saved_at = self._stepped_at = time.monotonic()
+
+    def _share(self, tree: PyTree) -> PyTree:
+        """On the devices that the images of a batch are spread over."""
+        return on_every_device(tree, self.config.places_per_batch * self.config.images_per_place)
+
+    def _place(self, state: TrainState) -> TrainState:
+        """A copy of its own on each of them: a step takes over the buffers of its state."""
+        return jax.tree.map(jnp.copy, self._share(state))
 
     def params(self) -> Crisalad:
         return merge_params(self.state.trainable, self._frozen)
@@ -198,7 +209,7 @@ class _Run:
         self.state, device_metrics = train_step(
             self.state,
             self._frozen,
-            batch.images,
+            over_devices(batch.images),
             batch.labels,
             batch.valid,
             self._step_key,

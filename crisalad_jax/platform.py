@@ -5,7 +5,7 @@ import functools
 import os
 import pathlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -16,25 +16,27 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 # By default jaxlib gives attention as a whole, and other products, to a library (YNN) that takes
 # longer than Eigen's products do, one by one (docs/performance.md).
 _CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_experimental_ynn_fusion_type": ""}
-# oneDNN's take a few percent less again, but a program with them cannot be kept in a file.
+# oneDNN's take a few percent less again where matrices are large (and half as long again where they
+# are small), but a program with them cannot be kept in a file.
 _ONEDNN_OPTIONS: dict[str, bool | str] = {
     "xla_cpu_use_onednn": True,
     "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
 }
+_SMALL = 2**23
+"""So many numbers in all arguments: `tiny` is an eighth of that, `s14` three times as much."""
 _Tree = TypeVar("_Tree")
 
 
 @functools.cache
-def compiler_options(*, kept: bool) -> dict[str, bool | str]:
+def compiler_options(*, onednn: bool) -> dict[str, bool | str]:
     """Options of XLA that make this package's programs faster on the default platform.
 
-    Those are left out that this version of jaxlib does not know, and with `kept` those under which
-    a program cannot be kept in the compile cache.
+    Those are left out that this version of jaxlib does not know.
     """
     if jax.default_backend() != "cpu":
         return {}
     known = {}
-    for name, value in (_CPU_OPTIONS if kept else _CPU_OPTIONS | _ONEDNN_OPTIONS).items():
+    for name, value in (_CPU_OPTIONS | _ONEDNN_OPTIONS if onednn else _CPU_OPTIONS).items():
         try:
             jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
         except Exception:  # jaxlib's own class, and which one has changed
@@ -48,28 +50,32 @@ def jit(
 ) -> Callable[..., Any]:
     """`jax.jit` with `compiler_options`, where the call is not inside of another transformation.
 
-    There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long` is
-    compiled for the shortest run even where the compile cache is on, which it then cannot enter.
-    What comes back has `lower` too.
+    There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long`, and is
+    not small, is compiled for the shortest run even where the compile cache is on, which it then
+    cannot enter. What comes back has `lower` too.
     """
     inner = jax.jit(function, **options)
 
     @functools.cache
-    def with_options(kept: bool) -> Any:
-        return jax.jit(function, compiler_options=compiler_options(kept=kept), **options)
+    def with_options(onednn: bool) -> Any:
+        return jax.jit(function, compiler_options=compiler_options(onednn=onednn), **options)
 
-    def outermost() -> Any:
+    def outermost(leaves: Sequence[Any]) -> Any:
         caches = jax.config.jax_compilation_cache_dir is not None  # pyright: ignore
-        return with_options(caches and not runs_long)
+        small = sum(getattr(leaf, "size", 1) for leaf in leaves) < _SMALL
+        return with_options(not small and (runs_long or not caches))
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        leaves = jax.tree.leaves((args, kwargs))
         # What is made inside of a trace is traced, whatever the arguments are.
-        leaves = (*jax.tree.leaves((args, kwargs)), jax.lax.full((), 0))
-        traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-        return (inner if traced else outermost())(*args, **kwargs)
+        traced = any(isinstance(leaf, Tracer) for leaf in (*leaves, jax.lax.full((), 0)))
+        return (inner if traced else outermost(leaves))(*args, **kwargs)
 
-    call.__dict__["lower"] = lambda *args, **kwargs: outermost().lower(*args, **kwargs)
+    def lower(*args: Any, **kwargs: Any) -> Any:
+        return outermost(jax.tree.leaves((args, kwargs))).lower(*args, **kwargs)
+
+    call.__dict__["lower"] = lower
     return call
 
 

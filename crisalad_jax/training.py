@@ -45,9 +45,10 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     """Split into (trainable, frozen): the model's structure, None for the other's leaves.
 
     `trains` is "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "all", or
-    "last-N-blocks+head" (SALAD: the last N blocks, the final layer norm, and the head). For the
-    last, the stack of blocks is cut in two, so that no gradient passes the frozen ones;
-    `merge_params` makes it one again. Batch-norm statistics stay frozen in every case.
+    "last-N-blocks+head" (SALAD: the last N blocks, the final layer norm, and the head). But for
+    "all", the stack of blocks is cut in two, and `merge_params` makes it one again: no gradient
+    passes the frozen blocks before the last N, nor all of a first block whose adapter alone trains.
+    Batch-norm statistics stay frozen in every case.
 
     Raises:
         InputError: an unknown name, or more blocks than there are.
@@ -57,9 +58,10 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     if trains == ALL:
         prefixes: tuple[str, ...] = ("",)
     elif trains == ADAPTERS_AND_HEAD:
-        prefixes = (*head, "backbone.blocks.adapter.")
+        params = _cut_blocks(params, 1)
+        prefixes = (*head, "backbone.blocks.0.adapter.", "backbone.blocks.1.adapter.")
     elif match:
-        params = _cut_blocks(params, int(match[1]))
+        params = _cut_blocks(params, _depth(params) - int(match[1]))
         prefixes = (*head, "backbone.norm.", "backbone.blocks.1.")
     else:
         raise InputError(
@@ -74,14 +76,17 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     return eqx.partition(params, chosen)
 
 
-def _cut_blocks(params: Crisalad, last: int) -> Crisalad:
+def _depth(params: Crisalad) -> int:
     stack = params.backbone.blocks
     assert isinstance(stack, Block)  # a model in training's hands alone is cut
-    depth = len(stack.ls1)
-    if last > depth:
-        raise InputError(f"trains: found the last {last} blocks, expected at most {depth}")
-    cut = depth - last
-    parts = (jax.tree.map(lambda x: x[:cut], stack), jax.tree.map(lambda x: x[cut:], stack))
+    return len(stack.ls1)
+
+
+def _cut_blocks(params: Crisalad, first: int) -> Crisalad:
+    stack, depth = params.backbone.blocks, _depth(params)
+    if first < 0:
+        raise InputError(f"trains: found the last {depth - first} blocks, expected at most {depth}")
+    parts = (jax.tree.map(lambda x: x[:first], stack), jax.tree.map(lambda x: x[first:], stack))
     backbone = dataclasses.replace(params.backbone, blocks=parts)
     return dataclasses.replace(params, backbone=backbone)
 

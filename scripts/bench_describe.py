@@ -7,9 +7,8 @@ The other side is the reference of the parity checks, with the same random weigh
 `dev` extra). On a GPU if both jax and torch find one. Before anything is timed, descriptors are
 checked to be equal to rounding. `racing.py` says how contenders are timed.
 
-Ours takes 8-bit images, as from a file, and normalises them; torch gets them normalised. "over
-devices" is how the command line runs it: the CPU made into a device for each core, the images
-spread over them.
+Both get images that are normalised. "over devices" is how the command line runs it: the CPU made
+into a device for each core, the images spread over them.
 
 Memory is what a call needs at once beyond parameters and images: of jax what the compiled program
 sets aside and its output, of torch the peak of what it allocates. The share of the machine is the
@@ -46,13 +45,13 @@ from crisalad_jax import platform
 from crisalad_jax.config import PRESETS, ModelConfig
 from crisalad_jax.costs import part_costs
 from crisalad_jax.model import Crisalad, describe
-from crisalad_jax.nn.pixels import normalise
 from parity.cases.case import build, convert, random
 from parity.reference.model import Crisalad as TorchCrisalad
 
 TOLERANCES = {"float32": 1e-5, "bfloat16": 2e-2}
 """Of descriptors, which are unit vectors: parity measures 1e-6 and 5e-3 at this size."""
 TORCHES = ("torch eager", "torch.compile")
+OURS = ("ours", "ours, over devices")
 
 
 class Contender(NamedTuple):
@@ -68,21 +67,18 @@ class Sides(NamedTuple):
     ours: Crisalad
     config: ModelConfig
     images: np.ndarray
-    """(image, height, width, 3), 8-bit."""
-    normalised: torch.Tensor
-    """(image, 3, height, width), where torch computes."""
+    """(image, height, width, 3), normalised."""
+    theirs_images: torch.Tensor
+    """The same, (image, 3, height, width), where torch computes."""
 
 
 def sides(config: ModelConfig, name: str, batch: int, dtype: str) -> Sides:
     model = build(config, dtype, random(name, 0))
     ours = convert(model)[0]
-    images = np.random.default_rng(0).integers(
-        0, 256, (batch, *config.image_size, 3), dtype=np.uint8
-    )
-    floats = jax.jit(jax.vmap(lambda image: normalise(image, config.normalisation)))(images)
+    images = np.random.default_rng(0).normal(size=(batch, *config.image_size, 3)).astype(np.float32)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    normalised = torch.from_numpy(np.array(floats)).permute(0, 3, 1, 2).contiguous().to(device)
-    return Sides(model.to(device), ours, model.config, images, normalised)
+    theirs = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous().to(device)
+    return Sides(model.to(device), ours, model.config, images, theirs)
 
 
 def by_torch(both: Sides, compiled: bool) -> Contender:
@@ -90,7 +86,7 @@ def by_torch(both: Sides, compiled: bool) -> Contender:
 
     def call() -> np.ndarray:
         with torch.inference_mode():
-            found = model(both.normalised)
+            found = model(both.theirs_images)
         wait()
         return found
 
@@ -110,7 +106,7 @@ def by_us(both: Sides, spread: bool) -> Contender:
         analysis: Any = describe.lower(params, images, both.config).compile().memory_analysis()  # pyright: ignore
         return devices * (analysis.temp_size_in_bytes + analysis.output_size_in_bytes)
 
-    return Contender("ours, over devices" if spread else "ours", call, memory)
+    return Contender(OURS[spread], call, memory)
 
 
 def seconds(call: Callable[[], Any]) -> float:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from bench_describe import (
+    OURS,
     TORCHES,
     Case,
     Contender,
@@ -37,6 +38,7 @@ import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
 import torch  # isort: skip
 
+from crisalad_jax import platform
 from crisalad_jax.config import TrainConfig, recipe
 from crisalad_jax.costs import part_costs
 from crisalad_jax.losses import multi_similarity_loss
@@ -59,13 +61,13 @@ def labels(both: Sides) -> np.ndarray:
 def torch_step(both: Sides, config: TrainConfig, compiled: bool) -> Contender:
     parameters = freeze(both.theirs, config.trains)
     model = torch.compile(both.theirs, dynamic=False) if compiled else both.theirs
-    places = torch.from_numpy(labels(both)).long().to(both.normalised.device)
+    places = torch.from_numpy(labels(both)).long().to(both.theirs_images.device)
     optimiser = torch.optim.AdamW(parameters, lr=config.optimiser.learning_rate)
 
     def call() -> float:
         both.theirs.train()
         optimiser.zero_grad()
-        loss = torch_loss(model(both.normalised), places, config.loss).loss
+        loss = torch_loss(model(both.theirs_images), places, config.loss).loss
         loss.backward()
         if config.optimiser.clip_norm is not None:
             clip_gradients(parameters, config.optimiser.clip_norm)
@@ -80,15 +82,14 @@ def torch_step(both: Sides, config: TrainConfig, compiled: bool) -> Contender:
     return Contender(TORCHES[compiled], call, memory)
 
 
-def our_step(both: Sides, config: TrainConfig) -> Contender:
+def our_step(both: Sides, config: TrainConfig, spread: bool) -> Contender:
     step = StepConfig(both.config, config.loss, config.optimiser, STEPS)
-    state, frozen = init_state(both.ours, config.trains, step)
+    count = len(both.images) if spread else 1
+    state, frozen = platform.on_every_device(init_state(both.ours, config.trains, step), count)
     state = jax.tree.map(jnp.copy, state)
-    rest = (
-        frozen,
-        *jax.device_put((both.images, labels(both), np.ones(len(both.images), bool))),
-        jax.random.key(0),
-    )
+    images = platform.over_devices(both.images) if spread else jax.device_put(both.images)
+    devices = len(images.sharding.device_set)
+    rest = (frozen, images, labels(both), np.ones(len(both.images), bool), jax.random.key(0))
 
     def call() -> float:
         nonlocal state
@@ -97,9 +98,9 @@ def our_step(both: Sides, config: TrainConfig) -> Contender:
 
     def memory() -> int:
         analysis: Any = train_step.lower(state, *rest, step).compile().memory_analysis()  # pyright: ignore
-        return analysis.temp_size_in_bytes
+        return devices * analysis.temp_size_in_bytes
 
-    return Contender("ours", call, memory)
+    return Contender(OURS[spread], call, memory)
 
 
 def check(both: Sides, config: TrainConfig, tolerance: float) -> None:
@@ -137,8 +138,10 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
         contenders = [
             torch_step(both, config, False),
             torch_step(both, config, True),
-            our_step(both, config),
+            our_step(both, config, False),
         ]
+        if len(jax.local_devices()) > 1:
+            contenders.append(our_step(both, config, True))
         first = {one.name: seconds(one.call) for one in contenders}
         yield Case(title(preset, config.model), batch, contenders, first, operations(config, batch))
 

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from crisalad_jax import platform
+from crisalad_jax.fit import read_metrics
 
 
-def in_a_program(source: str, home: pathlib.Path, **environment: str) -> str:
+def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment: str) -> str:
     """What a fresh Python prints: devices are counted once, when JAX starts."""
     inherited = {
         name: value
@@ -23,7 +24,7 @@ def in_a_program(source: str, home: pathlib.Path, **environment: str) -> str:
         if not name.startswith(("JAX_", "XLA_", "XDG_"))
     }
     done = subprocess.run(
-        [sys.executable, "-c", source],
+        [sys.executable, "-c", source, *arguments],
         env={**inherited, "HOME": str(home), "JAX_PLATFORMS": "cpu", **environment},
         capture_output=True,
         text=True,
@@ -46,13 +47,13 @@ def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         platform, "_CPU_OPTIONS", {"xla_of_another_version": True, "xla_cpu_enable_fast_math": True}
     )
-    assert platform.compiler_options(kept=True) == {"xla_cpu_enable_fast_math": True}
+    assert platform.compiler_options(onednn=False) == {"xla_cpu_enable_fast_math": True}
 
 
 @pytest.mark.usefixtures("_options_anew")
 def test_an_accelerator_has_no_options(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert platform.compiler_options(kept=True) == platform.compiler_options(kept=False) == {}
+    assert platform.compiler_options(onednn=True) == platform.compiler_options(onednn=False) == {}
 
 
 def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,27 +66,34 @@ def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None
         function.lower(jnp.ones(3)).compile()  # pyright: ignore[reportFunctionMemberAccess]
 
 
-def test_programs_can_be_kept_where_a_cache_would_and_they_do_not_run_long(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("runs_long", "caches", "size", "asked"),
+    [
+        (False, False, platform._SMALL, True),
+        (False, True, platform._SMALL, False),
+        (True, True, platform._SMALL, True),
+        (True, True, platform._SMALL - 1, False),
+        (False, False, platform._SMALL - 1, False),
+    ],
+)
+def test_onednn_where_it_pays_and_no_program_has_to_be_kept(
+    monkeypatch: pytest.MonkeyPatch, runs_long: bool, caches: bool, size: int, asked: bool
 ) -> None:
-    asked = []
+    seen = []
 
-    def options(*, kept: bool) -> dict[str, bool]:
-        asked.append(kept)
+    def options(*, onednn: bool) -> dict[str, bool]:
+        seen.append(onednn)
         return {}
 
     monkeypatch.setattr(platform, "compiler_options", options)
-    short, long = platform.jit(lambda x: x + 1), platform.jit(lambda x: x + 2, runs_long=True)
-    before = jax.config.jax_compilation_cache_dir
+    function = platform.jit(lambda x, y: x + y, runs_long=runs_long)
+    before = jax.config.jax_compilation_cache_dir  # pyright: ignore
     try:
-        for place in (None, "/dev/null/nowhere"):
-            jax.config.update("jax_compilation_cache_dir", place)
-            short.lower(1.0)
-            long.lower(1.0)
+        jax.config.update("jax_compilation_cache_dir", "/dev/null/nowhere" if caches else None)
+        function.lower(jax.ShapeDtypeStruct((size - 1,), jnp.float32), 1.0)  # pyright: ignore
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
-    # The long one's answer is the same, and is not asked for again.
-    assert asked == [False, False, True]
+    assert seen == [asked]
 
 
 WAYS: dict[str, Callable[[Any], Any]] = {
@@ -144,6 +152,39 @@ def test_images_are_spread_and_parameters_shared(
     path = os.pathsep.join([str(pathlib.Path(__file__).parent), os.getcwd()])
     told = {"JAX_NUM_CPU_DEVICES": str(devices), "PYTHONPATH": path}
     assert in_a_program(SPREAD, tmp_path, **told) == f"{devices} {used} {used} 1\n"
+
+
+TRAIN = """
+import dataclasses, pathlib, sys, jax
+from crisalad_jax import platform
+platform.set_up()
+from conftest import MODEL, RECIPE, random_params
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.places import read_places
+from crisalad_jax.fit import fit
+shared, out = map(pathlib.Path, sys.argv[1:])
+recipe = dataclasses.replace(RECIPE, patience=None)
+places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
+trained = fit(recipe, places, out, validation=town, initial=random_params(MODEL), quiet=True)
+print(len(trained.params.backbone.blocks.ls1.sharding.device_set))
+"""
+
+
+def test_a_run_on_three_devices_is_that_on_one(
+    shared: pathlib.Path, run: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    path = os.pathsep.join([str(pathlib.Path(__file__).parent), os.getcwd()])
+    told = {"JAX_NUM_CPU_DEVICES": "3", "PYTHONPATH": path}
+    assert in_a_program(TRAIN, tmp_path, str(shared), str(tmp_path / "run"), **told) == "3\n"
+    expected = read_metrics(run / "metrics.jsonl")
+    found = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    assert len(found) == len(expected)
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.keys() == theirs.keys()
+        for name in ours.keys() & {"loss", "b_acc", "gradient_norm", "R@1", "R@5"}:
+            # Sums in another order, 1e-7 each, and six steps of Adam, whose first ones divide a
+            # gradient by itself.
+            assert ours[name] == pytest.approx(theirs[name], rel=1e-4), (name, ours["step"])
 
 
 SET_UP = """

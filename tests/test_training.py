@@ -65,7 +65,14 @@ def test_batch_norm_statistics_never_train(trains: str) -> None:
 @pytest.mark.parametrize(
     ("trains", "prefixes"),
     [
-        ("adapters+head", ("aggregator.", "encoder.", "backbone.blocks.adapter.")),
+        (
+            "adapters+head",
+            (
+                *("aggregator.", "encoder."),
+                "backbone.blocks.0.adapter.",
+                "backbone.blocks.1.adapter.",
+            ),
+        ),
         ("last-1-blocks+head", ("aggregator.", "encoder.", "backbone.norm.", "backbone.blocks.1.")),
         ("last-0-blocks+head", ("aggregator.", "encoder.", "backbone.norm.", "backbone.blocks.1.")),
         ("all", ("",)),

@@ -3,9 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import torch
 
-from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.attention import Attention, _mix, attention
 from crisalad_jax.nn.layers import init_linear
 
 TOKENS, DIM, HEADS = 7, 12, 3
@@ -52,6 +53,35 @@ def test_a_masked_token_has_no_influence_and_no_gradient() -> None:
     gradient = jax.grad(lambda x: jnp.sin(seen(x)).sum())(x)
     np.testing.assert_array_equal(gradient[-1], 0)
     assert jnp.abs(gradient[:-1]).max() > 0
+
+
+@pytest.mark.parametrize("masked", [False, True], ids=["all", "masked"])
+@pytest.mark.parametrize("dropping", [False, True], ids=["whole", "dropped"])
+def test_gradient_equals_that_of_torchs_softmax(masked: bool, dropping: bool) -> None:
+    generator = np.random.default_rng(0)
+    queries, change = generator.normal(size=(2, HEADS, DIM, TOKENS)).astype(np.float32)
+    keys, values = generator.normal(size=(2, HEADS, TOKENS, DIM)).astype(np.float32)
+    mask = generator.random((TOKENS, TOKENS)) < 0.5 if masked else None  # keys by queries
+    if mask is not None:
+        np.fill_diagonal(mask, True)
+    shape = (HEADS, TOKENS, TOKENS)
+    kept = 2.0 * (generator.random(shape) < 0.5).astype(np.float32) if dropping else None
+
+    def ours(queries, keys, values):
+        return (_mix(queries, keys, values, mask, kept) * change).sum()
+
+    found, gradients = jax.value_and_grad(ours, argnums=(0, 1, 2))(queries, keys, values)
+    theirs = [torch.tensor(x, requires_grad=True) for x in (queries, keys, values)]
+    scores = theirs[1] @ theirs[0]
+    if mask is not None:
+        scores = scores.masked_fill(~torch.tensor(mask), -torch.inf)
+    weights = scores.softmax(dim=1) * (1 if kept is None else torch.tensor(kept))
+    expected = ((theirs[2].mT @ weights) * torch.tensor(change)).sum()
+    expected.backward()
+    # Sums of a few hundred numbers of order 1 in float32, and scores of order 10.
+    np.testing.assert_allclose(found, expected.item(), rtol=1e-4)
+    for gradient, tensor in zip(gradients, theirs, strict=True):
+        np.testing.assert_allclose(gradient, tensor.grad, atol=1e-4)
 
 
 def test_scores_of_bfloat16_are_float32() -> None:
