@@ -67,10 +67,14 @@ def test_gradient_equals_that_of_torchs_softmax(masked: bool, dropping: bool) ->
     shape = (HEADS, TOKENS, TOKENS)
     kept = 2.0 * (generator.random(shape) < 0.5).astype(np.float32) if dropping else None
 
-    def ours(queries, keys, values):
-        return (_mix(queries, keys, values, mask, kept) * change).sum()
+    def ours(queries: jax.Array, keys: jax.Array, values: jax.Array) -> jax.Array:
+        return (
+            _mix(queries, keys, values, *jax.tree.map(jnp.asarray, (mask, kept))) * change
+        ).sum()
 
-    found, gradients = jax.value_and_grad(ours, argnums=(0, 1, 2))(queries, keys, values)
+    found, gradients = jax.value_and_grad(ours, argnums=(0, 1, 2))(
+        *map(jnp.asarray, (queries, keys, values))
+    )
     theirs = [torch.tensor(x, requires_grad=True) for x in (queries, keys, values)]
     scores = theirs[1] @ theirs[0]
     if mask is not None:
