@@ -199,6 +199,9 @@ class Evaluate:
     """train, val or test, where the set has several."""
     radius: float = 25.0
     """Largest distance of a positive in metres, for @UTM names."""
+    compute_dtype: Literal["float32", "bfloat16"] | None = None
+    """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
+    gains and loses."""
     seed: int = 0
     """Draws the shuffled order, and untrained weights."""
     out: pathlib.Path | None = None
@@ -216,9 +219,7 @@ def _evaluate(arguments: Evaluate) -> None:
     if arguments.out is not None:
         check_target(arguments.out / "config.json")
     check_grouping(groupings, arguments.batch_size, arguments.seed)
-    params, config, model_name = _model(
-        arguments.weights, arguments.preset, arguments.image_size, arguments.seed
-    )
+    params, config, model_name = _model(arguments, arguments.preset)
     benchmark = open_benchmark(arguments.data, arguments.split, arguments.radius)
     _console.print(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
@@ -286,6 +287,9 @@ class Extract:
     grouping: str = "single"
     """single, shuffled or sequential: a cross-image model's descriptors depend on it."""
     batch_size: int = 16
+    compute_dtype: Literal["float32", "bfloat16"] | None = None
+    """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
+    gains and loses."""
     seed: int = 0
     """Draws the shuffled order."""
     on_bad_image: Literal["stop", "skip"] = "stop"
@@ -298,7 +302,7 @@ def _extract(arguments: Extract) -> None:
     write = writer_for(arguments.out)
     check_target(arguments.out)
     check_grouping([arguments.grouping], arguments.batch_size, arguments.seed)
-    params, config, _ = _model(arguments.weights, "", arguments.image_size, arguments.seed)
+    params, config, _ = _model(arguments, "")
     paths = list_images(arguments.images)
     folder = read_tokens(
         params,
@@ -418,18 +422,19 @@ def _info(arguments: Info) -> None:
         write_json(arguments.json, summary)
 
 
-def _model(
-    weights: pathlib.Path | None, preset: str, image_size: tuple[int, int] | None, seed: int
-) -> tuple[Crisalad, ModelConfig, str]:
+def _model(arguments: Evaluate | Extract, preset: str) -> tuple[Crisalad, ModelConfig, str]:
     """A model from a file or untrained, and what to call it."""
+    weights = arguments.weights
     if weights is None:
         config = recipe(preset).model
-        params = init_crisalad(jax.random.key(seed), config)
-        name = f"untrained {preset}, seed {seed}"
+        params = init_crisalad(jax.random.key(arguments.seed), config)
+        name = f"untrained {preset}, seed {arguments.seed}"
     else:
         params, config = load_weights(weights)
         name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
-    return params, _resized(config, image_size), name
+    if arguments.compute_dtype is not None:
+        config = dataclasses.replace(config, compute_dtype=arguments.compute_dtype)
+    return params, _resized(config, arguments.image_size), name
 
 
 def _resized(config: ModelConfig, image_size: tuple[int, int] | None) -> ModelConfig:

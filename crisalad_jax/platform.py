@@ -9,18 +9,25 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-# By default jaxlib gives attention as a whole, and other products, to a library (YNN) that takes
-# longer than Eigen's products do, one by one (docs/performance.md).
-_CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_experimental_ynn_fusion_type": ""}
-# oneDNN's take a few percent less again where matrices are large (and half as long again where they
-# are small), but a program with them cannot be kept in a file.
-_ONEDNN_OPTIONS: dict[str, bool | str] = {
-    "xla_cpu_use_onednn": True,
-    "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
+_FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
+_LIBRARIES: dict[str, dict[str, bool | str]] = {
+    # By default jaxlib gives attention as a whole, and other products, to a library (YNN) that
+    # takes longer than Eigen's products do, one by one (docs/performance.md).
+    "Eigen": {_FUSIONS: ""},
+    # Takes a few percent less again where matrices are large (and half as long again where they are
+    # small), but a program with its products cannot be kept in a file.
+    "oneDNN": {
+        _FUSIONS: "",
+        "xla_cpu_use_onednn": True,
+        "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
+    },
+    # The only one that uses a processor's products of bfloat16.
+    "YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"},
 }
 _SMALL = 2**23
 """So many numbers in all arguments: `tiny` is an eighth of that, `s14` three times as much."""
@@ -28,21 +35,44 @@ _Tree = TypeVar("_Tree")
 
 
 @functools.cache
-def compiler_options(*, onednn: bool) -> dict[str, bool | str]:
-    """Options of XLA that make this package's programs faster on the default platform.
+def compiler_options(library: str) -> dict[str, bool | str]:
+    """Options of XLA for a CPU's matrix products to be those of "Eigen", "oneDNN" or "YNN".
 
-    Those are left out that this version of jaxlib does not know.
+    Those are left out that this version of jaxlib does not know; on other platforms, all.
     """
     if jax.default_backend() != "cpu":
         return {}
     known = {}
-    for name, value in (_CPU_OPTIONS | _ONEDNN_OPTIONS if onednn else _CPU_OPTIONS).items():
+    for name, value in _LIBRARIES[library].items():
         try:
             jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
         except Exception:  # jaxlib's own class, and which one has changed
             continue
         known[name] = value
     return known
+
+
+@functools.cache
+def has_fused_attention() -> bool:
+    """Whether cuDNN's attention, which never writes the scores to memory, can be compiled here."""
+    if jax.default_backend() != "gpu":
+        return False
+    token = jax.ShapeDtypeStruct((1, 64, 1, 64), jnp.bfloat16)
+    attention = functools.partial(jax.nn.dot_product_attention, implementation="cudnn")
+    try:
+        jax.jit(attention).lower(token, token, token).compile()
+    except Exception:  # no cuDNN, one too old, or a GPU too old: each says so in its own way
+        return False
+    return True
+
+
+def product_dtype(dtype: Any) -> Any:
+    """In which type a product of matrices of `dtype` costs least, before it is rounded to it.
+
+    On a CPU only products that stay in float32 run in its units for bfloat16; a GPU rounds as it
+    writes.
+    """
+    return jnp.promote_types(dtype, jnp.float32) if jax.default_backend() == "cpu" else dtype
 
 
 def jit(
@@ -52,18 +82,21 @@ def jit(
 
     There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long`, and is
     not small, is compiled for the shortest run even where the compile cache is on, which it then
-    cannot enter. What comes back has `lower` too.
+    cannot enter. A configuration among the arguments says the type of the products, by its
+    `compute_dtype`. What comes back has `lower` too.
     """
     inner = jax.jit(function, **options)
 
     @functools.cache
-    def with_options(onednn: bool) -> Any:
-        return jax.jit(function, compiler_options=compiler_options(onednn=onednn), **options)
+    def with_products_of(library: str) -> Any:
+        return jax.jit(function, compiler_options=compiler_options(library), **options)
 
     def outermost(leaves: Sequence[Any]) -> Any:
+        if any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves):
+            return with_products_of("YNN")
         caches = jax.config.jax_compilation_cache_dir is not None  # pyright: ignore
         small = sum(getattr(leaf, "size", 1) for leaf in leaves) < _SMALL
-        return with_options(not small and (runs_long or not caches))
+        return with_products_of("oneDNN" if not small and (runs_long or not caches) else "Eigen")
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

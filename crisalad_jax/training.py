@@ -141,6 +141,11 @@ class StepConfig:
     optimiser: OptimiserConfig
     steps: int
 
+    @property
+    def compute_dtype(self) -> str:
+        """The model's."""
+        return self.model.compute_dtype
+
 
 def init_state(params: Crisalad, trains: str, config: StepConfig) -> tuple[TrainState, PyTree]:
     """The state before step 0, and the frozen parameters, which no step touches."""

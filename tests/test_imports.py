@@ -35,7 +35,7 @@ LEAVES = {
     "losses": {"config", "errors"},
     "data": {"config", "errors", "files", "data"},
 }
-CORE = ("__init__", "config", "errors", "pytree", "sinkhorn", "losses", "model", "nn")
+CORE = ("__init__", "config", "errors", "platform", "pytree", "sinkhorn", "losses", "model", "nn")
 CORE_NEEDS = {"jax", "numpy", "jaxtyping", "equinox", "optimistix"}
 
 

@@ -1,5 +1,6 @@
 """Compiler options, virtual devices, the compile cache: what is asked of JAX, and what it does."""
 
+import dataclasses
 import os
 import pathlib
 import subprocess
@@ -45,20 +46,23 @@ def _options_anew() -> Any:
 @pytest.mark.usefixtures("_options_anew")
 def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        platform, "_CPU_OPTIONS", {"xla_of_another_version": True, "xla_cpu_enable_fast_math": True}
+        platform,
+        "_LIBRARIES",
+        {"some": {"xla_of_another_version": True, "xla_cpu_enable_fast_math": True}},
     )
-    assert platform.compiler_options(onednn=False) == {"xla_cpu_enable_fast_math": True}
+    assert platform.compiler_options("some") == {"xla_cpu_enable_fast_math": True}
 
 
 @pytest.mark.usefixtures("_options_anew")
 def test_an_accelerator_has_no_options(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert platform.compiler_options(onednn=True) == platform.compiler_options(onednn=False) == {}
+    for library in ("Eigen", "oneDNN", "YNN"):
+        assert platform.compiler_options(library) == {}
 
 
 def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that it does not know stops it."""
-    monkeypatch.setattr(platform, "compiler_options", lambda **_: {"xla_no_such_option": True})
+    monkeypatch.setattr(platform, "compiler_options", lambda library: {"xla_no_such_option": True})
     function = platform.jit(lambda x: x + 1)
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
         function(jnp.ones(3))
@@ -66,31 +70,49 @@ def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None
         function.lower(jnp.ones(3)).compile()  # pyright: ignore[reportFunctionMemberAccess]
 
 
+@dataclasses.dataclass(frozen=True)
+class Configured:
+    """As much of a configuration as is looked at."""
+
+    compute_dtype: str
+
+
 @pytest.mark.parametrize(
-    ("runs_long", "caches", "size", "asked"),
+    ("runs_long", "caches", "size", "dtype", "asked"),
     [
-        (False, False, platform._SMALL, True),
-        (False, True, platform._SMALL, False),
-        (True, True, platform._SMALL, True),
-        (True, True, platform._SMALL - 1, False),
-        (False, False, platform._SMALL - 1, False),
+        (False, False, platform._SMALL, "float32", "oneDNN"),
+        (False, True, platform._SMALL, "float32", "Eigen"),
+        (True, True, platform._SMALL, "float32", "oneDNN"),
+        (True, True, platform._SMALL - 1, "float32", "Eigen"),
+        (False, False, platform._SMALL - 1, "float32", "Eigen"),
+        (True, False, platform._SMALL, "bfloat16", "YNN"),
+        (False, True, platform._SMALL - 1, "bfloat16", "YNN"),
     ],
 )
-def test_onednn_where_it_pays_and_no_program_has_to_be_kept(
-    monkeypatch: pytest.MonkeyPatch, runs_long: bool, caches: bool, size: int, asked: bool
+def test_whose_products_a_program_has(
+    monkeypatch: pytest.MonkeyPatch,
+    runs_long: bool,
+    caches: bool,
+    size: int,
+    dtype: str,
+    asked: str,
 ) -> None:
+    """oneDNN's where it pays and no program has to be kept, YNN's in bfloat16, or Eigen's."""
     seen = []
 
-    def options(*, onednn: bool) -> dict[str, bool]:
-        seen.append(onednn)
+    def options(library: str) -> dict[str, bool]:
+        seen.append(library)
         return {}
 
     monkeypatch.setattr(platform, "compiler_options", options)
-    function = platform.jit(lambda x, y: x + y, runs_long=runs_long)
+    function = platform.jit(
+        lambda x, y, config: x + y, runs_long=runs_long, static_argnames="config"
+    )
     before = jax.config.jax_compilation_cache_dir  # pyright: ignore
     try:
         jax.config.update("jax_compilation_cache_dir", "/dev/null/nowhere" if caches else None)
-        function.lower(jax.ShapeDtypeStruct((size - 1,), jnp.float32), 1.0)  # pyright: ignore
+        x = jax.ShapeDtypeStruct((size - 2,), jnp.float32)
+        function.lower(x, 1.0, Configured(dtype))  # pyright: ignore[reportFunctionMemberAccess]
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
     assert seen == [asked]

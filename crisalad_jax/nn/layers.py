@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from crisalad_jax.platform import product_dtype
 from crisalad_jax.pytree import params
 
 
@@ -109,9 +110,9 @@ def widen(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
-    """Affine map of the last axis, in the type of `x`."""
-    y = x @ params.weight.astype(x.dtype)
-    return y if params.bias is None else (widen(y) + params.bias).astype(x.dtype)
+    """Affine map of the last axis, rounded once to the type of `x`."""
+    y = jnp.matmul(x, params.weight.astype(x.dtype), preferred_element_type=product_dtype(x.dtype))
+    return (y if params.bias is None else widen(y) + params.bias).astype(x.dtype)
 
 
 def layer_norm(

@@ -104,3 +104,28 @@ def test_dropout_needs_a_key_and_changes_the_output() -> None:
     np.testing.assert_array_equal(plain, attention(params, x, HEADS, key=None))
     dropped = attention(params, x, HEADS, dropout_rate=0.5, key=jax.random.key(1))
     assert not np.allclose(plain, dropped, atol=1e-3)
+
+
+def test_cudnn_is_asked_where_it_can_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With XLA in its place, which takes the same arguments: here there is no GPU."""
+    _, x, _ = make()
+    x, heads = x[:, :8].astype(jnp.bfloat16), 1  # cuDNN takes eights
+    params = Attention(*(init_linear(jax.random.key(n), 8, 8 * n) for n in (3, 1)))
+    expected = attention(params, x, heads, key=None)
+    asked = []
+
+    def stand_in(*args: jax.Array, implementation: str) -> jax.Array:
+        asked.append(implementation)
+        return original(*args, implementation="xla")
+
+    original = jax.nn.dot_product_attention
+    monkeypatch.setattr(jax.nn, "dot_product_attention", stand_in)
+    monkeypatch.setattr("crisalad_jax.nn.attention.has_fused_attention", lambda: True)
+    found = attention(params, x, heads, key=None)
+    assert asked == ["cudnn"]
+    # bfloat16 keeps 8 bits, and the two divide at different places.
+    np.testing.assert_allclose(found.astype(jnp.float32), expected.astype(jnp.float32), atol=0.02)
+    attention(params, x, heads, mask=jnp.ones((TOKENS, TOKENS), bool), key=None)
+    attention(params, x.astype(jnp.float32), heads, key=None)
+    attention(params, x, heads, dropout_rate=0.5, key=jax.random.key(0))
+    assert asked == ["cudnn"]

@@ -1,0 +1,175 @@
+"""What bfloat16 gains and loses beside float32, and why there is no int8, in one run.
+
+    python scripts/bench_modes.py [--out docs/performance] [--page docs/performance.md]
+        [--presets s14 b14] [--batch 8] [--weights demo/run/best.safetensors --data demo/city/val]
+
+Three tables. One product of matrices, of the size of `b14`'s widest: its rate by type, of the best
+of the libraries that XLA can give it to, over float32's. Descriptors of a batch, images spread over
+the devices: times as fast as float32, and the cosine of each to its own in float32; parameters are
+those of the parity checks, random. And a trained model, by default the demo's, if it is there:
+cosines, and Recall@K in both. `racing.py` says how contenders are timed.
+"""
+
+import argparse
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from fragments import Study, Table, bars, markdown, save, splice
+from racing import Timed, machine, race, ratio, times
+
+# After racing, which says how many devices there are.
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+
+from crisalad_jax import platform
+from crisalad_jax.checkpoint import load_weights
+from crisalad_jax.config import PRESETS, ModelConfig
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.evaluation import evaluate, group, read_tokens
+from crisalad_jax.model import Crisalad, describe
+from parity.cases.case import build, convert, random
+
+TYPES = {"float32": "float32", "bfloat16": "float32", "int8": "int32"}
+"""What is multiplied, and in what it is added up."""
+LIBRARIES = ("Eigen", "oneDNN", "YNN")
+ROWS, WIDTH, HIDDEN = 2056, 768, 3072
+"""Tokens of eight images through `b14`'s first feed-forward layer."""
+
+
+def product(dtype: str, library: str) -> Callable[[], Any]:
+    generator = np.random.default_rng(0)
+    a, b = (
+        jnp.asarray(generator.integers(-100, 100, shape), dtype)
+        for shape in ((ROWS, WIDTH), (WIDTH, HIDDEN))
+    )
+    multiply = functools.partial(jnp.matmul, preferred_element_type=TYPES[dtype])
+    compiled = jax.jit(multiply, compiler_options=platform.compiler_options(library))
+    return lambda: jax.block_until_ready(compiled(a, b))
+
+
+def products(arguments: argparse.Namespace) -> Study:
+    calls = {(dtype, name): product(dtype, name) for dtype in TYPES for name in LIBRARIES}
+    timed = race({"/".join(key): call for key, call in calls.items()}, arguments.rounds, 5)
+    best: dict[str, Timed] = {}
+    values, rows = [], []
+    for dtype, sums in TYPES.items():
+        name = min(LIBRARIES, key=lambda name: timed[f"{dtype}/{name}"].median)
+        best[dtype] = timed[f"{dtype}/{name}"]
+        faster = ratio(best["float32"], best[dtype])
+        values.append({"contender": dtype, "library": name, "faster": faster})
+        rows.append((dtype, sums, name, times(faster)))
+    caption = (
+        f"One product, {ROWS} x {WIDTH} by {WIDTH} x {HIDDEN}, {machine()}; medians and ranges of "
+        f"{arguments.rounds} rounds of 5 calls."
+    )
+    table = Table(("type", "sums", "best library", "times float32's rate"), rows, caption, 3)
+    return Study(table, values, bars(values, lambda _: "One product", "faster", "times float32"))
+
+
+def cosines(narrow: np.ndarray, wide: np.ndarray) -> np.ndarray:
+    """Of unit vectors."""
+    return np.sum(narrow.astype(np.float64) * wide, axis=-1)
+
+
+def in_type(config: ModelConfig, dtype: str) -> ModelConfig:
+    return dataclasses.replace(config, compute_dtype=dtype)
+
+
+def described(params: Crisalad, config: ModelConfig, images: np.ndarray) -> Callable[[], Any]:
+    everywhere = platform.on_every_device(params, len(images))
+    spread = platform.over_devices(images)
+    return lambda: jax.block_until_ready(describe(everywhere, spread, config))
+
+
+def speed(arguments: argparse.Namespace) -> Study:
+    values, rows = [], []
+    for preset in arguments.presets:
+        model = build(PRESETS[preset], "float32", random(preset, 0))
+        params, config = convert(model)[0], model.config
+        shape = (arguments.batch, *config.image_size, 3)
+        images = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+        calls = {
+            dtype: described(params, in_type(config, dtype), images)
+            for dtype in ("float32", "bfloat16")
+        }
+        wide, narrow = (np.asarray(call(), np.float32) for call in calls.values())
+        timed = race(calls, arguments.rounds, arguments.calls)
+        faster, alike = ratio(timed["float32"], timed["bfloat16"]), cosines(narrow, wide)
+        values.append({"model": preset, "contender": "bfloat16", "faster": faster})
+        values[-1]["cosine"] = alike.tolist()
+        rows.append((preset, times(faster), f"{alike.mean():.5f}", f"{alike.min():.5f}"))
+    caption = (
+        f"Descriptors of {arguments.batch} images in bfloat16, {machine()}; medians and ranges of "
+        f"{arguments.rounds} rounds of {arguments.calls} calls. Cosine: to the same in float32."
+    )
+    header = ("model", "times as fast as float32", "mean cosine", "least cosine")
+    figure = bars(values, lambda v: v["model"], "faster", "times float32's speed")
+    return Study(Table(header, rows, caption, 1), values, figure)
+
+
+def recall(arguments: argparse.Namespace) -> Study:
+    params, config = load_weights(arguments.weights)
+    benchmark = open_benchmark(arguments.data)
+    values, rows, descriptors = [], [], {}
+    for dtype in ("float32", "bfloat16"):
+        typed = in_type(config, dtype)
+        tokens = read_tokens(
+            params, typed, benchmark.queries, batch_size=16, label=dtype, on_bad_image="stop"
+        )
+        descriptors[dtype] = group(params, typed, tokens, "single", batch_size=16)
+        alike = cosines(descriptors[dtype], descriptors["float32"])
+        for result in evaluate(params, typed, benchmark, batch_size=16, quiet=True):
+            values.append(
+                {
+                    "contender": dtype,
+                    "grouping": result.grouping,
+                    "recalls": result.recalls,
+                    "R@1": (result.recalls[1],),
+                    "cosine": [alike.mean(), alike.min()],
+                }
+            )
+            found = (f"{100 * result.recalls[k]:.1f}" for k in (1, 5, 10))
+            rows.append(
+                (dtype, result.grouping, *found, f"{alike.mean():.5f}", f"{alike.min():.5f}")
+            )
+    caption = (
+        f"Recall@K of a trained model on {benchmark.name}, {len(benchmark.queries)} queries; the "
+        "cosine of the queries' descriptors (single) to the same in float32."
+    )
+    header = ("type", "grouping", "R@1", "R@5", "R@10", "mean cosine", "least cosine")
+    figure = bars(values, lambda v: v["grouping"], "R@1", "Recall@1")
+    return Study(Table(header, rows, caption, 2), values, figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__ or "")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/performance"))
+    parser.add_argument("--page", type=pathlib.Path, help="also put the tables into this page")
+    parser.add_argument("--presets", nargs="+", default=["s14", "b14"], choices=PRESETS)
+    parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--calls", type=int, default=2)
+    parser.add_argument(
+        "--weights", type=pathlib.Path, default=pathlib.Path("demo/run/best.safetensors")
+    )
+    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("demo/city/val"))
+    arguments = parser.parse_args()
+    studies = {"bench_products": products, "bench_bfloat16": speed}
+    if arguments.weights.exists():
+        studies["bench_recall"] = recall
+    else:
+        print(f"{arguments.weights}: not there, so no recall is compared; scripts/demo.sh makes it")
+    for name, study in studies.items():
+        made = study(arguments)
+        save(name, made, arguments.out)
+        if arguments.page is not None:
+            splice(arguments.page, name, made.table)
+        print(markdown(made.table), flush=True)
+
+
+if __name__ == "__main__":
+    main()
