@@ -7,8 +7,9 @@ The other side is the reference of the parity checks, with the same random weigh
 `dev` extra). On a GPU if both jax and torch find one. Before anything is timed, descriptors are
 checked to be equal to rounding. `racing.py` says how contenders are timed.
 
-Both get images that are normalised. "over devices" is how the command line runs it: the CPU made
-into a device for each core, the images spread over them.
+Both get images that are normalised. "over devices" is nearly how the command line runs it: the CPU
+made into a device for each core, the images spread over them. There programs are kept in the
+compile cache besides, for which large ones do without oneDNN's products.
 
 Memory is what a call needs at once beyond parameters and images: of jax what the compiled program
 sets aside and its output, of torch the peak of what it allocates. The share of the machine is the
@@ -182,8 +183,8 @@ def compare(name: str, what: str, cases: Iterable[Case], arguments: argparse.Nam
             rows.append((case.title, f"{case.batch}", one.name, *cells))
         torch.compiler.reset()
     caption = (
-        f"{what}, {arguments.dtype}, {machine()}; medians and ranges of {arguments.rounds} rounds "
-        f"of {arguments.calls} calls. Times faster: than the better of torch eager and "
+        f"{what}, {arguments.dtype}, {machine()}; medians and ranges of {arguments.rounds} rounds. "
+        "Times faster: than the better of torch eager and "
         "torch.compile."
     )
     table = Table(HEADER, rows, caption, 3)

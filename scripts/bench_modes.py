@@ -1,7 +1,7 @@
 """What bfloat16 gains and loses beside float32, and why there is no int8, in one run.
 
     python scripts/bench_modes.py [--out docs/performance] [--page docs/performance.md]
-        [--presets s14 b14] [--batch 8] [--weights demo/run/best.safetensors --data demo/city/val]
+        [--presets s14 b14] [--batch 8] [--weights demo/run/last.safetensors --data demo/city/test]
 
 Three tables. One product of matrices, of the size of `b14`'s widest: its rate by type, of the best
 of the libraries that XLA can give it to, over float32's. Descriptors of a batch, images spread over
@@ -64,7 +64,7 @@ def products(arguments: argparse.Namespace) -> Study:
         rows.append((dtype, sums, name, times(faster)))
     caption = (
         f"One product, {ROWS} x {WIDTH} by {WIDTH} x {HIDDEN}, {machine()}; medians and ranges of "
-        f"{arguments.rounds} rounds of 5 calls."
+        f"{arguments.rounds} rounds."
     )
     table = Table(("type", "sums", "best library", "times float32's rate"), rows, caption, 3)
     return Study(table, values, bars(values, lambda _: "One product", "faster", "times float32"))
@@ -104,7 +104,7 @@ def speed(arguments: argparse.Namespace) -> Study:
         rows.append((preset, times(faster), f"{alike.mean():.5f}", f"{alike.min():.5f}"))
     caption = (
         f"Descriptors of {arguments.batch} images in bfloat16, {machine()}; medians and ranges of "
-        f"{arguments.rounds} rounds of {arguments.calls} calls. Cosine: to the same in float32."
+        f"{arguments.rounds} rounds. Cosine: to the same in float32."
     )
     header = ("model", "times as fast as float32", "mean cosine", "least cosine")
     figure = bars(values, lambda v: v["model"], "faster", "times float32's speed")
@@ -154,9 +154,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--calls", type=int, default=2)
     parser.add_argument(
-        "--weights", type=pathlib.Path, default=pathlib.Path("demo/run/best.safetensors")
+        "--weights", type=pathlib.Path, default=pathlib.Path("demo/run/last.safetensors")
     )
-    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("demo/city/val"))
+    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("demo/city/test"))
     arguments = parser.parse_args()
     studies = {"bench_products": products, "bench_bfloat16": speed}
     if arguments.weights.exists():

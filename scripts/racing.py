@@ -2,9 +2,9 @@
 
 Fairness. The contenders take turns, `rounds` times: a pause of a quarter of a second, in which the
 threads of the one before stop spinning (OpenMP's do so after each call), as long again of calls
-that do not count, so that cores and caches are as warm for the quick as for the slow, then `calls`
-that do. A ratio is that of two medians of the same round; of the ratios the median over rounds is
-shown, and the range. All use as many threads as they like.
+that do not count, so that cores and caches are as warm for the quick as for the slow, then as long
+again, and `calls` at least, of calls that do. A ratio is that of two medians of the same round; of
+the ratios the median over rounds is shown, and the range. All use as many threads as they like.
 """
 
 import itertools
@@ -52,8 +52,8 @@ def race(contenders: Mapping[str, Callable[[], Any]], rounds: int, calls: int) -
             warm = time.perf_counter() + PAUSE
             while time.perf_counter() < warm:
                 call()
-            times = []
-            for _ in range(calls):
+            times, end = [], time.perf_counter() + PAUSE
+            while len(times) < calls or time.perf_counter() < end:
                 started = time.perf_counter()
                 call()
                 times.append(1e3 * (time.perf_counter() - started))

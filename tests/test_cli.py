@@ -412,6 +412,19 @@ def test_weights_of_another_configuration(capfd, tmp_path, shared):
     assert not (tmp_path / "run").exists()
 
 
+def test_extract_computes_in_the_type_that_is_asked_for(capfd, tmp_path, shared):
+    town = shared / "town"
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
+    succeeds(capfd, *extract(shared, town, tmp_path / "n.npy", "--compute-dtype", "bfloat16"))
+    config = json.loads((tmp_path / "n.config.json").read_text())
+    assert config["model"]["compute_dtype"] == "bfloat16"
+    wide, narrow = (np.load(tmp_path / name) for name in ("d.npy", "n.npy"))
+    assert np.abs(narrow - wide).max() > 1e-4  # float32 would be off by 1e-6
+    # bfloat16 keeps 8 bits: a step is off by up to 2^-9, some 20 of them by 1 % or so, and the
+    # cosine by half the square of that, with room for an unlucky image.
+    assert (narrow * wide).sum(axis=-1).min() > 0.999
+
+
 @pytest.mark.parametrize("kind", ["missing", "empty", "cut", "foreign", "shape", "nan"])
 def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
     weights = tmp_path / "w.safetensors"
