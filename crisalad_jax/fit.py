@@ -162,7 +162,7 @@ class _Run:
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         params = init_crisalad(init_key, config.model) if initial is None else initial
         state, frozen = init_state(params, config.trains, self._compiled)
-        self.state, self._frozen = self._place(state), self._share(frozen)
+        self._frozen = self._share(frozen)
         claim_run(out, config)
         self.store = StateStore(out / "state")
         self.record = _Record(
@@ -172,7 +172,7 @@ class _Run:
             ),
         )
         self.step = 0
-        saved = self.store.load(self.state)
+        saved = self.store.load(state)
         if saved is not None:
             for what in ("weights", "places"):
                 if saved.record[f"{what}_checksum"] != getattr(self.record, f"{what}_checksum"):
@@ -180,18 +180,15 @@ class _Run:
                         f"{out}: the run started from other {what} than are given now; "
                         "expected the same, or another folder"
                     )
-            self.step, self.record = saved.step, _Record(**saved.record)
-            self.state = self._place(saved.state)
+            self.step, state, self.record = saved.step, saved.state, _Record(**saved.record)
+        # A copy of its own on each device: a step takes over the buffers of its state.
+        self.state: TrainState = jax.tree.map(jnp.copy, self._share(state))
         self._log = MetricsLog(out / "metrics.jsonl", keep_up_to=self.step)
         self._saved_at = self._stepped_at = time.monotonic()
 
     def _share(self, tree: PyTree) -> PyTree:
         """On the devices that the images of a batch are spread over."""
         return on_every_device(tree, self.config.places_per_batch * self.config.images_per_place)
-
-    def _place(self, state: TrainState) -> TrainState:
-        """A copy of its own on each of them: a step takes over the buffers of its state."""
-        return jax.tree.map(jnp.copy, self._share(state))
 
     def params(self) -> Crisalad:
         return merge_params(self.state.trainable, self._frozen)

@@ -95,8 +95,9 @@ def jit(
         if any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves):
             return with_products_of("YNN")
         caches = jax.config.jax_compilation_cache_dir is not None  # pyright: ignore
-        small = sum(getattr(leaf, "size", 1) for leaf in leaves) < _SMALL
-        return with_products_of("oneDNN" if not small and (runs_long or not caches) else "Eigen")
+        if (runs_long or not caches) and sum(getattr(x, "size", 1) for x in leaves) >= _SMALL:
+            return with_products_of("oneDNN")
+        return with_products_of("Eigen")
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

@@ -61,7 +61,10 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
         params = _cut_blocks(params, 1)
         prefixes = (*head, "backbone.blocks.0.adapter.", "backbone.blocks.1.adapter.")
     elif match:
-        params = _cut_blocks(params, _depth(params) - int(match[1]))
+        last, depth = int(match[1]), len(_stack(params).ls1)
+        if last > depth:
+            raise InputError(f"trains: found the last {last} blocks, expected at most {depth}")
+        params = _cut_blocks(params, depth - last)
         prefixes = (*head, "backbone.norm.", "backbone.blocks.1.")
     else:
         raise InputError(
@@ -76,16 +79,14 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     return eqx.partition(params, chosen)
 
 
-def _depth(params: Crisalad) -> int:
+def _stack(params: Crisalad) -> Block:
     stack = params.backbone.blocks
     assert isinstance(stack, Block)  # a model in training's hands alone is cut
-    return len(stack.ls1)
+    return stack
 
 
 def _cut_blocks(params: Crisalad, first: int) -> Crisalad:
-    stack, depth = params.backbone.blocks, _depth(params)
-    if first < 0:
-        raise InputError(f"trains: found the last {depth - first} blocks, expected at most {depth}")
+    stack = _stack(params)
     parts = (jax.tree.map(lambda x: x[:first], stack), jax.tree.map(lambda x: x[first:], stack))
     backbone = dataclasses.replace(params.backbone, blocks=parts)
     return dataclasses.replace(params, backbone=backbone)

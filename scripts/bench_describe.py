@@ -20,13 +20,12 @@ library's product of two square matrices.
 import argparse
 import dataclasses
 import itertools
-import pathlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from fragments import Study, Table, bars, markdown, save, splice
+from fragments import Study, Table, bars, flags, leave
 from racing import (
     machine,
     megabytes,
@@ -184,33 +183,23 @@ def compare(name: str, what: str, cases: Iterable[Case], arguments: argparse.Nam
         torch.compiler.reset()
     caption = (
         f"{what}, {arguments.dtype}, {machine()}; medians and ranges of {arguments.rounds} rounds. "
-        "Times faster: than the better of torch eager and "
-        "torch.compile."
+        "Times faster: than the better of torch eager and torch.compile."
     )
-    table = Table(HEADER, rows, caption, 3)
-    save(name, Study(table, values, draw(values)), arguments.out)
-    if arguments.page is not None:
-        splice(arguments.page, name, table)
-    print(markdown(table), flush=True)
-
-
-def draw(values: list[dict[str, Any]]) -> Any:
-    return bars(
+    figure = bars(
         values,
         lambda value: f"{value['model']}, {value['batch']} images",
         "faster than the better torch",
         "times the better torch's speed",
     )
+    leave(name, Study(Table(HEADER, rows, caption, 3), values, figure), arguments)
 
 
 def title(preset: str, config: ModelConfig) -> str:
     return f"{preset} at {config.image_size[0]} x {config.image_size[1]}"
 
 
-def flags(description: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/performance"))
-    parser.add_argument("--page", type=pathlib.Path, help="also put the table into this page")
+def race_flags(description: str) -> argparse.ArgumentParser:
+    parser = flags(description, "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
     parser.add_argument("--batches", type=int, nargs="+", default=[8, 16])
     parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
@@ -242,7 +231,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
 
 
 def main() -> None:
-    parser = flags(__doc__ or "")
+    parser = race_flags(__doc__ or "")
     parser.add_argument("--sizes", nargs="+", default=[None], help="such as 322x322")
     arguments = parser.parse_args()
     compare("bench_describe", "Descriptors of a batch", cases(arguments), arguments)

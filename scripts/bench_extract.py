@@ -38,7 +38,7 @@ from unittest import mock
 import cv2
 import numpy as np
 from bench_describe import TOLERANCES, Sides, sides, title
-from fragments import Study, Table, bars, markdown, save, splice
+from fragments import Study, Table, bars, flags, leave
 from racing import PAUSE, Timed, machine, ratio, times
 
 # After racing, which says how many devices there are.
@@ -51,7 +51,7 @@ from crisalad_jax.data import synthetic
 from crisalad_jax.data.images import list_images, read_image, resize_image
 from crisalad_jax.data.loader import image_batches
 from crisalad_jax.descriptors import writer_for
-from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN, LOCAL_WINDOW
+from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN, LOCAL_NOISE, LOCAL_WINDOW
 
 SIZE = (480, 640)
 DISTINCT = 50
@@ -136,7 +136,7 @@ def normalised(image: np.ndarray, how: str) -> np.ndarray:
     if how == "imagenet":
         return (values - MEAN) / DEVIATION
     centred = values - box_mean(values)
-    return centred / np.sqrt(box_mean(centred**2) + 0.02**2)
+    return centred / np.sqrt(box_mean(centred**2) + LOCAL_NOISE**2)
 
 
 class Photographs(torch.utils.data.Dataset[torch.Tensor]):
@@ -293,9 +293,7 @@ def row(value: dict[str, Any]) -> tuple[str, ...]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/performance"))
-    parser.add_argument("--page", type=pathlib.Path, help="also put the table into this page")
+    parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["tiny", "s14"], choices=PRESETS)
     parser.add_argument("--images", type=int, default=2000)
     parser.add_argument("--batch", type=int, default=16)
@@ -326,10 +324,7 @@ def main() -> None:
         "faster than torch's",
         "times the speed of torch's",
     )
-    save("bench_extract", Study(table, values, figure), arguments.out)
-    if arguments.page is not None:
-        splice(arguments.page, "bench_extract", table)
-    print(markdown(table), flush=True)
+    leave("bench_extract", Study(table, values, figure), arguments)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from fragments import Study, Table, bars, markdown, save, splice
+from fragments import Study, Table, bars, flags, leave
 from racing import Timed, machine, race, ratio, times
 
 # After racing, which says how many devices there are.
@@ -146,9 +146,7 @@ def recall(arguments: argparse.Namespace) -> Study:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__ or "")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/performance"))
-    parser.add_argument("--page", type=pathlib.Path, help="also put the tables into this page")
+    parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["s14", "b14"], choices=PRESETS)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=5)
@@ -164,11 +162,7 @@ def main() -> None:
     else:
         print(f"{arguments.weights}: not there, so no recall is compared; scripts/demo.sh makes it")
     for name, study in studies.items():
-        made = study(arguments)
-        save(name, made, arguments.out)
-        if arguments.page is not None:
-            splice(arguments.page, name, made.table)
-        print(markdown(made.table), flush=True)
+        leave(name, study(arguments), arguments)
 
 
 if __name__ == "__main__":

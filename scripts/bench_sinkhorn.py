@@ -18,7 +18,6 @@ import argparse
 import functools
 import itertools
 import math
-import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
-from fragments import Study, Table, bars, markdown, save, splice
+from fragments import Study, Table, bars, flags, leave
 from racing import machine, megabytes, race, ratio, times, torch_memory, wait
 
 from crisalad_jax.config import SinkhornConfig
@@ -377,10 +376,8 @@ BENCHES = {"bench_fixed": fixed, "bench_converged": converged}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Time the transport; see the top.")
+    parser = flags("Time the transport; see the top.", "docs/sinkhorn")
     parser.add_argument("benches", nargs="*", metavar="BENCH", help=f"of {', '.join(BENCHES)}")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/sinkhorn"))
-    parser.add_argument("--page", type=pathlib.Path, help="also put the tables into this page")
     parser.add_argument("--images", type=int, default=32)
     parser.add_argument("--clusters", type=int, default=64)
     parser.add_argument("--patches", type=int, nargs="+", default=[256, 529])
@@ -394,11 +391,7 @@ def main() -> None:
     if unknown := set(arguments.benches) - set(BENCHES):
         parser.error(f"found {', '.join(sorted(unknown))}, expected of {', '.join(BENCHES)}")
     for name in arguments.benches or BENCHES:
-        study = BENCHES[name](arguments)
-        save(name, study, arguments.out)
-        if arguments.page is not None:
-            splice(arguments.page, name, study.table)
-        print(markdown(study.table), flush=True)
+        leave(name, BENCHES[name](arguments), arguments)
 
 
 if __name__ == "__main__":

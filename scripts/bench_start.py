@@ -9,7 +9,6 @@ it imports torch, builds the model, reads weights, describes the image and write
 eager and through torch.compile, likewise cold and warm. All take turns.
 """
 
-import argparse
 import itertools
 import os
 import pathlib
@@ -23,7 +22,7 @@ import cv2
 import jax
 import numpy as np
 import torch
-from fragments import Study, Table, bars, markdown, save, splice
+from fragments import Study, Table, bars, flags, leave
 from racing import Timed, machine, ratio, times
 
 from crisalad_jax.checkpoint import save_weights
@@ -91,9 +90,7 @@ def programs(folder: pathlib.Path, preset: str) -> dict[str, Callable[[], None]]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__ or "")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/performance"))
-    parser.add_argument("--page", type=pathlib.Path, help="also put the table into this page")
+    parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--preset", default="b14", choices=PRESETS)
     parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
@@ -116,10 +113,7 @@ def main() -> None:
     )
     table = Table(("model", "program", "time over torch eager's"), rows, caption, 2)
     figure = bars(values, lambda _: arguments.preset, "slower", "time over torch eager's")
-    save("bench_start", Study(table, values, figure), arguments.out)
-    if arguments.page is not None:
-        splice(arguments.page, "bench_start", table)
-    print(markdown(table), flush=True)
+    leave("bench_start", Study(table, values, figure), arguments)
 
 
 if __name__ == "__main__":

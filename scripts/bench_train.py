@@ -26,7 +26,7 @@ from bench_describe import (
     Sides,
     by_torch,
     compare,
-    flags,
+    race_flags,
     seconds,
     sides,
     title,
@@ -147,7 +147,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
 
 
 def main() -> None:
-    arguments = flags(__doc__ or "").parse_args()
+    arguments = race_flags(__doc__ or "").parse_args()
     compare("bench_train", "A training step", cases(arguments), arguments)
 
 

@@ -1,5 +1,6 @@
 """What a study leaves: a table in Markdown, its numbers, a picture; and the page that shows it."""
 
+import argparse
 import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -66,6 +67,22 @@ def splice(page: pathlib.Path, name: str, table: Table) -> None:
         raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
     with atomic_path(page) as temporary:
         temporary.write_text(before + start + markdown(table) + end + after, encoding="utf-8")
+
+
+def flags(description: str, out: str) -> argparse.ArgumentParser:
+    """A parser of where what a study leaves goes: folder `out` by default, and a page if asked."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(out))
+    parser.add_argument("--page", type=pathlib.Path, help="also put what is tabled into this page")
+    return parser
+
+
+def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:
+    """Put a study where the arguments of `flags` say, and on the terminal."""
+    save(name, study, arguments.out)
+    if arguments.page is not None:
+        splice(arguments.page, name, study.table)
+    print(markdown(study.table), flush=True)
 
 
 def panels(

@@ -8,9 +8,7 @@ standard deviation. Writes NAME.md, NAME.json and NAME.png per study, and with -
 tables into that page. About two minutes on two cores.
 """
 
-import argparse
 import functools
-import pathlib
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -18,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fragments import COLOURS, Study, Table, markdown, number, panels, save, splice
+from fragments import COLOURS, Study, Table, flags, leave, number, panels
 
 from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.sinkhorn import (
@@ -428,10 +426,8 @@ STUDIES: dict[str, Callable[[Size], Study]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Study the transport; see the top.")
+    parser = flags("Study the transport; see the top.", "docs/sinkhorn")
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {', '.join(STUDIES)}")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/sinkhorn"))
-    parser.add_argument("--page", type=pathlib.Path, help="also put the tables into this page")
     parser.add_argument("--images", type=int, default=Size().images)
     arguments = parser.parse_args()
     if unknown := set(arguments.studies) - set(STUDIES):
@@ -441,10 +437,8 @@ def main() -> None:
         started = time.monotonic()
         with jax.enable_x64(True):
             study = STUDIES[name](size)
-        save(name, study, arguments.out)
-        if arguments.page is not None:
-            splice(arguments.page, name, study.table)
-        print(f"{name} ({time.monotonic() - started:.0f} s)\n\n{markdown(study.table)}", flush=True)
+        print(f"{name} ({time.monotonic() - started:.0f} s)\n")
+        leave(name, study, arguments)
 
 
 if __name__ == "__main__":

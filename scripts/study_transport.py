@@ -8,13 +8,12 @@ recall.md, recall.json and recall.png to --out, and with --page puts the table i
 takes one to two minutes on two cores.
 """
 
-import argparse
 import dataclasses
 import pathlib
 import statistics
 from typing import Any
 
-from fragments import COLOURS, INK, Study, Table, markdown, panels, save, splice
+from fragments import COLOURS, INK, Study, Table, flags, leave, panels
 
 from crisalad_jax.config import SinkhornConfig, TrainConfig, recipe
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
@@ -94,10 +93,8 @@ def study_of(results: dict[str, dict[str, Runs]]) -> Study:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Train and tabulate; see the top.")
+    parser = flags("Train and tabulate; see the top.", "docs/sinkhorn")
     parser.add_argument("--runs", type=pathlib.Path, required=True, help="where trainings are kept")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/sinkhorn"))
-    parser.add_argument("--page", type=pathlib.Path)
     parser.add_argument("--data", type=pathlib.Path, help="also train and test on its sped_*")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
@@ -129,11 +126,7 @@ def main() -> None:
                     folder = arguments.runs / "runs" / f"{number}_{variant}_{seed}"
                     found.setdefault(label, []).append(run(config, places, benchmark, folder))
                     bar.advance(1, note=f"{name}, {label}, seed {seed}")
-    study = study_of(results)
-    save("recall", study, arguments.out)
-    if arguments.page is not None:
-        splice(arguments.page, "recall", study.table)
-    print(markdown(study.table))
+    leave("recall", study_of(results), arguments)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 LOCAL_WINDOW = 21
 """Side in pixels of the box of local contrast normalisation: one and a half patches."""
+LOCAL_NOISE = 0.02
+"""About the noise of a night photograph, of full scale: flat sky is not blown up."""
 
 
 def normalise(image: UInt8[Array, "height width 3"], how: str) -> Float[Array, "height width 3"]:
@@ -39,8 +41,7 @@ def _local_contrast(image: Float[Array, "height width 3"]) -> Float[Array, "heig
         return jnp.einsum("ri,cj,ijk->rck", rows, columns, x, precision="highest")
 
     centred = image - box_mean(image)
-    # 0.02 of full scale is about the noise of a night photograph: flat sky is not blown up.
-    return centred / jnp.sqrt(box_mean(centred**2) + 0.02**2)
+    return centred / jnp.sqrt(box_mean(centred**2) + LOCAL_NOISE**2)
 
 
 def _box(side: int) -> np.ndarray:
