@@ -91,14 +91,9 @@ def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
     config.check_image_size((images.shape[1], images.shape[2]))
 
-    def look(
-        image: UInt8[Array, "height width 3"] | Float[Array, "height width 3"],
-    ) -> Features:
-        if image.dtype == jnp.uint8:
-            image = normalise(image, config.normalisation)
-        return vit(params.backbone, image.astype(config.compute_dtype), config.backbone)
-
-    return jax.vmap(look)(images)
+    if images.dtype == jnp.uint8:
+        images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
+    return vit(params.backbone, images.astype(config.compute_dtype), config.backbone)
 
 
 @functools.partial(platform.jit, static_argnames="config")

@@ -29,21 +29,26 @@ _LIBRARIES: dict[str, dict[str, bool | str]] = {
     # The only one that uses a processor's products of bfloat16.
     "YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"},
 }
+# By default all weights of a layer are copied out of their stack before its work begins, which
+# takes up to a third more memory.
+_LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 _SMALL = 2**23
 """So many numbers in all arguments: `tiny` is an eighth of that, `s14` three times as much."""
 _Tree = TypeVar("_Tree")
 
 
 @functools.cache
-def compiler_options(library: str) -> dict[str, bool | str]:
+def compiler_options(library: str, *, least_memory: bool = False) -> dict[str, bool | str]:
     """Options of XLA for a CPU's matrix products to be those of "Eigen", "oneDNN" or "YNN".
 
-    Those are left out that this version of jaxlib does not know; on other platforms, all.
+    `least_memory` orders all operations for that; a training step it makes longer, and no smaller.
+    Options are left out that this version of jaxlib does not know; on other platforms, all.
     """
     if jax.default_backend() != "cpu":
         return {}
     known = {}
-    for name, value in _LIBRARIES[library].items():
+    wanted = _LIBRARIES[library] | (_LEAST_MEMORY if least_memory else {})
+    for name, value in wanted.items():
         try:
             jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
         except Exception:  # jaxlib's own class, and which one has changed
@@ -80,16 +85,17 @@ def jit(
 ) -> Callable[..., Any]:
     """`jax.jit` with `compiler_options`, where the call is not inside of another transformation.
 
-    There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long`, and is
-    not small, is compiled for the shortest run even where the compile cache is on, which it then
-    cannot enter. A configuration among the arguments says the type of the products, by its
-    `compute_dtype`. What comes back has `lower` too.
+    There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long` is
+    compiled for the shortest run, all else for the least memory; if it is not small, even where the
+    compile cache is on, which it then cannot enter. A configuration among the arguments says the
+    type of the products, by its `compute_dtype`. What comes back has `lower` too.
     """
     inner = jax.jit(function, **options)
 
     @functools.cache
     def with_products_of(library: str) -> Any:
-        return jax.jit(function, compiler_options=compiler_options(library), **options)
+        chosen = compiler_options(library, least_memory=not runs_long)
+        return jax.jit(function, compiler_options=chosen, **options)
 
     def outermost(leaves: Sequence[Any]) -> Any:
         if any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves):

@@ -150,21 +150,18 @@ def test_vit(name: str, registers: int) -> None:
         backbone=config, aggregator="class-token", encoder=CrossImageConfig(layers=0)
     )
 
-    def one(params: Any, image: jax.Array) -> dict[str, jax.Array]:
-        image = image.transpose(1, 2, 0)
-        tokens = run_blocks(params, embed(params, image, config), grid_of(image), config)
+    def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        images = inputs["image"].transpose(0, 2, 3, 1)
+        tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+        tokens = run_blocks(params, tokens, grid_of(images[0]), config)
         normed = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
         outputs = {
-            "x_norm_clstoken": normed[0],
-            "x_norm_patchtokens": normed[1 + registers :],
+            "x_norm_clstoken": normed[:, 0],
+            "x_norm_patchtokens": normed[:, 1 + registers :],
             "x_prenorm": tokens,
         }
         if registers:
-            outputs["x_norm_regtokens"] = normed[1 : 1 + registers]
-        return outputs
-
-    def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        outputs = jax.vmap(one, in_axes=(None, 0))(params, inputs["image"])
+            outputs["x_norm_regtokens"] = normed[:, 1 : 1 + registers]
         return {k: v for k, v in outputs.items() if f"out.{k}" in golden}
 
     names = Names(

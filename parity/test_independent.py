@@ -171,7 +171,7 @@ def their_features(model: Any, images: Tensor, registers: int) -> dict[str, Tens
 
 
 def our_features(params: Crisalad, images: Any, config: ModelConfig) -> dict[str, jax.Array]:
-    return jax.vmap(lambda image: vit(params.backbone, image, config.backbone))(images)._asdict()
+    return vit(params.backbone, images, config.backbone)._asdict()
 
 
 def torch_loss(outputs: dict[str, Tensor]) -> Tensor:

@@ -51,6 +51,23 @@ def test_the_papers_descriptor_has_8448_numbers() -> None:
     assert config.descriptor_dim == 8448
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="how much memory a CPU's program takes")
+def test_memory_is_what_attention_needs_at_once() -> None:
+    """Scores; queries, keys and values as made; the first two as multiplied; the tokens.
+
+    The feed-forward network needs no more: GELU is written over what it reads. Nor do copies of the
+    weights: each is made when it is needed.
+    """
+    config = PRESETS["s14"]
+    params = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
+    images = jax.ShapeDtypeStruct((8, 224, 224, 3), jnp.uint8)
+    memory = describe.lower(params, images, config).compile().memory_analysis()
+    scores, tokens = 8 * 6 * 257 * 257, 8 * 257 * 384
+    needed = 4 * (scores + (3 + 2 + 1) * tokens)
+    # A hundredth for the small arrays.
+    assert memory.temp_size_in_bytes <= 1.01 * needed
+
+
 @pytest.mark.parametrize("preset", ["s14", "l14", "g14"])
 def test_every_preset_composes(preset: str) -> None:
     config = PRESETS[preset]

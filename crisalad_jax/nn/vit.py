@@ -81,7 +81,7 @@ class ViT:
 
 
 class Features(NamedTuple):
-    """What a backbone says of an image, or of a batch, after its last layer norm."""
+    """What a backbone says of a batch, or of one image of it, after its last layer norm."""
 
     class_token: Float[Array, "*batch dim"]
     patches: Float[Array, "*batch patch dim"]
@@ -141,11 +141,12 @@ def _sincos_positions(side: int, dim: int) -> np.ndarray:
     return np.concatenate([rows, columns], axis=-1)
 
 
-def vit(params: ViT, image: Float[Array, "height width 3"], config: ViTConfig) -> Features:
-    """Features of one normalised image whose sides are multiples of 14."""
-    tokens = run_blocks(params, embed(params, image, config), grid_of(image), config)
+def vit(params: ViT, images: Float[Array, "image height width 3"], config: ViTConfig) -> Features:
+    """Features of a batch of normalised images whose sides are multiples of 14."""
+    tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+    tokens = run_blocks(params, tokens, grid_of(images[0]), config)
     tokens = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
-    return Features(tokens[0], tokens[1 + config.registers :])
+    return Features(tokens[:, 0], tokens[:, 1 + config.registers :])
 
 
 def grid_of(image: Shaped[Array, "height width 3"]) -> tuple[int, int]:
@@ -167,13 +168,13 @@ def embed(
 
 
 def run_blocks(
-    params: ViT, tokens: Float[Array, "token dim"], grid: tuple[int, int], config: ViTConfig
-) -> Float[Array, "token dim"]:
+    params: ViT, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "image token dim"]:
     """All blocks in turn, by one compiled body, of whose work the gradient keeps `KEPT`."""
 
     def body(
-        carry: Float[Array, "token dim"], one: Block
-    ) -> tuple[Float[Array, "token dim"], None]:
+        carry: Float[Array, "image token dim"], one: Block
+    ) -> tuple[Float[Array, "image token dim"], None]:
         return block(one, carry, grid, config), None
 
     policy = jax.checkpoint_policies.save_only_these_names(*KEPT)
@@ -186,26 +187,36 @@ def run_blocks(
 
 
 def block(
-    params: Block, tokens: Float[Array, "token dim"], grid: tuple[int, int], config: ViTConfig
-) -> Float[Array, "token dim"]:
+    params: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "image token dim"]:
     """One block (paper Eq. 2), with LayerScale over MLP and adapter alike, as in CricaVPR."""
+
+    def attend(x: Float[Array, "token dim"]) -> Float[Array, "token dim"]:
+        return attention(params.attn, x, config.heads, key=None)
+
     normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
-    attended = attention(params.attn, normed, config.heads, key=None)
-    tokens = (widen(tokens) + params.ls1 * widen(attended)).astype(tokens.dtype)
+    tokens = (widen(tokens) + params.ls1 * widen(jax.vmap(attend)(normed))).astype(tokens.dtype)
     tokens = checkpoint_name(tokens, "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
     update = feed_forward(params.mlp, normed)
     if params.adapter is not None:
-        update = update + config.adapter.alpha * adapter(params.adapter, normed, grid)
+        adapt = functools.partial(adapter, params.adapter, grid=grid)
+        update = update + config.adapter.alpha * jax.vmap(adapt)(normed)
     return (widen(tokens) + params.ls2 * widen(update)).astype(tokens.dtype)
 
 
 def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
-    """GELU network, or SwiGLU (Shazeer 2020) where the parameters are its."""
+    """GELU network, or SwiGLU (Shazeer 2020) where the parameters are its.
+
+    All tokens are rows of one matrix: as a product leaves it, XLA can write GELU over it.
+    """
+    rows = x.reshape(-1, x.shape[-1])
     if isinstance(params, Mlp):
-        return linear(params.fc2, gelu(checkpoint_name(linear(params.fc1, x), "hidden")))
-    gate, value = jnp.split(checkpoint_name(linear(params.w12, x), "hidden"), 2, axis=-1)
-    return linear(params.w3, jax.nn.silu(gate) * value)
+        y = linear(params.fc2, gelu(checkpoint_name(linear(params.fc1, rows), "hidden")))
+    else:
+        gate, value = jnp.split(checkpoint_name(linear(params.w12, rows), "hidden"), 2, axis=-1)
+        y = linear(params.w3, jax.nn.silu(gate) * value)
+    return y.reshape(x.shape)
 
 
 def interpolate_positions(

@@ -108,8 +108,7 @@ FEED_FORWARD = Part(
 
 
 def _our_block(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    weights = _last_block(params)
-    return {"tokens": jax.vmap(lambda t: block(weights, t, GRID, config.backbone))(x["tokens"])}
+    return {"tokens": block(_last_block(params), x["tokens"], GRID, config.backbone)}
 
 
 BLOCK = Part(

@@ -21,7 +21,7 @@ from crisalad_jax.nn.vit import (
 CONFIG = ViTConfig(dim=16, depth=3, heads=2, position_grid=5)
 
 
-def image(*size: int, seed: int = 0) -> jax.Array:
+def images(*size: int, seed: int = 0) -> jax.Array:
     return jax.random.normal(jax.random.key(seed), (*size, 3))
 
 
@@ -85,7 +85,7 @@ def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
         jax.tree.map(lambda leaf: leaf[1:], params.blocks),
     )
     cut = dataclasses.replace(params, blocks=parts)
-    ours, theirs = vit(cut, image(28, 42), CONFIG), vit(params, image(28, 42), CONFIG)
+    ours, theirs = vit(cut, images(1, 28, 42), CONFIG), vit(params, images(1, 28, 42), CONFIG)
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
 
@@ -96,7 +96,7 @@ def test_an_untrained_adapter_leaves_the_backbone_unchanged() -> None:
     bare = dataclasses.replace(params, blocks=bare_blocks)
     config = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="none"))
     for a, b in zip(
-        vit(params, image(28, 42), CONFIG), vit(bare, image(28, 42), config), strict=True
+        vit(params, images(1, 28, 42), CONFIG), vit(bare, images(1, 28, 42), config), strict=True
     ):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
@@ -116,7 +116,7 @@ def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
     params = dataclasses.replace(params, blocks=blocks)
     from crisalad_jax.nn.vit import run_blocks
 
-    tokens = jax.random.normal(jax.random.key(2), (1 + 6, 16))
+    tokens = jax.random.normal(jax.random.key(2), (1, 1 + 6, 16))
     out = [
         run_blocks(
             params, tokens, (2, 3), dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=alpha))
