@@ -29,7 +29,7 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
-from crisalad_jax.platform import on_every_device, over_devices
+from crisalad_jax.platform import on_every_device, on_one_device, over_devices
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.training import (
@@ -191,7 +191,7 @@ class _Run:
         return on_every_device(tree, self.config.places_per_batch * self.config.images_per_place)
 
     def params(self) -> Crisalad:
-        return merge_params(self.state.trainable, self._frozen)
+        return merge_params(*on_one_device((self.state.trainable, self._frozen)))
 
     def take_step(self, batch: ImageBatch, epoch: int) -> str:
         """Train on a batch, log it, and say in a few words how it went."""

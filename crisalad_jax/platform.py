@@ -14,6 +14,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from crisalad_jax.cores import usable_cores
+
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
     # By default jaxlib gives attention as a whole, and other products, to a library (YNN) that
@@ -33,7 +35,7 @@ _LIBRARIES: dict[str, dict[str, bool | str]] = {
 # takes up to a third more memory.
 _LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 _SMALL = 2**23
-"""So many numbers in all arguments: `tiny` is an eighth of that, `s14` three times as much."""
+"""So many numbers in all parameters: `tiny` has an eighth of that, `s14` three times as many."""
 _Tree = TypeVar("_Tree")
 
 
@@ -85,10 +87,11 @@ def jit(
 ) -> Callable[..., Any]:
     """`jax.jit` with `compiler_options`, where the call is not inside of another transformation.
 
-    There the options of the outermost `jit` hold, and JAX takes no others. What `runs_long` is
-    compiled for the shortest run, all else for the least memory; if it is not small, even where the
-    compile cache is on, which it then cannot enter. A configuration among the arguments says the
-    type of the products, by its `compute_dtype`. What comes back has `lower` too.
+    There the options of the outermost `jit` hold, and JAX takes no others. Products are Eigen's;
+    of a large model oneDNN's, where the program `runs_long` or there is no compile cache that it
+    would have to enter; YNN's where a configuration among the arguments says bfloat16, by its
+    `compute_dtype`. What does not run long is ordered for the least memory. What comes back has
+    `lower` too.
     """
     inner = jax.jit(function, **options)
 
@@ -101,7 +104,7 @@ def jit(
         if any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves):
             return with_products_of("YNN")
         caches = jax.config.jax_compilation_cache_dir is not None  # pyright: ignore
-        if (runs_long or not caches) and sum(getattr(x, "size", 1) for x in leaves) >= _SMALL:
+        if (runs_long or not caches) and _numbers(leaves) >= _SMALL:
             return with_products_of("oneDNN")
         return with_products_of("Eigen")
 
@@ -119,33 +122,36 @@ def jit(
     return call
 
 
+def _numbers(leaves: Sequence[Any]) -> int:
+    """Of floating point: a model's, and not the images as they are read."""
+    arrays = (leaf for leaf in leaves if hasattr(leaf, "dtype"))
+    return sum(leaf.size for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.floating))
+
+
 def set_up() -> None:
     """For a program of its own, before JAX is used: virtual devices and the compile cache.
 
     The CPU becomes as many devices as it has cores, so that `over_devices` may spread images over
     them: that is faster than all cores on every product. Compiled programs are kept in
-    `~/.cache/crisalad-jax` (or under XDG_CACHE_HOME). What the environment says of either
-    (JAX_NUM_CPU_DEVICES, XLA_FLAGS, JAX_COMPILATION_CACHE_DIR) holds.
+    `~/.cache/crisalad-jax` (or under XDG_CACHE_HOME), where that can be written. What the
+    environment says of either (JAX_NUM_CPU_DEVICES, XLA_FLAGS, JAX_COMPILATION_CACHE_DIR) holds.
     """
     told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get(
         "XLA_FLAGS", ""
     )
     if not told and jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
         with contextlib.suppress(RuntimeError):  # JAX has been used already
-            jax.config.update("jax_num_cpu_devices", _cores())
+            jax.config.update("jax_num_cpu_devices", usable_cores())
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore
-        root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(root) / "crisalad-jax"))
+        with contextlib.suppress(OSError, RuntimeError):  # no such right, or no home
+            cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+            cache /= "crisalad-jax"
+            cache.mkdir(parents=True, exist_ok=True)
+            if os.access(cache, os.W_OK):
+                jax.config.update("jax_compilation_cache_dir", str(cache))
         # What takes less is compiled as soon as it is read.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     warnings.filterwarnings("ignore", "Error writing .* onednn-fusion")  # see `jit`
-
-
-def _cores() -> int:
-    """Those that this process may use, where the system says."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _mesh(count: int) -> Mesh:
@@ -172,3 +178,8 @@ def on_every_device(tree: _Tree, count: int) -> _Tree:
         return jax.device_put(host, sharding, may_alias=True)
 
     return jax.tree.map(put, tree)
+
+
+def on_one_device(tree: _Tree) -> _Tree:
+    """The first device's own arrays of a tree that is on several alike: nothing is copied."""
+    return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)

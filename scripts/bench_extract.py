@@ -47,6 +47,7 @@ import torch  # isort: skip
 
 from crisalad_jax import evaluation, platform
 from crisalad_jax.config import PRESETS, ModelConfig
+from crisalad_jax.cores import usable_cores
 from crisalad_jax.data import synthetic
 from crisalad_jax.data.images import list_images, read_image, resize_image
 from crisalad_jax.data.loader import image_batches
@@ -160,7 +161,7 @@ def torch_batches(
     return torch.utils.data.DataLoader(
         Photographs(paths, config),
         batch_size=batch,
-        num_workers=os.cpu_count() or 1,
+        num_workers=usable_cores(),
         worker_init_fn=lambda _: cv2.setNumThreads(0),
         multiprocessing_context="fork",
     )
@@ -245,7 +246,7 @@ def measure(contender: Contender, folder: pathlib.Path, out: pathlib.Path) -> Ru
     used, started = sum(os.times()[:4]), time.perf_counter()
     contender.run(folder, out, watch)
     seconds = time.perf_counter() - started
-    busy = (sum(os.times()[:4]) - used) / (seconds * (os.cpu_count() or 1))
+    busy = (sum(os.times()[:4]) - used) / (seconds * usable_cores())
     return Run(seconds, watch.waited / seconds, busy)
 
 

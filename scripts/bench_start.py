@@ -33,17 +33,20 @@ from parity.cases.case import build, random
 THEIRS = """
 import sys
 import cv2, numpy as np, torch
+device = "cuda" if torch.cuda.is_available() else "cpu"
 from crisalad_jax.config import PRESETS
 from parity.reference.model import Crisalad
 weights, image, out, preset, compiled = sys.argv[1:]
 config = PRESETS[preset]
-model = Crisalad(config).eval()
-model.load_state_dict(torch.load(weights, mmap=True))
+with torch.device("meta"):
+    model = Crisalad(config).eval()
+model.load_state_dict(torch.load(weights, mmap=True), assign=True)
+model = model.to(device)
 pixels = cv2.resize(cv2.imread(image)[..., ::-1], config.image_size[::-1]) / 255.0
 pixels = (pixels - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-batch = torch.from_numpy(pixels.astype(np.float32).transpose(2, 0, 1)[None])
+batch = torch.from_numpy(pixels.astype(np.float32).transpose(2, 0, 1)[None]).to(device)
 with torch.inference_mode():
-    np.save(out, (torch.compile(model) if compiled == "True" else model)(batch).numpy())
+    np.save(out, (torch.compile(model) if compiled == "True" else model)(batch).cpu().numpy())
 """
 NAMES = ("torch eager", "torch.compile, cold", "torch.compile, warm", "ours, cold", "ours, warm")
 

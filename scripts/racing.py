@@ -16,10 +16,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+from crisalad_jax.cores import usable_cores
+
 # On a GPU jax would take most of the memory at once, and leave torch too little.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 # As the command line does, where all cores may be used.
-os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(os.cpu_count()))
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +30,10 @@ import torch
 # First calls are from nothing, whatever ran before.
 _KERNELS = tempfile.TemporaryDirectory(prefix="inductor-")
 os.environ["TORCHINDUCTOR_CACHE_DIR"] = _KERNELS.name
+
+if torch.cuda.is_available():
+    # There jax would by itself round what it multiplies to 10 bits (TF32), and torch would not.
+    jax.config.update("jax_default_matmul_precision", "highest")
 
 PAUSE = 0.25
 GEMM = 4096
@@ -128,5 +134,5 @@ def machine() -> str:
         info = pathlib.Path("/proc/cpuinfo")
         lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
         models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-        name = f"{models[0] if models else 'CPU'}, {os.cpu_count()} cores"
+        name = f"{models[0] if models else 'CPU'}, {usable_cores()} cores"
     return f"{name}, jax {jax.__version__}, torch {torch.__version__}"

@@ -6,7 +6,11 @@ All tests use the same shapes, so that each program is compiled once for the who
 import csv
 import dataclasses
 import functools
+import importlib
 import pathlib
+import sys
+from collections.abc import Callable, Iterator
+from types import ModuleType
 
 import cv2
 import jax
@@ -97,6 +101,15 @@ def write_town(root: pathlib.Path) -> pathlib.Path:
             seed = 500 + round(east / 40)
             write_picture(root / "images" / "test" / part / name, seed, noise=20.0)
     return root
+
+
+@pytest.fixture(scope="session")
+def scripts() -> Iterator[Callable[[str], ModuleType]]:
+    """Imports a script by its name."""
+    folder = str(pathlib.Path(__file__).parents[1] / "scripts")
+    sys.path.insert(0, folder)
+    yield importlib.import_module
+    sys.path.remove(folder)
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ SOURCE = pathlib.Path(__file__).parents[1] / PACKAGE
 
 # A module imports from layers above its own line only; a package, from itself as well.
 LAYERS = (
-    ("errors",),
+    ("errors", "cores"),
     ("config", "pytree", "files", "progress", "platform"),
     ("sinkhorn", "losses", "serial", "data"),
     ("nn",),
@@ -33,9 +33,12 @@ LEAVES = {
     "pytree": set(),
     "sinkhorn": {"config", "errors", "pytree"},
     "losses": {"config", "errors"},
-    "data": {"config", "errors", "files", "data"},
+    "data": {"config", "cores", "errors", "files", "data"},
 }
-CORE = ("__init__", "config", "errors", "platform", "pytree", "sinkhorn", "losses", "model", "nn")
+CORE = (
+    *("__init__", "config", "cores", "errors", "platform", "pytree"),
+    *("sinkhorn", "losses", "model", "nn"),
+)
 CORE_NEEDS = {"jax", "numpy", "jaxtyping", "equinox", "optimistix"}
 
 

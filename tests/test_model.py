@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crisalad_jax import platform
 from crisalad_jax.config import PRESETS, AdapterConfig, CrossImageConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import alone, among, describe, init_crisalad, relate, tokenise
@@ -58,6 +59,9 @@ def test_memory_is_what_attention_needs_at_once() -> None:
     The feed-forward network needs no more: GELU is written over what it reads. Nor do copies of the
     weights: each is made when it is needed.
     """
+    known = platform.compiler_options("Eigen", least_memory=True)
+    if not known.keys() >= platform._LEAST_MEMORY.keys():
+        pytest.skip("this jaxlib orders operations in its own way")
     config = PRESETS["s14"]
     params = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
     images = jax.ShapeDtypeStruct((8, 224, 224, 3), jnp.uint8)

@@ -111,8 +111,9 @@ def test_whose_products_a_program_has(
     before = jax.config.jax_compilation_cache_dir  # pyright: ignore
     try:
         jax.config.update("jax_compilation_cache_dir", "/dev/null/nowhere" if caches else None)
-        x = jax.ShapeDtypeStruct((size - 2,), jnp.float32)
-        function.lower(x, 1.0, Configured(dtype))  # pyright: ignore[reportFunctionMemberAccess]
+        x = jax.ShapeDtypeStruct((size,), jnp.float32)
+        images = jax.ShapeDtypeStruct((size,), jnp.uint8)
+        function.lower(x, images, Configured(dtype))  # pyright: ignore[reportFunctionMemberAccess]
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
     assert seen == [(asked, not runs_long)]
@@ -183,12 +184,14 @@ platform.set_up()
 from conftest import MODEL, RECIPE, random_params
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
-from crisalad_jax.fit import fit
+from crisalad_jax import fit as module
 shared, out = map(pathlib.Path, sys.argv[1:])
 recipe = dataclasses.replace(RECIPE, patience=None)
+used, spread = [], module.over_devices
+module.over_devices = lambda images: used.append(spread(images)) or used[-1]
 places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
-trained = fit(recipe, places, out, validation=town, initial=random_params(MODEL), quiet=True)
-print(len(trained.params.backbone.blocks.ls1.sharding.device_set))
+trained = module.fit(recipe, places, out, validation=town, initial=random_params(MODEL), quiet=True)
+print(*(len(x.sharding.device_set) for x in (used[-1], trained.params.backbone.blocks.ls1)))
 """
 
 
@@ -197,7 +200,7 @@ def test_a_run_on_three_devices_is_that_on_one(
 ) -> None:
     path = os.pathsep.join([str(pathlib.Path(__file__).parent), os.getcwd()])
     told = {"JAX_NUM_CPU_DEVICES": "3", "PYTHONPATH": path}
-    assert in_a_program(TRAIN, tmp_path, str(shared), str(tmp_path / "run"), **told) == "3\n"
+    assert in_a_program(TRAIN, tmp_path, str(shared), str(tmp_path / "run"), **told) == "3 1\n"
     expected = read_metrics(run / "metrics.jsonl")
     found = read_metrics(tmp_path / "run" / "metrics.jsonl")
     assert len(found) == len(expected)
@@ -211,6 +214,8 @@ def test_a_run_on_three_devices_is_that_on_one(
 
 SET_UP = """
 import os, jax
+if os.environ.get("FEWER"):
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 from crisalad_jax import platform
 platform.set_up()
 print(len(jax.devices()), len(os.sched_getaffinity(0)), jax.config.jax_compilation_cache_dir)
@@ -222,12 +227,21 @@ platform.jit(squared)(jax.numpy.ones((64, 64))).block_until_ready()
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")
-def test_a_device_a_core_and_programs_are_kept(tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize("fewer", ["", "yes"], ids=("all cores", "one core"))
+def test_a_device_a_core_and_programs_are_kept(tmp_path: pathlib.Path, fewer: str) -> None:
     cache = tmp_path / ".cache" / "crisalad-jax"
-    devices, cores, place = in_a_program(SET_UP, tmp_path).split()
+    devices, cores, place = in_a_program(SET_UP, tmp_path, FEWER=fewer).split()
     assert devices == cores
+    assert not fewer or cores == "1"
     assert place == str(cache)
     assert list(cache.glob("jit_squared-*"))
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")
+def test_without_a_place_for_them_programs_are_not_kept(tmp_path: pathlib.Path) -> None:
+    nowhere = tmp_path / "file"
+    nowhere.write_text("")
+    assert in_a_program(SET_UP, tmp_path, XDG_CACHE_HOME=str(nowhere)).split()[2] == "None"
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")

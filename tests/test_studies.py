@@ -6,7 +6,6 @@ about 40 in size are far from overflow there.
 
 import argparse
 import contextlib
-import importlib
 import io
 import itertools
 import json
@@ -31,14 +30,6 @@ ROOT = pathlib.Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "sinkhorn.md"
 IMAGES, PATCHES, CLUSTERS = 3, 24, 5
 CASES = list(itertools.product(("iid", "lowrank"), (1.0, 3.0, 10.0)))
-
-
-@pytest.fixture(scope="module")
-def scripts() -> Any:
-    """Imports a script by its name."""
-    sys.path.insert(0, str(ROOT / "scripts"))
-    yield importlib.import_module
-    sys.path.remove(str(ROOT / "scripts"))
 
 
 @pytest.fixture(scope="module")

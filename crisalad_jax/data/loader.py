@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Int32, Int64, UInt8
 
 from crisalad_jax.config import AugmentConfig, LightAugmentConfig
+from crisalad_jax.cores import usable_cores
 from crisalad_jax.data.augment import augment as augment_image
 from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.data.places import Order, Places, epoch_batches
@@ -18,7 +19,7 @@ from crisalad_jax.errors import InputError
 
 OnBadImage = Literal["skip", "stop"]
 BATCHES_AHEAD = 2
-THREADS = min(os.cpu_count() or 2, 16)
+THREADS = min(usable_cores(), 16)
 """OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
 
 _Image = UInt8[np.ndarray, "h w 3"]

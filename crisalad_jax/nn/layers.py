@@ -110,7 +110,7 @@ def widen(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
-    """Affine map of the last axis, rounded once to the type of `x`."""
+    """Affine map of the last axis, in the type of `x`. On a CPU it is rounded once, at the end."""
     y = jnp.matmul(x, params.weight.astype(x.dtype), preferred_element_type=product_dtype(x.dtype))
     return (y if params.bias is None else widen(y) + params.bias).astype(x.dtype)
 

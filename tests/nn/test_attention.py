@@ -108,10 +108,13 @@ def test_dropout_needs_a_key_and_changes_the_output() -> None:
 
 def test_cudnn_is_asked_where_it_can_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """With XLA in its place, which takes the same arguments: here there is no GPU."""
-    _, x, _ = make()
-    x, heads = x[:, :8].astype(jnp.bfloat16), 1  # cuDNN takes eights
-    params = Attention(*(init_linear(jax.random.key(n), 8, 8 * n) for n in (3, 1)))
-    expected = attention(params, x, heads, key=None)
+    x = jax.random.normal(jax.random.key(0), (TOKENS, 16)).astype(jnp.bfloat16)
+    params = Attention(*(init_linear(jax.random.key(n), 16, 16 * n) for n in (3, 1)))
+
+    def value(x: jax.Array) -> jax.Array:
+        return jnp.sin(attention(params, x, 2, key=None).astype(jnp.float32)).sum()
+
+    expected, gradient = attention(params, x, 2, key=None), jax.grad(value)(x)
     asked = []
 
     def stand_in(*args: jax.Array, implementation: str) -> jax.Array:
@@ -121,11 +124,15 @@ def test_cudnn_is_asked_where_it_can_answer(monkeypatch: pytest.MonkeyPatch) -> 
     original = jax.nn.dot_product_attention
     monkeypatch.setattr(jax.nn, "dot_product_attention", stand_in)
     monkeypatch.setattr("crisalad_jax.nn.attention.has_fused_attention", lambda: True)
-    found = attention(params, x, heads, key=None)
+    found = attention(params, x, 2, key=None)
     assert asked == ["cudnn"]
     # bfloat16 keeps 8 bits, and the two divide at different places.
     np.testing.assert_allclose(found.astype(jnp.float32), expected.astype(jnp.float32), atol=0.02)
-    attention(params, x, heads, mask=jnp.ones((TOKENS, TOKENS), bool), key=None)
-    attention(params, x.astype(jnp.float32), heads, key=None)
-    attention(params, x, heads, dropout_rate=0.5, key=jax.random.key(0))
-    assert asked == ["cudnn"]
+    found = jax.grad(value)(x)
+    assert asked == 2 * ["cudnn"]
+    np.testing.assert_allclose(found.astype(jnp.float32), gradient.astype(jnp.float32), atol=0.02)
+    attention(params, x, 4, key=None)  # heads of 4 numbers: cuDNN takes eights
+    attention(params, x, 2, mask=jnp.ones((TOKENS, TOKENS), bool), key=None)
+    attention(params, x.astype(jnp.float32), 2, key=None)
+    attention(params, x, 2, dropout_rate=0.5, key=jax.random.key(0))
+    assert asked == 2 * ["cudnn"]

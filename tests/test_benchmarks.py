@@ -1,0 +1,107 @@
+"""What the benchmarks reckon with: turns, ratios, memory, waiting. No time is asserted."""
+
+import concurrent.futures
+import itertools
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+import torch
+
+from crisalad_jax.config import recipe
+from crisalad_jax.costs import part_costs
+
+
+@pytest.fixture(scope="module")
+def racing(scripts: Any) -> ModuleType:
+    return scripts("racing")
+
+
+def test_a_ratio_is_of_the_same_round(racing: ModuleType) -> None:
+    """4 / 2, 9 / 3 and 8 / 8; the medians over all rounds would give 8 / 3."""
+    found = racing.ratio(racing.Timed([4.0, 9.0, 8.0]), racing.Timed([2.0, 3.0, 8.0]))
+    assert found == (2.0, 1.0, 3.0)
+    assert racing.times(found) == "2.00 (1.00 to 3.00)"
+
+
+def test_contenders_take_turns(racing: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock on which a call of one takes 1 s and of the other 3: five calls at least."""
+    now, called = 0.0, []
+
+    def call(name: str, seconds: float) -> None:
+        nonlocal now
+        now += seconds
+        called.append(name)
+
+    def sleep(seconds: float) -> None:
+        nonlocal now
+        now += seconds
+
+    monkeypatch.setattr(racing.time, "perf_counter", lambda: now)
+    monkeypatch.setattr(racing.time, "sleep", sleep)
+    found = racing.race({"a": lambda: call("a", 1), "b": lambda: call("b", 3)}, rounds=2, calls=5)
+    assert found == {"a": racing.Timed([1e3, 1e3]), "b": racing.Timed([3e3, 3e3])}
+    # One call that does not count, then five.
+    assert [(name, len(list(turn))) for name, turn in itertools.groupby(called)] == [
+        *(("a", 6), ("b", 6)),
+        *(("a", 6), ("b", 6)),
+    ]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there the allocator itself counts")
+def test_torchs_memory_is_the_most_at_once(racing: ModuleType) -> None:
+    """Two arrays of a million numbers at the same time, although three are made."""
+
+    def call() -> torch.Tensor:
+        first = torch.ones(1_000_000)
+        second = first + 1
+        del first
+        return second * 2
+
+    assert racing.torch_memory(call) == 8_000_000
+
+
+def test_descriptors_that_differ_are_not_raced(scripts: Any) -> None:
+    bench = scripts("bench_describe")
+
+    def contender(name: str, found: Any) -> Any:
+        return bench.Contender(name, lambda: found, lambda: 0)
+
+    theirs, ours = torch.tensor([[0.6, 0.8]]), jnp.array([[0.6, 0.801]])
+    bench.check([contender("torch", theirs), contender("ours", ours)], tolerance=2e-3)
+    with pytest.raises(RuntimeError, match=r"ours: differs from torch by 1\.0e-03"):
+        bench.check([contender("torch", theirs), contender("ours", ours)], tolerance=5e-4)
+
+
+def test_only_what_no_program_hides_is_waited_for(
+    scripts: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = scripts("bench_extract")
+    watch = bench.Watch()
+    # Asked and answered: before any program, with one that ended at 5, with one still running.
+    clock = iter([0.0, 2.0, 4.0, 9.0, 9.0, 20.0])
+    monkeypatch.setattr(bench.time, "perf_counter", lambda: next(clock))
+    batches = watch.each(["first", "second"])
+    assert next(batches) == "first"
+    assert watch.waited == 2
+    watch._ended = concurrent.futures.Future()
+    watch._ended.set_result(5.0)
+    assert next(batches) == "second"
+    assert watch.waited == 2 + (9 - 5)
+    watch._ended = concurrent.futures.Future()
+    assert next(batches, None) is None
+    assert watch.waited == 6
+
+
+def test_operations_of_a_step_are_those_of_what_trains(scripts: Any) -> None:
+    """Of all three times the forward's; of adapters and head little more than twice."""
+    bench, tiny, paper = scripts("bench_train"), recipe("tiny"), recipe("b14")
+    assert (tiny.trains, paper.trains) == ("all", "adapters+head")
+
+    def forward(recipe: Any) -> float:
+        return 2 * 8 * sum(cost.macs for cost in part_costs(recipe.model, images=8))
+
+    assert bench.operations(tiny, 8) == 3 * forward(tiny)
+    # The head's are a twentieth of all, the embedding's less.
+    assert 1.9 * forward(paper) < bench.operations(paper, 8) < 2.2 * forward(paper)
