@@ -7,8 +7,10 @@ import csv
 import dataclasses
 import functools
 import importlib
+import os
 import pathlib
 import sys
+import unittest.mock
 from collections.abc import Callable, Iterator
 from types import ModuleType
 
@@ -105,10 +107,15 @@ def write_town(root: pathlib.Path) -> pathlib.Path:
 
 @pytest.fixture(scope="session")
 def scripts() -> Iterator[Callable[[str], ModuleType]]:
-    """Imports a script by its name."""
+    """Imports a script by its name. What it sets in the environment ends with that."""
     folder = str(pathlib.Path(__file__).parents[1] / "scripts")
+
+    def load(name: str) -> ModuleType:
+        with unittest.mock.patch.dict(os.environ):
+            return importlib.import_module(name)
+
     sys.path.insert(0, folder)
-    yield importlib.import_module
+    yield load
     sys.path.remove(folder)
 
 

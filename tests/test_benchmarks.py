@@ -59,7 +59,8 @@ def test_torchs_memory_is_the_most_at_once(racing: ModuleType) -> None:
         del first
         return second * 2
 
-    assert racing.torch_memory(call) == 8_000_000
+    # And a few bytes for the numbers 1 and 2.
+    assert 8_000_000 <= racing.torch_memory(call) < 8_000_100
 
 
 def test_descriptors_that_differ_are_not_raced(scripts: Any) -> None:
