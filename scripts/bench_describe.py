@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from fragments import Study, Table, bars, flags, leave
 from racing import (
-    machine,
+    measured,
     megabytes,
     product_rate,
     race,
@@ -182,7 +182,7 @@ def compare(name: str, what: str, cases: Iterable[Case], arguments: argparse.Nam
             rows.append((case.title, f"{case.batch}", one.name, *cells))
         torch.compiler.reset()
     caption = (
-        f"{what}, {arguments.dtype}, {machine()}; medians and ranges of {arguments.rounds} rounds. "
+        f"{what}, {arguments.dtype}, {measured(arguments.rounds)}. "
         "Times faster: than the better of torch eager and torch.compile."
     )
     figure = bars(

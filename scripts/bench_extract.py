@@ -39,7 +39,7 @@ import cv2
 import numpy as np
 from bench_describe import TOLERANCES, Sides, sides, title
 from fragments import Study, Table, bars, flags, leave
-from racing import PAUSE, Timed, machine, ratio, times
+from racing import PAUSE, Timed, measured, ratio, times
 
 # After racing, which says how many devices there are.
 import jax  # isort: skip
@@ -313,10 +313,10 @@ def main() -> None:
             values += compare(preset, (small, folder), arguments)
     caption = (
         f"From a folder of JPEGs ({SIZE[1]} x {SIZE[0]}) to a file of descriptors, in batches of "
-        f"{arguments.batch}, float32, {machine()}; medians and ranges of {arguments.rounds} rounds "
-        "of a whole folder. Times faster: than torch with its DataLoader, and of the loaders alone "
-        "than that one. Images waited for: the share of the time in which no program is in flight "
-        "because the next batch is not there. Cores busy: of all cores' time."
+        f"{arguments.batch}, float32, {measured(arguments.rounds)} of a whole folder. Times "
+        "faster: than torch with its DataLoader, and of the loaders alone than that one. Images "
+        "waited for: the share of the time in which no program is in flight because the next "
+        "batch is not there. Cores busy: of all cores' time."
     )
     table = Table(HEADER, [row(value) for value in values], caption, 3)
     figure = bars(

@@ -4,10 +4,10 @@
         [--presets s14 b14] [--batch 8] [--weights demo/run/last.safetensors --data demo/city/test]
 
 Three tables. One product of matrices, of the size of `b14`'s widest: its rate by type and by the
-library that XLA gives it to. Descriptors of a batch, images spread over
-the devices: times as fast as float32, and the cosine of each to its own in float32; parameters are
-those of the parity checks, random. And a trained model, by default the demo's, if it is there:
-cosines, and Recall@K in both. `racing.py` says how contenders are timed.
+library that XLA gives it to. Descriptors of a batch, images spread over the devices: times as fast
+as float32, and the cosine of each to its own in float32; parameters are those of the parity checks,
+random. And a trained model, by default the demo's, if it is there: cosines, and Recall@K in both.
+`racing.py` says how contenders are timed.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from fragments import Study, Table, bars, flags, leave
-from racing import machine, race, ratio, times
+from racing import measured, race, ratio, times
 
 # After racing, which says how many devices there are.
 import jax  # isort: skip
@@ -36,7 +36,8 @@ from parity.cases.case import build, convert, random
 
 TYPES = {"float32": "float32", "bfloat16": "float32", "int8": "int32"}
 """What is multiplied, and in what it is added up."""
-LIBRARIES = ("jaxlib's choice", "Eigen", "oneDNN", "YNN")
+DEFAULT = "jaxlib's choice"
+LIBRARIES = (DEFAULT, "Eigen", "oneDNN", "YNN")
 ROWS, WIDTH, HIDDEN = 2056, 768, 3072
 """Tokens of eight images through `b14`'s first feed-forward layer."""
 
@@ -48,27 +49,25 @@ def product(dtype: str, library: str) -> Callable[[], Any]:
         for shape in ((ROWS, WIDTH), (WIDTH, HIDDEN))
     )
     multiply = functools.partial(jnp.matmul, preferred_element_type=TYPES[dtype])
-    chosen = {} if library == LIBRARIES[0] else platform.compiler_options(library)
+    chosen = {} if library == DEFAULT else platform.compiler_options(library)
     compiled = jax.jit(multiply, compiler_options=chosen)
     return lambda: jax.block_until_ready(compiled(a, b))
 
 
 def products(arguments: argparse.Namespace) -> Study:
-    libraries = LIBRARIES if jax.default_backend() == "cpu" else LIBRARIES[:1]
+    libraries = LIBRARIES if jax.default_backend() == "cpu" else (DEFAULT,)
     calls = {
         f"{dtype}, {library}": product(dtype, library) for dtype in TYPES for library in libraries
     }
     timed = race(calls, arguments.rounds, 5)
     values, rows = [], []
     for (dtype, sums), library in itertools.product(TYPES.items(), libraries):
-        faster = ratio(timed[f"float32, {libraries[0]}"], timed[f"{dtype}, {library}"])
+        faster = ratio(timed[f"float32, {DEFAULT}"], timed[f"{dtype}, {library}"])
         values.append({"type": dtype, "contender": library, "faster": faster})
         rows.append((dtype, sums, library, times(faster)))
-    caption = (
-        f"One product, {ROWS} x {WIDTH} by {WIDTH} x {HIDDEN}, {machine()}; medians and ranges of "
-        f"{arguments.rounds} rounds."
-    )
-    header = ("type", "sums", "library", "times as fast as float32, jaxlib's choice")
+    size = f"{ROWS} x {WIDTH} by {WIDTH} x {HIDDEN}"
+    caption = f"One product, {size}, {measured(arguments.rounds)}."
+    header = ("type", "sums", "library", f"times as fast as float32, {DEFAULT}")
     figure = bars(values, lambda value: value["type"], "faster", "times float32")
     return Study(Table(header, rows, caption, 3), values, figure)
 
@@ -106,8 +105,8 @@ def speed(arguments: argparse.Namespace) -> Study:
         values[-1]["cosine"] = alike.tolist()
         rows.append((preset, times(faster), f"{alike.mean():.5f}", f"{alike.min():.5f}"))
     caption = (
-        f"Descriptors of {arguments.batch} images in bfloat16, {machine()}; medians and ranges of "
-        f"{arguments.rounds} rounds. Cosine: to the same in float32."
+        f"Descriptors of {arguments.batch} images in bfloat16, {measured(arguments.rounds)}. "
+        "Cosine: to the same in float32."
     )
     header = ("model", "times as fast as float32", "mean cosine", "least cosine")
     figure = bars(values, lambda v: v["model"], "faster", "times float32's speed")

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 from fragments import Study, Table, bars, flags, leave
-from racing import machine, megabytes, race, ratio, times, torch_memory, wait
+from racing import measured, megabytes, race, ratio, times, torch_memory, wait
 
 from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.sinkhorn import append_dustbin, assign, log_marginals
@@ -246,8 +246,7 @@ def fixed(arguments: argparse.Namespace) -> Study:
 def describe(arguments: argparse.Namespace) -> str:
     return (
         f"B = {arguments.images}, m = {arguments.clusters}, iid scores of standard deviation "
-        f"{arguments.std:g}, float32, {machine()}; medians and ranges of "
-        f"{arguments.rounds} rounds of {arguments.calls} calls"
+        f"{arguments.std:g}, float32, {measured(arguments.rounds)} of {arguments.calls} calls"
     )
 
 

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 import torch
 from fragments import Study, Table, bars, flags, leave
-from racing import Timed, machine, ratio, times
+from racing import Timed, measured, ratio, times
 
 from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import PRESETS
@@ -111,8 +111,7 @@ def main() -> None:
         values.append({"contender": name, "ms": one.rounds, "slower": slower})
         rows.append((arguments.preset, name, times(slower)))
     caption = (
-        f"From the start of the program to a descriptor in a file, {machine()}; medians and ranges "
-        f"of {arguments.rounds} rounds."
+        f"From the start of the program to a descriptor in a file, {measured(arguments.rounds)}."
     )
     table = Table(("model", "program", "time over torch eager's"), rows, caption, 2)
     figure = bars(values, lambda _: arguments.preset, "slower", "time over torch eager's")

@@ -108,6 +108,11 @@ def wait() -> None:
         torch.cuda.synchronize()
 
 
+def measured(rounds: int) -> str:
+    """On what, and how: for the caption of a table of `ratio`s."""
+    return f"{machine()}; medians and ranges of {rounds} rounds"
+
+
 def product_rate(dtype: str) -> float:
     """Floating-point operations a second of the better library's square matrix product."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
