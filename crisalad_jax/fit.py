@@ -38,6 +38,7 @@ from crisalad_jax.training import (
     init_state,
     learning_rate_schedule,
     merge_params,
+    spreads_images,
     train_step,
 )
 
@@ -155,6 +156,7 @@ class _Run:
             )
         )
         self.config, self.out = config, out
+        self._spread = spreads_images(config.trains)
         self.steps = self.steps_per_epoch * config.epochs
         self.cache = ImageCache()
         self._compiled = StepConfig(config.model, config.loss, config.optimiser, self.steps)
@@ -188,7 +190,8 @@ class _Run:
 
     def _share(self, tree: PyTree) -> PyTree:
         """On the devices that the images of a batch are spread over."""
-        return on_every_device(tree, self.config.places_per_batch * self.config.images_per_place)
+        batch = self.config.places_per_batch * self.config.images_per_place
+        return on_every_device(tree, batch if self._spread else 1)
 
     def params(self) -> Crisalad:
         return merge_params(*on_one_device((self.state.trainable, self._frozen)))
@@ -206,7 +209,7 @@ class _Run:
         self.state, device_metrics = train_step(
             self.state,
             self._frozen,
-            over_devices(batch.images),
+            over_devices(batch.images) if self._spread else batch.images,
             batch.labels,
             batch.valid,
             self._step_key,

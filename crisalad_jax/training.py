@@ -41,6 +41,15 @@ class Metrics(NamedTuple):
     gradient_norm: Float[Array, ""]
 
 
+def spreads_images(trains: str) -> bool:
+    """Whether a batch is spread over devices: not where all parameters train, on a CPU.
+
+    Each device has what trains, its gradient and its moments to itself: of all parameters these are
+    most of the memory, which a CPU's devices share, and no time is won (docs/performance.md).
+    """
+    return trains != ALL or jax.default_backend() != "cpu"
+
+
 def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     """Split into (trainable, frozen): the model's structure, None for the other's leaves.
 

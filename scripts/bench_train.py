@@ -44,7 +44,7 @@ from crisalad_jax.config import TrainConfig, recipe
 from crisalad_jax.costs import part_costs
 from crisalad_jax.losses import multi_similarity_loss
 from crisalad_jax.model import describe
-from crisalad_jax.training import StepConfig, init_state, train_step
+from crisalad_jax.training import StepConfig, init_state, spreads_images, train_step
 from parity.reference.losses import multi_similarity_loss as torch_loss
 from parity.reference.training import clip_gradients, freeze
 
@@ -142,7 +142,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
             torch_step(both, config, True),
             our_step(both, config, False),
         ]
-        if len(jax.local_devices()) > 1:
+        if len(jax.local_devices()) > 1 and spreads_images(config.trains):
             contenders.append(our_step(both, config, True))
         first = {one.name: seconds(one.call) for one in contenders}
         yield Case(title(preset, config.model), batch, contenders, first, operations(config, batch))

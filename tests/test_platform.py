@@ -185,24 +185,33 @@ from conftest import MODEL, RECIPE, random_params
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax import fit as module
-shared, out = map(pathlib.Path, sys.argv[1:])
-recipe = dataclasses.replace(RECIPE, patience=None)
-used, spread = [], module.over_devices
-module.over_devices = lambda images: used.append(spread(images)) or used[-1]
+shared, out = map(pathlib.Path, sys.argv[1:3])
+recipe = dataclasses.replace(RECIPE, patience=None, trains=sys.argv[3])
+used, step = set(), module.train_step
+def train_step(state, frozen, images, *rest):
+    used.update(len(x.sharding.device_set) for x in (state.step, jax.numpy.asarray(images)))
+    return step(state, frozen, images, *rest)
+module.train_step = train_step
 places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
 trained = module.fit(recipe, places, out, validation=town, initial=random_params(MODEL), quiet=True)
-print(*(len(x.sharding.device_set) for x in (used[-1], trained.params.backbone.blocks.ls1)))
+print(*used, len(trained.params.backbone.blocks.ls1.sharding.device_set))
 """
 
 
-def test_a_run_on_three_devices_is_that_on_one(
-    shared: pathlib.Path, run: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
+def train_in_a_program(devices: int, trains: str, shared: pathlib.Path, out: pathlib.Path) -> str:
     path = os.pathsep.join([str(pathlib.Path(__file__).parent), os.getcwd()])
-    told = {"JAX_NUM_CPU_DEVICES": "3", "PYTHONPATH": path}
-    assert in_a_program(TRAIN, tmp_path, str(shared), str(tmp_path / "run"), **told) == "3 1\n"
-    expected = read_metrics(run / "metrics.jsonl")
-    found = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    told = {"JAX_NUM_CPU_DEVICES": str(devices), "PYTHONPATH": path}
+    return in_a_program(TRAIN, out.parent, str(shared), str(out), trains, **told)
+
+
+def test_a_run_on_three_devices_is_that_on_one(
+    shared: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """And what it comes back with is on one."""
+    runs = [tmp_path / "one", tmp_path / "three"]
+    assert train_in_a_program(1, "adapters+head", shared, runs[0]) == "1 1\n"
+    assert train_in_a_program(3, "adapters+head", shared, runs[1]) == "3 1\n"
+    expected, found = (read_metrics(run / "metrics.jsonl") for run in runs)
     assert len(found) == len(expected)
     for ours, theirs in zip(found, expected, strict=True):
         assert ours.keys() == theirs.keys()
@@ -210,6 +219,10 @@ def test_a_run_on_three_devices_is_that_on_one(
             # Sums in another order, 1e-7 each, and six steps of Adam, whose first ones divide a
             # gradient by itself.
             assert ours[name] == pytest.approx(theirs[name], rel=1e-4), (name, ours["step"])
+
+
+def test_where_all_trains_one_device_does(shared: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    assert train_in_a_program(3, "all", shared, tmp_path / "run") == "1 1\n"
 
 
 SET_UP = """
