@@ -58,6 +58,9 @@ class Contender(NamedTuple):
     name: str
     call: Callable[[], Any]
     memory: Callable[[], int]
+    program: Callable[[], str] = str
+    """As XLA compiled it: of torch's, nothing."""
+    devices: int = 1
 
 
 class Sides(NamedTuple):
@@ -102,11 +105,14 @@ def by_us(both: Sides, spread: bool) -> Contender:
     def call() -> jax.Array:
         return jax.block_until_ready(describe(params, images, both.config))
 
+    def compiled() -> Any:
+        return describe.lower(params, images, both.config).compile()  # pyright: ignore
+
     def memory() -> int:
-        analysis: Any = describe.lower(params, images, both.config).compile().memory_analysis()  # pyright: ignore
+        analysis = compiled().memory_analysis()
         return devices * (analysis.temp_size_in_bytes + analysis.output_size_in_bytes)
 
-    return Contender(OURS[spread], call, memory)
+    return Contender(OURS[spread], call, memory, lambda: compiled().as_text(), devices)
 
 
 def seconds(call: Callable[[], Any]) -> float:

@@ -98,11 +98,13 @@ def our_step(both: Sides, config: TrainConfig, spread: bool) -> Contender:
         state, metrics = train_step(state, *rest, step)
         return float(metrics.loss)
 
-    def memory() -> int:
-        analysis: Any = train_step.lower(state, *rest, step).compile().memory_analysis()  # pyright: ignore
-        return devices * analysis.temp_size_in_bytes + (devices - 1) * size
+    def compiled() -> Any:
+        return train_step.lower(state, *rest, step).compile()  # pyright: ignore
 
-    return Contender(OURS[spread], call, memory)
+    def memory() -> int:
+        return devices * compiled().memory_analysis().temp_size_in_bytes + (devices - 1) * size
+
+    return Contender(OURS[spread], call, memory, lambda: compiled().as_text(), devices)
 
 
 def check(both: Sides, config: TrainConfig, tolerance: float) -> None:
