@@ -86,8 +86,8 @@ def _without_layer_scale(block: Any) -> Any:
 def _special_tokens_once(adapter: Any) -> Any:
     def wrong(params: Any, tokens: Any, grid: tuple[int, int]) -> Any:
         # Without bias, half of what counts twice is what counts once.
-        special = tokens.shape[0] - grid[0] * grid[1]
-        return adapter(params, tokens, grid).at[:special].multiply(0.5)
+        special = tokens.shape[-2] - grid[0] * grid[1]
+        return adapter(params, tokens, grid).at[..., :special, :].multiply(0.5)
 
     return wrong
 

@@ -106,3 +106,37 @@ def test_operations_of_a_step_are_those_of_what_trains(scripts: Any) -> None:
     assert bench.operations(tiny, 8) == 3 * forward(tiny)
     # The head's are a twentieth of all, the embedding's less.
     assert 1.9 * forward(paper) < bench.operations(paper, 8) < 2.2 * forward(paper)
+
+
+PROGRAM = """
+  %dot.7 = f32[9]{0} dot(%a, %b), metadata={op_name="jit(f)/jvp()/...jd,...di->...ji/dot_general"}
+  ROOT %dot.8 = f32[9]{0} dot(%a, %b), metadata={op_name="jit(f)/jvp()/dot_general"}
+  %copy_bitcast_fusion.1 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/transpose"}
+  %bitcast_dynamic-update-slice_fusion = f32[9]{0} fusion(%a, %b)
+  %add_bitcast_fusion = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/add"}
+  %wrapped_broadcast.2 = f32[9]{0} fusion(), metadata={op_name="jit(f)/broadcast_in_dim"}
+  %broadcast_add_fusion.2 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/add"}
+  %all-reduce.3 = f32[9]{0} all-reduce(%a), metadata={op_name="jit(f)/dot_general"}
+  %copy_multiply_fusion.1 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/mul"}
+  %while.4 = f32[9]{0} while(%a), metadata={op_name="jit(f)/while"}
+"""
+
+
+def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
+    """Each once, the n-th for 2^n microseconds; what is not of the program, or holds it, never."""
+    bench = scripts("bench_profile")
+    names = (
+        *("dot.7", "dot.8", "copy_bitcast_fusion.1", "bitcast_dynamic-update-slice_fusion"),
+        *("add_bitcast_fusion", "wrapped_broadcast.2", "broadcast_add_fusion.2", "all-reduce.3"),
+        *("while.4", "another", "copy_multiply_fusion.1"),
+    )
+    events = [{"ph": "X", "name": name, "dur": 2**n} for n, name in enumerate(names)]
+    found = bench.milliseconds([*events, {"ph": "M", "name": "dot.7"}, {}], PROGRAM)
+    assert found == {
+        "each other": 0.128,
+        "attention's products": 0.001,
+        "other products": 0.002,
+        "constants written": 0.032,
+        "copies": 0.004 + 0.008,
+        "numbers one by one, sums": 0.016 + 0.064 + 1.024,
+    }

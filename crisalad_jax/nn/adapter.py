@@ -4,6 +4,8 @@ All narrow the tokens, act on them, and widen them again with a projection that 
 an untrained adapter changes nothing.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
@@ -109,8 +111,8 @@ def _init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) 
 
 
 def adapter(
-    params: Adapter, tokens: Float[Array, "token dim"], grid: tuple[int, int]
-) -> Float[Array, "token dim"]:
+    params: Adapter, tokens: Float[Array, "*batch token dim"], grid: tuple[int, int]
+) -> Float[Array, "*batch token dim"]:
     """Down, ReLU, convolutions on the patch grid plus skip, up (Adapter of paper Eq. 2).
 
     The last `grid[0] * grid[1]` tokens are patches in row order. The class and register tokens
@@ -120,23 +122,24 @@ def adapter(
     hidden = jax.nn.relu(checkpoint_name(linear(params.down, tokens), "down"))
     if isinstance(params, MlpAdapter):
         return linear(params.up, hidden)
-    special = tokens.shape[0] - grid[0] * grid[1]
-    patches = hidden[special:].reshape(*grid, -1)
+    *batch, count, width = hidden.shape
+    special = count - grid[0] * grid[1]
+    patches = hidden[..., special:, :].reshape(-1, *grid, width)
     if isinstance(params, DepthwiseAdapter):
         mixed = _separable(params, patches)
     else:
-        mixed = _multi_resolution(params, patches)
-    branch = jnp.concatenate([hidden[:special], mixed.reshape(grid[0] * grid[1], -1)])
+        mixed = jax.vmap(functools.partial(_multi_resolution, params))(patches)
+    mixed = mixed.reshape(*batch, -1, width)
+    branch = jnp.concatenate([hidden[..., :special, :], mixed], axis=-2)
     return linear(params.up, branch + hidden)
 
 
 def _separable(
-    params: DepthwiseAdapter, x: Float[Array, "height width dim"]
-) -> Float[Array, "height width dim"]:
+    params: DepthwiseAdapter, x: Float[Array, "image height width dim"]
+) -> Float[Array, "image height width dim"]:
     # No activation between the two convolutions, as in Xception.
-    return jax.nn.relu(
-        checkpoint_name(linear(params.pointwise, depthwise_conv(params.depthwise, x)), "mixed")
-    )
+    filtered = jax.vmap(functools.partial(depthwise_conv, params.depthwise))(x)
+    return jax.nn.relu(checkpoint_name(linear(params.pointwise, filtered), "mixed"))
 
 
 def _multi_resolution(

@@ -26,38 +26,40 @@ class Attention:
 
 def attention(
     params: Attention,
-    x: Float[Array, "token dim"],
+    x: Float[Array, "*batch token dim"],
     heads: int,
     *,
     mask: Bool[Array, "token token"] | None = None,
     dropout_rate: float = 0.0,
     key: PRNGKeyArray | None,
-) -> Float[Array, "token dim"]:
-    """Scaled dot-product self-attention (Vaswani et al. 2017).
+) -> Float[Array, "*batch token dim"]:
+    """Scaled dot-product self-attention (Vaswani et al. 2017), of one sequence or a batch.
 
     `mask[i, j]` says that token i may look at token j; a row must allow at least one. Scores and
     softmax are float32 whatever the type of `x`. `dropout_rate` falls on the attention weights.
     """
-    tokens, dim = x.shape
+    *batch, tokens, dim = x.shape
     kept = None
     if key is not None and dropout_rate > 0:
-        kept = dropout(jnp.ones((heads, tokens, tokens), _wide(x)), dropout_rate, key=key)
-    qkv = checkpoint_name(linear(params.qkv, x), "qkv").reshape(tokens, 3 * heads, dim // heads)
-    queries, keys, values = jnp.split(qkv, 3, axis=1)
+        every = jnp.ones((*batch, heads, tokens, tokens), _wide(x))
+        kept = dropout(every, dropout_rate, key=key)
+    qkv = checkpoint_name(linear(params.qkv, x), "qkv")
+    qkv = qkv.reshape(*batch, tokens, 3 * heads, dim // heads)
+    queries, keys, values = jnp.split(qkv, 3, axis=-2)
     fits = x.dtype == jnp.bfloat16 and dim // heads % 8 == 0 and mask is None and kept is None
     if fits and has_fused_attention():
         mixed = jax.nn.dot_product_attention(queries, keys, values, implementation="cudnn")
-        return linear(params.proj, mixed.reshape(tokens, dim))
+        return linear(params.proj, mixed.reshape(x.shape))
     # With the heads in front every product is a plain batched matmul. Queries are columns: so is
     # what becomes of them, and the softmax runs down columns, which is faster on a CPU.
     mixed = _mix(
-        (queries / math.sqrt(dim // heads)).transpose(1, 2, 0),
-        keys.transpose(1, 0, 2),
-        values.transpose(1, 0, 2),
+        jnp.moveaxis(queries / math.sqrt(dim // heads), -3, -1),
+        jnp.moveaxis(keys, -3, -2),
+        jnp.moveaxis(values, -3, -2),
         None if mask is None else mask.T,
         kept,
     )
-    return linear(params.proj, mixed.transpose(2, 0, 1).reshape(tokens, dim))
+    return linear(params.proj, jnp.moveaxis(mixed, -1, -3).reshape(x.shape))
 
 
 def _wide(x: Array) -> Any:
@@ -70,12 +72,12 @@ def _product(formula: str, a: Array, b: Array) -> Array:
 
 @jax.custom_vjp
 def _mix(
-    queries: Float[Array, "head dim token"],
-    keys: Float[Array, "head token dim"],
-    values: Float[Array, "head token dim"],
+    queries: Float[Array, "*batch head dim token"],
+    keys: Float[Array, "*batch head token dim"],
+    values: Float[Array, "*batch head token dim"],
     mask: Bool[Array, "token token"] | None,
-    kept: Float[Array, "head token token"] | None,
-) -> Float[Array, "head dim token"]:
+    kept: Float[Array, "*batch head token token"] | None,
+) -> Float[Array, "*batch head dim token"]:
     """Every query's mean of the values, weighted by the softmax of its scores, times `kept`.
 
     The gradient is written out: by itself JAX would make the result once more for it, and take the
@@ -84,16 +86,16 @@ def _mix(
     """
     weights, totals = _softmax(queries, keys, mask)
     weights = weights if kept is None else weights * kept
-    mixed = _product("hjd,hji->hdi", values, weights.astype(values.dtype))
+    mixed = _product("...jd,...ji->...di", values, weights.astype(values.dtype))
     # The softmax's division, where there is less to divide.
     return (mixed / totals).astype(values.dtype)
 
 
 def _softmax(
     queries: Array, keys: Array, mask: Array | None
-) -> tuple[Float[Array, "head token token"], Float[Array, "head 1 token"]]:
+) -> tuple[Float[Array, "*batch head token token"], Float[Array, "*batch head 1 token"]]:
     """Exponentials of the scores, keys down the columns, and what to divide a column by."""
-    scores = _product("hjd,hdi->hji", keys, queries)
+    scores = _product("...jd,...di->...ji", keys, queries)
     if mask is not None:
         scores = jnp.where(mask, scores, -jnp.inf)
     weights = jnp.exp(scores - scores.max(axis=-2, keepdims=True))
@@ -108,15 +110,15 @@ def _mix_backward(inputs: tuple[Any, ...], change: Array) -> tuple[Any, ...]:
     queries, keys, values, mask, kept = inputs
     weights, totals = _softmax(queries, keys, mask)
     change = (change / totals).astype(values.dtype)
-    to_weights = _product("hjd,hdi->hji", values, change)
+    to_weights = _product("...jd,...di->...ji", values, change)
     used = weights
     if kept is not None:
         to_weights, used = to_weights * kept, weights * kept
-    to_values = _product("hji,hdi->hjd", used.astype(values.dtype), change)
+    to_values = _product("...ji,...di->...jd", used.astype(values.dtype), change)
     mean = (weights * to_weights).sum(axis=-2, keepdims=True) / totals
     to_scores = (weights * (to_weights - mean)).astype(keys.dtype)
-    to_queries = _product("hjd,hji->hdi", keys, to_scores).astype(queries.dtype)
-    to_keys = _product("hji,hdi->hjd", to_scores, queries).astype(keys.dtype)
+    to_queries = _product("...jd,...ji->...di", keys, to_scores).astype(queries.dtype)
+    to_keys = _product("...ji,...di->...jd", to_scores, queries).astype(keys.dtype)
     nothing = None if kept is None else jnp.zeros_like(kept)
     return to_queries, to_keys, to_values.astype(values.dtype), None, nothing
 

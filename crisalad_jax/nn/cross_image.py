@@ -3,7 +3,6 @@
 Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact GELU.
 """
 
-import functools
 import math
 
 import jax
@@ -97,15 +96,11 @@ def _encoder_layer(
 ) -> Float[Array, "image token dim"]:
     weights_key, attended_key, hidden_key, update_key = split_key(key, 4)
     rate = config.dropout
-    across = functools.partial(
-        attention, params.attn, heads=config.heads, mask=mask, dropout_rate=rate
+    across = tokens.swapaxes(0, 1)
+    attended = attention(
+        params.attn, across, config.heads, mask=mask, dropout_rate=rate, key=weights_key
     )
-    if weights_key is None:
-        attended = jax.vmap(lambda x: across(x, key=None), in_axes=1, out_axes=1)(tokens)
-    else:
-        keys = jax.random.split(weights_key, tokens.shape[1])
-        attended = jax.vmap(lambda x, k: across(x, key=k), in_axes=(1, 0), out_axes=1)(tokens, keys)
-    tokens = tokens + dropout(attended, rate, key=attended_key)
+    tokens = tokens + dropout(attended.swapaxes(0, 1), rate, key=attended_key)
     tokens = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
     hidden = dropout(gelu(linear(params.linear1, tokens)), rate, key=hidden_key)
     update = dropout(linear(params.linear2, hidden), rate, key=update_key)

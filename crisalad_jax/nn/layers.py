@@ -110,9 +110,15 @@ def widen(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
-    """Affine map of the last axis, in the type of `x`. On a CPU it is rounded once, at the end."""
-    y = jnp.matmul(x, params.weight.astype(x.dtype), preferred_element_type=product_dtype(x.dtype))
-    return (y if params.bias is None else widen(y) + params.bias).astype(x.dtype)
+    """Affine map of the last axis, in the type of `x`. On a CPU it is rounded once, at the end.
+
+    All of the batch are rows of one matrix: for the gradient of a weight XLA would else turn what
+    comes back, by a copy.
+    """
+    rows, weight = x.reshape(-1, x.shape[-1]), params.weight.astype(x.dtype)
+    y = jnp.matmul(rows, weight, preferred_element_type=product_dtype(x.dtype))
+    y = (y if params.bias is None else widen(y) + params.bias).astype(x.dtype)
+    return y.reshape(*x.shape[:-1], -1)
 
 
 def layer_norm(

@@ -191,17 +191,14 @@ def block(
 ) -> Float[Array, "image token dim"]:
     """One block (paper Eq. 2), with LayerScale over MLP and adapter alike, as in CricaVPR."""
 
-    def attend(x: Float[Array, "token dim"]) -> Float[Array, "token dim"]:
-        return attention(params.attn, x, config.heads, key=None)
-
     normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
-    tokens = (widen(tokens) + params.ls1 * widen(jax.vmap(attend)(normed))).astype(tokens.dtype)
+    attended = attention(params.attn, normed, config.heads, key=None)
+    tokens = (widen(tokens) + params.ls1 * widen(attended)).astype(tokens.dtype)
     tokens = checkpoint_name(tokens, "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
     update = feed_forward(params.mlp, normed)
     if params.adapter is not None:
-        adapt = functools.partial(adapter, params.adapter, grid=grid)
-        update = update + config.adapter.alpha * jax.vmap(adapt)(normed)
+        update = update + config.adapter.alpha * adapter(params.adapter, normed, grid)
     return (widen(tokens) + params.ls2 * widen(update)).astype(tokens.dtype)
 
 

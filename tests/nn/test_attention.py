@@ -29,17 +29,19 @@ def make() -> tuple[Attention, jax.Array, torch.nn.MultiheadAttention]:
 
 def test_equals_torch_with_and_without_mask() -> None:
     params, x, theirs = make()
+    x = jnp.stack([x, 1 - x])
     mask = np.random.default_rng(0).random((TOKENS, TOKENS)) < 0.5
     np.fill_diagonal(mask, True)
-    tx = torch.tensor(np.asarray(x))[None]
+    tx = torch.tensor(np.asarray(x))
     for allowed in (None, mask):
         forbidden = None if allowed is None else torch.tensor(~allowed)
-        expected = theirs(tx, tx, tx, attn_mask=forbidden, need_weights=False)[0][0]
-        ours = attention(
-            params, x, HEADS, mask=None if allowed is None else jnp.asarray(allowed), key=None
-        )
+        expected = theirs(tx, tx, tx, attn_mask=forbidden, need_weights=False)[0]
+        seen = None if allowed is None else jnp.asarray(allowed)
+        ours = attention(params, x, HEADS, mask=seen, key=None)
+        one = attention(params, x[1], HEADS, mask=seen, key=None)
         # Two products of 12 terms of order 1 in float32.
         np.testing.assert_allclose(ours, expected.detach().numpy(), atol=2e-6)
+        np.testing.assert_allclose(one, expected[1].detach().numpy(), atol=2e-6)
 
 
 def test_a_masked_token_has_no_influence_and_no_gradient() -> None:
@@ -108,7 +110,7 @@ def test_dropout_needs_a_key_and_changes_the_output() -> None:
 
 def test_cudnn_is_asked_where_it_can_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """With XLA in its place, which takes the same arguments: here there is no GPU."""
-    x = jax.random.normal(jax.random.key(0), (TOKENS, 16)).astype(jnp.bfloat16)
+    x = jax.random.normal(jax.random.key(0), (3, TOKENS, 16)).astype(jnp.bfloat16)
     params = Attention(*(init_linear(jax.random.key(n), 16, 16 * n) for n in (3, 1)))
 
     def value(x: jax.Array) -> jax.Array:

@@ -90,7 +90,7 @@ def test_dropout_stands_where_torch_has_it(monkeypatch) -> None:
     tokens = jax.random.normal(jax.random.key(1), (IMAGES, TOKENS, DIM))
     cross_image_encoder(params, tokens, CONFIG, key=jax.random.key(2))
     layer = [
-        ((4, IMAGES, IMAGES), 0.1, True),
+        ((TOKENS, 4, IMAGES, IMAGES), 0.1, True),
         ((IMAGES, TOKENS, DIM), 0.1, True),
         ((IMAGES, TOKENS, 24), 0.1, True),
         ((IMAGES, TOKENS, DIM), 0.1, True),
