@@ -24,17 +24,15 @@ from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.places import read_places
-from crisalad_jax.demo import DemoConfig, run_demo
 from crisalad_jax.descriptors import writer_for
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate, group, read_tokens
 from crisalad_jax.files import check_target, write_json
-from crisalad_jax.fit import fit, read_metrics
 from crisalad_jax.layouts import LAYOUTS
 from crisalad_jax.model import Crisalad, init_crisalad
-from crisalad_jax.report import RecallRow, prediction_gallery, recall_table, training_curves
 from crisalad_jax.serial import read_config, to_plain
-from crisalad_jax.training import split_params
+
+# What only some commands need is imported in them, for the others to start sooner.
 
 # Into a file or a pipe, wide enough that tables do not wrap.
 _console = rich.console.Console(width=None if sys.stdout.isatty() else 120)
@@ -52,6 +50,9 @@ class Demo:
 
 
 def _demo(arguments: Demo) -> None:
+    from crisalad_jax.demo import DemoConfig, run_demo
+    from crisalad_jax.report import recall_table
+
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
     _console.print(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
     _console.print(
@@ -94,6 +95,9 @@ class Train:
 
 
 def _train(arguments: Train) -> None:
+    from crisalad_jax.fit import fit, read_metrics
+    from crisalad_jax.report import training_curves
+
     config = arguments.settings
     if arguments.image_size is not None:
         model = dataclasses.replace(config.model, image_size=arguments.image_size)
@@ -213,6 +217,8 @@ class Evaluate:
 
 
 def _evaluate(arguments: Evaluate) -> None:
+    from crisalad_jax.report import RecallRow, prediction_gallery, recall_table
+
     groupings = list(dict.fromkeys(arguments.grouping.split(",")))
     if arguments.json is not None:
         check_target(arguments.json)
@@ -366,6 +372,8 @@ class Info:
 
 
 def _info(arguments: Info) -> None:
+    from crisalad_jax.training import split_params
+
     check_grouping((), arguments.batch_size, seed=0)
     if arguments.json is not None:
         check_target(arguments.json)

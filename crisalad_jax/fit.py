@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from crisalad_jax.checkpoint import StateStore, save_weights
+from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import TrainConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import (
@@ -32,6 +32,7 @@ from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
 from crisalad_jax.platform import on_every_device, on_one_device, over_devices
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
+from crisalad_jax.states import StateStore
 from crisalad_jax.training import (
     StepConfig,
     TrainState,

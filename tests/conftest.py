@@ -13,6 +13,7 @@ import sys
 import unittest.mock
 from collections.abc import Callable, Iterator
 from types import ModuleType
+from typing import Any
 
 import cv2
 import jax
@@ -103,6 +104,14 @@ def write_town(root: pathlib.Path) -> pathlib.Path:
             seed = 500 + round(east / 40)
             write_picture(root / "images" / "test" / part / name, seed, noise=20.0)
     return root
+
+
+def assert_equal(found: Any, expected: Any) -> None:
+    """The same tree of arrays, of the same types, to the last bit."""
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for (name, a), b in zip(named_leaves(found).items(), jax.tree.leaves(expected), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 @pytest.fixture(scope="session")

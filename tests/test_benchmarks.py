@@ -133,7 +133,7 @@ def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
     events = [{"ph": "X", "name": name, "dur": 2**n} for n, name in enumerate(names)]
     found = bench.milliseconds([*events, {"ph": "M", "name": "dot.7"}, {}], PROGRAM)
     assert found == {
-        "each other": 0.128,
+        "between devices": 0.128,
         "attention's products": 0.001,
         "other products": 0.002,
         "constants written": 0.032,

@@ -1,39 +1,27 @@
-"""Weights there and back bit for bit, files that are none of ours, and states to resume from."""
+"""Weights there and back bit for bit, and files that are none of ours."""
 
 import dataclasses
 import json
 import os
 import pathlib
-import re
 import struct
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
 
 import crisalad_jax
-from crisalad_jax.checkpoint import StateStore, load_weights, save_weights
+from crisalad_jax.checkpoint import load_weights, save_weights
 from crisalad_jax.config import PRESETS
 from crisalad_jax.errors import InputError
-from crisalad_jax.model import Crisalad
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import to_plain
-from crisalad_jax.training import StepConfig, init_state
-from tests.conftest import MODEL, RECIPE, random_params
+from tests.conftest import MODEL, assert_equal, random_params
 
 WITHOUT_ENCODER = dataclasses.replace(MODEL, encoder=dataclasses.replace(MODEL.encoder, layers=0))
 REGISTERS = dataclasses.replace(
     MODEL, backbone=dataclasses.replace(MODEL.backbone, registers=4, ffn="swiglu")
 )
-
-
-def assert_equal(found: Crisalad, expected: Crisalad) -> None:
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for (name, a), b in zip(named_leaves(found).items(), jax.tree.leaves(expected), strict=True):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 @pytest.mark.parametrize("config", [MODEL, WITHOUT_ENCODER, REGISTERS])
@@ -164,57 +152,3 @@ def test_no_file_or_another_one_is_refused(tmp_path):
     (tmp_path / "w.safetensors").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
     with pytest.raises(InputError, match=r"w\.safetensors: not a whole safetensors file"):
         load_weights(tmp_path / "w.safetensors")
-
-
-@pytest.fixture
-def state(params):
-    step = StepConfig(MODEL, RECIPE.loss, RECIPE.optimiser, 6)
-    return init_state(params, "adapters+head", step)[0]
-
-
-def test_a_state_survives_bit_for_bit_and_the_last_ones_stay(tmp_path, state):
-    store = StateStore(tmp_path / "state", keep=2)
-    assert store.load(state) is None
-    for step in (1, 2, 5):
-        moved = jax.tree.map(lambda leaf, step=step: leaf + step, state)
-        store.save(step, moved, {"best": 0.1 * step})
-    store.save(5, state, {"best": 9.0})  # there already: stays as it is
-    store.close()
-    assert sorted(os.listdir(tmp_path / "state")) == ["2", "5"]
-    again = StateStore(tmp_path / "state")
-    saved = again.load(state)
-    again.close()
-    assert saved is not None
-    assert (saved.step, saved.record) == (5, {"best": 0.5})
-    assert_equal(saved.state, jax.tree.map(lambda leaf: leaf + 5, state))
-
-
-def test_a_state_of_another_model_is_refused(tmp_path, state):
-    store = StateStore(tmp_path / "state")
-    store.save(1, state, {})
-    leaves, structure = jax.tree.flatten(state)
-    largest = max(range(len(leaves)), key=lambda i: leaves[i].size)
-    shape = leaves[largest].shape
-    leaves[largest] = jnp.zeros((*shape, 2))
-    words = re.escape(f"found {shape}, expected {(*shape, 2)}")
-    with pytest.raises(
-        InputError,
-        match=f"^{tmp_path}/state/1: this state is damaged or not of this run .*{words}",
-    ):
-        store.load(jax.tree.unflatten(structure, leaves))
-    store.close()
-
-
-def test_a_damaged_state_is_refused_and_the_older_one_named(tmp_path, state):
-    store = StateStore(tmp_path / "state")
-    store.save(1, state, {})
-    store.save(2, state, {})
-    files = [file for file in (tmp_path / "state" / "2" / "state").rglob("*") if file.is_file()]
-    largest = max(files, key=lambda file: file.stat().st_size)
-    largest.write_bytes(largest.read_bytes()[:100])
-    with pytest.raises(
-        InputError,
-        match=f"^{tmp_path}/state/2: this state is damaged .*; delete it to go on from step 1",
-    ):
-        store.load(state)
-    store.close()

@@ -18,7 +18,7 @@ LAYERS = (
     ("sinkhorn", "losses", "serial", "data"),
     ("nn",),
     ("model",),
-    ("checkpoint", "costs", "layouts"),
+    ("checkpoint", "states", "costs", "layouts"),
     ("convert",),
     ("training", "retrieval", "report", "descriptors"),
     ("evaluation",),
@@ -137,6 +137,12 @@ HEAVY = {"cv2", "orbax", "grain", "h5py", "tyro", "optax", "safetensors", "matpl
 def test_a_model_needs_no_file_formats():
     statement = f"import {PACKAGE}; import {PACKAGE}.model; {PACKAGE}.describe, {PACKAGE}.recipe"
     assert loaded_after(statement, HEAVY | {"torch", "jax"}) == {"jax"}
+
+
+def test_what_describes_starts_without_what_trains():
+    loaded = loaded_after(f"import {PACKAGE}.cli", HEAVY)
+    assert {"tyro", "cv2", "safetensors"} <= loaded
+    assert not loaded & {"optax", "matplotlib"}
 
 
 def test_pictures_need_no_jax():

@@ -1,0 +1,119 @@
+"""The states that a run resumes from (orbax)."""
+
+import os
+import pathlib
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+from jaxtyping import PyTree
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.pytree import named_leaves
+
+
+class Saved(NamedTuple):
+    """One restored state of a run."""
+
+    step: int
+    state: PyTree
+    record: dict[str, Any]
+
+
+class StateStore:
+    """The resumable states of a run (orbax): each step is written whole or not at all."""
+
+    def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
+        """Open or make the folder; the last `keep` states stay.
+
+        Raises:
+            InputError: the folder cannot be made or read.
+        """
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
+        )
+        try:
+            self._manager = ocp.CheckpointManager(
+                pathlib.Path(folder).absolute(),
+                options=options,
+                item_handlers={
+                    "state": ocp.StandardCheckpointHandler(),
+                    "record": ocp.JsonCheckpointHandler(),
+                },
+            )
+        except OSError as error:
+            raise InputError(f"{folder}: cannot keep states here: {error.strerror}") from error
+
+    def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
+        """Write the arrays of `state` and the JSON values of `record`; an existing step stays."""
+        if step in self._manager.all_steps():
+            return
+        arrays = ocp.args.StandardSave(_stored(state))
+        self._manager.save(
+            step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonSave(record))
+        )
+
+    def load(self, template: PyTree) -> Saved | None:
+        """The last state, in the structure of `template`; None if there is none.
+
+        Raises:
+            InputError: the stored arrays are damaged or do not fit the template.
+        """
+        step = self._manager.latest_step()
+        if step is None:
+            return None
+        wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _stored(template))
+        try:
+            # Before any array is read: orbax reads all at once, and every misfit is an exception
+            # in a thread of its own.
+            found = self._manager.item_metadata(step)["state"].tree
+            misfits = _misfits(wanted, found)
+            if misfits:
+                raise ValueError(misfits)
+            saved = self._manager.restore(
+                step,
+                args=ocp.args.Composite(
+                    state=ocp.args.StandardRestore(wanted), record=ocp.args.JsonRestore()
+                ),
+            )
+        except Exception as error:  # whatever a damaged file makes orbax and its threads raise
+            reason = " ".join(str(error).split())[:200]
+            older = [other for other in self._manager.all_steps() if other != step]
+            advice = f"; delete it to go on from step {max(older)}" if older else ""
+            raise InputError(
+                f"{self._manager.directory / str(step)}: this state is damaged or not of this run"
+                f"{advice} ({reason})"
+            ) from error
+        # Through numpy, for arrays that orbax has bound to a device would compile the step anew.
+        leaves = [
+            jnp.asarray(np.asarray(saved["state"].get(name, leaf)))
+            for name, leaf in named_leaves(template).items()
+        ]
+        return Saved(
+            step, jax.tree.unflatten(jax.tree.structure(template), leaves), saved["record"]
+        )
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        self._manager.close()
+
+
+def _stored(state: PyTree) -> dict[str, Any]:
+    """Leaves by name, without the empty ones (absent registers), which orbax refuses."""
+    return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}
+
+
+def _misfits(wanted: dict[str, jax.ShapeDtypeStruct], found: dict[str, Any]) -> str:
+    """What keeps the stored arrays from being the wanted ones; empty if nothing does."""
+    differing = sorted(
+        name
+        for name in wanted.keys() | found.keys()
+        if name not in wanted or name not in found or wanted[name].shape != found[name].shape
+    )
+    if not differing:
+        return ""
+    first = differing[0]
+    shapes = [tree[first].shape if first in tree else "none" for tree in (found, wanted)]
+    return f"{len(differing)} arrays differ, as {first}: found {shapes[0]}, expected {shapes[1]}"

@@ -1,0 +1,67 @@
+"""States to resume from: there and back bit for bit, damaged ones, and those of another model."""
+
+import os
+import re
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.states import StateStore
+from crisalad_jax.training import StepConfig, init_state
+from tests.conftest import MODEL, RECIPE, assert_equal
+
+
+@pytest.fixture
+def state(params):
+    step = StepConfig(MODEL, RECIPE.loss, RECIPE.optimiser, 6)
+    return init_state(params, "adapters+head", step)[0]
+
+
+def test_a_state_survives_bit_for_bit_and_the_last_ones_stay(tmp_path, state):
+    store = StateStore(tmp_path / "state", keep=2)
+    assert store.load(state) is None
+    for step in (1, 2, 5):
+        moved = jax.tree.map(lambda leaf, step=step: leaf + step, state)
+        store.save(step, moved, {"best": 0.1 * step})
+    store.save(5, state, {"best": 9.0})  # there already: stays as it is
+    store.close()
+    assert sorted(os.listdir(tmp_path / "state")) == ["2", "5"]
+    again = StateStore(tmp_path / "state")
+    saved = again.load(state)
+    again.close()
+    assert saved is not None
+    assert (saved.step, saved.record) == (5, {"best": 0.5})
+    assert_equal(saved.state, jax.tree.map(lambda leaf: leaf + 5, state))
+
+
+def test_a_state_of_another_model_is_refused(tmp_path, state):
+    store = StateStore(tmp_path / "state")
+    store.save(1, state, {})
+    leaves, structure = jax.tree.flatten(state)
+    largest = max(range(len(leaves)), key=lambda i: leaves[i].size)
+    shape = leaves[largest].shape
+    leaves[largest] = jnp.zeros((*shape, 2))
+    words = re.escape(f"found {shape}, expected {(*shape, 2)}")
+    with pytest.raises(
+        InputError,
+        match=f"^{tmp_path}/state/1: this state is damaged or not of this run .*{words}",
+    ):
+        store.load(jax.tree.unflatten(structure, leaves))
+    store.close()
+
+
+def test_a_damaged_state_is_refused_and_the_older_one_named(tmp_path, state):
+    store = StateStore(tmp_path / "state")
+    store.save(1, state, {})
+    store.save(2, state, {})
+    files = [file for file in (tmp_path / "state" / "2" / "state").rglob("*") if file.is_file()]
+    largest = max(files, key=lambda file: file.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[:100])
+    with pytest.raises(
+        InputError,
+        match=f"^{tmp_path}/state/2: this state is damaged .*; delete it to go on from step 1",
+    ):
+        store.load(state)
+    store.close()
