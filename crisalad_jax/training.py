@@ -45,7 +45,8 @@ def spreads_images(trains: str) -> bool:
     """Whether a batch is spread over devices: not where all parameters train, on a CPU.
 
     Each device has what trains, its gradient and its moments to itself: of all parameters these are
-    most of the memory, which a CPU's devices share, and no time is won (docs/performance.md).
+    most of the memory, which a CPU's devices share, and `tiny` saves no time by it
+    (docs/performance.md).
     """
     return trains != ALL or jax.default_backend() != "cpu"
 

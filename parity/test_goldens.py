@@ -179,7 +179,7 @@ def test_multi_resolution_adapter() -> None:
     template = jax.eval_shape(functools.partial(init_adapter, config=config), jax.random.key(0))
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        return {"tokens": jax.vmap(lambda x: adapter(params, x, (5, 5)))(inputs["tokens"])}
+        return {"tokens": adapter(params, inputs["tokens"], (5, 5))}
 
     names = part_names("adapter", adapter_lines(config, "adapter", "adapter"), template)
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})

@@ -32,8 +32,8 @@ from crisalad_jax.training import spreads_images
 KINDS: dict[str, tuple[str, str]] = {
     # By the name of an operation, and what it was made of.
     "between devices": (r"all-|collective|reduce-scatter", ""),
-    "attention's products": (r"dot|gemm|onednn|ynn|custom-call", r"\.\.\.(jd|ji),"),
-    "other products": (r"dot|gemm|onednn|ynn|convolution|custom-call", ""),
+    "attention's products": (r"dot|gemm|cublas|cudnn|onednn|ynn|custom-call", r"\.\.\.(jd|ji),"),
+    "other products": (r"dot|gemm|cublas|cudnn|onednn|ynn|convolution|custom-call", ""),
     "constants written": (r"(wrapped_)?broadcast(_fusion)?(\.|$)", ""),
     "copies": (
         r"(wrapped_)?((copy|transpose|bitcast|concatenate|pad|[a-z-]*slice)_?)+(fusion)?(\.|$)",
@@ -44,7 +44,7 @@ KINDS: dict[str, tuple[str, str]] = {
 """The first that fits: regular expressions, of which both are found."""
 NOTHING = "nothing"
 SECONDS = 1
-WITHIN = re.compile(r"(while|call|conditional)(\.|$)")
+WITHIN = re.compile(r"(while|call|cond|conditional)(\.|$)")
 """What only holds other operations."""
 INSTRUCTION = re.compile(
     r"^\s*(?:ROOT )?%?([\w.\-]+) = .*?(?:op_name=\"([^\"]*)\"|$)", re.MULTILINE
@@ -82,9 +82,11 @@ def traced(contender: Contender) -> dict[str, float]:
         (path,) = pathlib.Path(folder).glob("**/*.trace.json.gz")
         events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
     found = milliseconds(events, contender.program())
+    if not any(found.values()):
+        raise RuntimeError(f"{contender.name}: found no operation of its program in the trace")
     total = contender.devices * wall
     shares = {kind: spent / total for kind, spent in found.items()}
-    # The clock of the trace is another: its sum may be more than all by a percent.
+    # A device may do two things at once, so that all kinds may be more than all of the time.
     return shares | {NOTHING: max(0.0, 1 - sum(shares.values()))}
 
 

@@ -118,6 +118,7 @@ PROGRAM = """
   %broadcast_add_fusion.2 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/add"}
   %all-reduce.3 = f32[9]{0} all-reduce(%a), metadata={op_name="jit(f)/dot_general"}
   %copy_multiply_fusion.1 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/mul"}
+  %cond.5 = f32[9]{0} conditional(%a), metadata={op_name="jit(f)/cond"}
   %while.4 = f32[9]{0} while(%a), metadata={op_name="jit(f)/while"}
 """
 
@@ -128,7 +129,7 @@ def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
     names = (
         *("dot.7", "dot.8", "copy_bitcast_fusion.1", "bitcast_dynamic-update-slice_fusion"),
         *("add_bitcast_fusion", "wrapped_broadcast.2", "broadcast_add_fusion.2", "all-reduce.3"),
-        *("while.4", "another", "copy_multiply_fusion.1"),
+        *("while.4", "another", "copy_multiply_fusion.1", "cond.5"),
     )
     events = [{"ph": "X", "name": name, "dur": 2**n} for n, name in enumerate(names)]
     found = bench.milliseconds([*events, {"ph": "M", "name": "dot.7"}, {}], PROGRAM)

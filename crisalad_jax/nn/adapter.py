@@ -129,7 +129,7 @@ def adapter(
         mixed = _separable(params, patches)
     else:
         mixed = jax.vmap(functools.partial(_multi_resolution, params))(patches)
-    mixed = mixed.reshape(*batch, -1, width)
+    mixed = mixed.reshape(*batch, grid[0] * grid[1], width)
     branch = jnp.concatenate([hidden[..., :special, :], mixed], axis=-2)
     return linear(params.up, branch + hidden)
 

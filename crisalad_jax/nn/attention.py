@@ -48,6 +48,9 @@ def attention(
     queries, keys, values = jnp.split(qkv, 3, axis=-2)
     fits = x.dtype == jnp.bfloat16 and dim // heads % 8 == 0 and mask is None and kept is None
     if fits and has_fused_attention():
+        queries, keys, values = (
+            one.reshape(-1, tokens, heads, dim // heads) for one in (queries, keys, values)
+        )
         mixed = jax.nn.dot_product_attention(queries, keys, values, implementation="cudnn")
         return linear(params.proj, mixed.reshape(x.shape))
     # With the heads in front every product is a plain batched matmul. Queries are columns: so is

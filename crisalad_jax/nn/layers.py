@@ -118,7 +118,7 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
     rows, weight = x.reshape(-1, x.shape[-1]), params.weight.astype(x.dtype)
     y = jnp.matmul(rows, weight, preferred_element_type=product_dtype(x.dtype))
     y = (y if params.bias is None else widen(y) + params.bias).astype(x.dtype)
-    return y.reshape(*x.shape[:-1], -1)
+    return y.reshape(*x.shape[:-1], weight.shape[-1])
 
 
 def layer_norm(

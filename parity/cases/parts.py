@@ -94,7 +94,7 @@ def positions(grid: tuple[int, int]) -> Part:
 
 def _our_attention(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
     weights, heads = _last_block(params).attn, config.backbone.heads
-    return {"tokens": jax.vmap(lambda t: attention(weights, t, heads, key=None))(x["tokens"])}
+    return {"tokens": attention(weights, x["tokens"], heads, key=None)}
 
 
 ATTENTION = Part(
