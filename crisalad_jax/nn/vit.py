@@ -190,7 +190,6 @@ def block(
     params: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
 ) -> Float[Array, "image token dim"]:
     """One block (paper Eq. 2), with LayerScale over MLP and adapter alike, as in CricaVPR."""
-
     normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
     attended = attention(params.attn, normed, config.heads, key=None)
     tokens = (widen(tokens) + params.ls1 * widen(attended)).astype(tokens.dtype)
