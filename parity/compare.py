@@ -6,7 +6,7 @@ shows the array with the largest error of those that it covers, so every one of 
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -55,9 +55,8 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
             "2e-7 after a step of 1e-2, and optax's 1 - 0.999^1 in float32 is 1e-5 off",
         ),
         OWN_STEP: Tolerance(
-            3e-4,
-            "a step's slope is 1 / epsilon at a gradient of 0; three times the measured 1e-4 "
-            "(seed 0: 9e-5)",
+            1.2e-4,
+            "a step's slope is 1 / epsilon at a gradient of 0; three times the measured 3.7e-5",
         ),
         AFTER: Tolerance(
             1.5e-4,
@@ -89,7 +88,8 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         STEP: Tolerance(7e-5, "as in float32: parameters and gradients are float32"),
         OWN_STEP: Tolerance(
             5e-2,
-            "one sign in 2000 may differ; three times the measured 1.5e-2 (seed 0: 9.4e-3)",
+            "one sign in 2000 may differ, which is 4.5e-2 of all elements together; one of 3,381 "
+            "does at seed 0, 3.4e-2; 9.3e-3 where none does",
         ),
         AFTER: Tolerance(
             1e-1,
@@ -121,7 +121,7 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
             2e-13, "the parameter's rounding over the step of 1e-2; four times the measured 4.6e-14"
         ),
         OWN_STEP: Tolerance(
-            1e-11, "as in float32; three times the measured 3.4e-12 (seed 0: 2.2e-13)"
+            2.5e-12, "as in float32; three times the measured 7.3e-13 (seed 0: 1.1e-13)"
         ),
         AFTER: Tolerance(
             6e-13,
@@ -240,6 +240,33 @@ def compare(
 
 
 @np.errstate(invalid="ignore")
+def compare_joined(
+    case: str,
+    quantity: str,
+    precision: str,
+    ours: Arrays,
+    theirs: Arrays,
+    tolerance: Tolerance,
+    *,
+    note: str = "",
+) -> Row:
+    """The row of all arrays of `theirs` joined to one, for what is only true of many elements."""
+    mine, other = (_join(side[name] for name in theirs) for side in (ours, theirs))
+    return Row(
+        case=case,
+        quantity=quantity,
+        precision=precision,
+        worst="all together",
+        shape=other.shape,
+        max_abs=float(np.abs(mine - other).max(initial=0.0)),
+        relative=relative_error(mine, other),
+        tolerance=tolerance.value,
+        why=tolerance.why,
+        arrays=len(theirs),
+        note=note,
+    )
+
+
 def compare_truth(
     case: str,
     quantity: str,
@@ -252,21 +279,13 @@ def compare_truth(
 
     Where torch's error is no number there is nothing to be held to: the row misses.
     """
-
-    def joined(side: Arrays) -> np.ndarray:
-        return np.concatenate([as_double(side[name]).ravel() for name in truth])
-
-    mine, other, true = joined(ours), joined(theirs), joined(truth)
-    allowed = TRUTH_FACTOR * relative_error(other, true)
-    return Row(
-        case=case,
-        quantity=quantity,
-        precision=precision,
-        worst="all together",
-        shape=true.shape,
-        max_abs=float(np.abs(mine - true).max(initial=0.0)),
-        relative=relative_error(mine, true),
-        tolerance=allowed,
-        why=f"{TRUTH_FACTOR} times torch's own error: as many roundings of the same size",
-        arrays=len(truth),
+    their_error = relative_error(_join(theirs[name] for name in truth), _join(truth.values()))
+    tolerance = Tolerance(
+        TRUTH_FACTOR * their_error,
+        f"{TRUTH_FACTOR} times torch's own error: as many roundings of the same size",
     )
+    return compare_joined(case, quantity, precision, ours, truth, tolerance)
+
+
+def _join(arrays: Iterable[np.ndarray]) -> np.ndarray:
+    return np.concatenate([as_double(array).ravel() for array in arrays])

@@ -31,6 +31,7 @@ from parity.compare import (
     Row,
     as_double,
     compare,
+    compare_joined,
     compare_truth,
     relative_error,
 )
@@ -292,7 +293,8 @@ def _check_step(
 
     AdamW's first step is the sign of the gradient, whatever its size. Where a gradient is rounding
     noise, the two sides' own signs have nothing to do with each other: such elements are left out
-    of the row of the steps along own gradients, and counted in its note.
+    of the row of the steps along own gradients, and counted in its note. That row is of all arrays
+    joined: of the few elements of a small array a single other sign would be a large part.
     """
     names = [name for name in their_gradients if name in our_gradients]
     start = {name: model.get_parameter(name).detach().numpy() for name in names}
@@ -316,7 +318,8 @@ def _check_step(
     same, own = after(their_gradients), after(our_gradients)
     mine, other = split(our_gradients), split(their_gradients)
     # An array without gradient, such as positions that a case does not use, would only decay.
-    compared = [name for name in theirs.keys() - cancelling(theirs).keys() if other[name].any()]
+    noise = cancelling(theirs)
+    compared = [name for name in theirs if name not in noise and other[name].any()]
     tolerances = TOLERANCES[precision]
     floor = tolerances["gradients" if case.smooth else "gradients, kinks"].value
     told = {name: _told(mine[name], other[name], floor) for name in compared}
@@ -329,15 +332,15 @@ def _check_step(
     def moved(state: Arrays, where: Mapping[str, Any]) -> dict[str, np.ndarray]:
         return {name: np.where(where[name], state[name] - origin[name], 0) for name in compared}
 
+    def row(check: Callable[..., Row], name: str, ours: Arrays, theirs: Arrays, note: str) -> Row:
+        return check(case.name, name, precision, ours, theirs, tolerances[name], note=note)
+
     everywhere = dict.fromkeys(compared, True)
-    rows = (
-        (STEP, moved(same, everywhere), moved(theirs, everywhere), ""),
-        (OWN_STEP, moved(own, told), moved(theirs, told), note),
-        (AFTER, *({n: x[n] for n in compared} for x in (own, theirs)), ""),
-    )
+    there = ({name: state[name] for name in compared} for state in (own, theirs))
     return [
-        compare(case.name, name, precision, ours, theirs, tolerances[name], note=note)
-        for name, ours, theirs, note in rows
+        row(compare, STEP, moved(same, everywhere), moved(theirs, everywhere), ""),
+        row(compare_joined, OWN_STEP, moved(own, told), moved(theirs, told), note),
+        row(compare, AFTER, *there, ""),
     ]
 
 
