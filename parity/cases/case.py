@@ -332,15 +332,19 @@ def _check_step(
     def moved(state: Arrays, where: Mapping[str, Any]) -> dict[str, np.ndarray]:
         return {name: np.where(where[name], state[name] - origin[name], 0) for name in compared}
 
-    def row(check: Callable[..., Row], name: str, ours: Arrays, theirs: Arrays, note: str) -> Row:
+    def row(
+        check: Callable[..., Row], name: str, ours: Arrays, theirs: Arrays, note: str = ""
+    ) -> Row:
         return check(case.name, name, precision, ours, theirs, tolerances[name], note=note)
 
+    def there(state: Arrays) -> Arrays:
+        return {name: state[name] for name in compared}
+
     everywhere = dict.fromkeys(compared, True)
-    there = ({name: state[name] for name in compared} for state in (own, theirs))
     return [
-        row(compare, STEP, moved(same, everywhere), moved(theirs, everywhere), ""),
+        row(compare, STEP, moved(same, everywhere), moved(theirs, everywhere)),
         row(compare_joined, OWN_STEP, moved(own, told), moved(theirs, told), note),
-        row(compare, AFTER, *there, ""),
+        row(compare, AFTER, there(own), there(theirs)),
     ]
 
 
