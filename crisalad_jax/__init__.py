@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from crisalad_jax.checkpoint import save_weights as save
     from crisalad_jax.config import PRESETS, ModelConfig, TrainConfig, recipe
     from crisalad_jax.errors import InputError
-    from crisalad_jax.losses import multi_similarity_loss
+    from crisalad_jax.losses import metric_loss
     from crisalad_jax.model import Crisalad, alone, among, describe, init_crisalad
     from crisalad_jax.sinkhorn import sinkhorn as solve_transport
 
@@ -26,7 +26,7 @@ __all__ = [
     "describe",
     "init_crisalad",
     "load",
-    "multi_similarity_loss",
+    "metric_loss",
     "recipe",
     "save",
     "solve_transport",
@@ -43,7 +43,7 @@ _HOMES = {
     "describe": "model.describe",
     "init_crisalad": "model.init_crisalad",
     "load": "checkpoint.load_weights",
-    "multi_similarity_loss": "losses.multi_similarity_loss",
+    "metric_loss": "losses.metric_loss",
     "recipe": "config.recipe",
     "save": "checkpoint.save_weights",
     # `crisalad_jax.sinkhorn` is the module.

@@ -38,13 +38,16 @@ def save_weights(
     `extras` are arrays of a public checkpoint that no description needs (see `convert`).
 
     Raises:
-        InputError: the folder cannot be made.
+        InputError: the folder cannot be made, or the file not be written.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
     metadata = {FORMAT: json.dumps(to_plain(config))}
     with atomic_path(path) as temporary:
-        safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
+        try:
+            safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
+        except safetensors.SafetensorError as error:  # a full disk too
+            raise InputError(f"{path}: cannot be written: {error}") from error
         # The library makes files that only their owner can read.
         temporary.chmod(0o644)
 
@@ -73,7 +76,7 @@ def load_weights(
     Args:
         path: the file.
         expected: if given, the configuration that the file must have, except for what parameters
-            do not depend on: image size, dropout, compute type.
+            do not depend on: image size, dropout, compute type, what is kept.
 
     Raises:
         InputError: the file is missing, cut short or no such file; its parameters do not fit its
@@ -113,6 +116,7 @@ def _with_free_fields_of(other: ModelConfig, config: ModelConfig) -> ModelConfig
         config,
         image_size=other.image_size,
         compute_dtype=other.compute_dtype,
+        keeps=other.keeps,
         salad=dataclasses.replace(config.salad, dropout=other.salad.dropout),
         encoder=dataclasses.replace(config.encoder, dropout=other.encoder.dropout),
     )

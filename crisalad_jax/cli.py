@@ -25,7 +25,7 @@ from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.places import read_places
 from crisalad_jax.descriptors import writer_for
-from crisalad_jax.errors import InputError
+from crisalad_jax.errors import InputError, Stopped
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate, group, read_tokens
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.layouts import LAYOUTS
@@ -83,7 +83,10 @@ class Train:
     """Start from this backbone alone: a file of this package or a public checkpoint (DINOv2 .pth,
     Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth)."""
     preset: str = "b14"
-    """tiny, s14, b14, l14 or g14: model and recipe that the other flags start from."""
+    """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
+    recipe: str | None = None
+    """How it trains: crisalad (the paper; the default), crisalad-1e-4 or crisalad-step (its Table
+    2), salad, cricavpr, or scratch (the default of tiny, from random weights)."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     image_size: tuple[int, int] | None = None
@@ -95,7 +98,8 @@ class Train:
 
 
 def _train(arguments: Train) -> None:
-    from crisalad_jax.fit import fit, read_metrics
+    from crisalad_jax.fit import fit
+    from crisalad_jax.metrics import read_metrics
     from crisalad_jax.report import training_curves
 
     config = arguments.settings
@@ -467,13 +471,14 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
 
 
 def _train_defaults(arguments: list[str]) -> TrainConfig:
-    """What the flags of `train` start from: --config or --preset, wherever they stand."""
+    """What the flags of `train` start from: --config, or --preset and --recipe, in any place."""
     given = _flag(arguments, "--config")
     if given is not None:
-        if _flag(arguments, "--preset") is not None:
-            raise InputError("--preset: found beside --config, expected only one of the two")
+        for flag in ("--preset", "--recipe"):
+            if _flag(arguments, flag) is not None:
+                raise InputError(f"{flag}: found beside --config, expected only one of the two")
         return read_config(TrainConfig, pathlib.Path(given))
-    return recipe(_flag(arguments, "--preset") or "b14")
+    return recipe(_flag(arguments, "--preset") or "b14", _flag(arguments, "--recipe"))
 
 
 def _flag(arguments: list[str], name: str) -> str | None:
@@ -549,6 +554,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except SystemExit:  # from tyro, after --help
         return 0
+    except Stopped as stopped:
+        print(f"crisalad: {stopped}", file=sys.stderr)
+        return 128 + stopped.number
     except KeyboardInterrupt:
         print("crisalad: interrupted", file=sys.stderr)
         return 130

@@ -8,7 +8,7 @@ a comment says otherwise.
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from crisalad_jax.errors import InputError
@@ -323,6 +323,9 @@ class ModelConfig:
     compute_dtype: Literal["float32", "bfloat16", "float64"] = "float32"
     """Type of the matrix products; normalisations, softmax and transport are float32 at least.
     float64 is for numerical studies, under JAX's 64-bit mode."""
+    keeps: Literal["products", "blocks", "everything"] = "products"
+    """What of a block's work stays in memory for the gradient: the results of its large products,
+    its input alone (the least memory, a forward pass more), or all of it. Results are the same."""
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""
@@ -334,6 +337,7 @@ class ModelConfig:
             self.compute_dtype,
             {"float32": 0, "bfloat16": 0, "float64": 0},
         )
+        _require_choice(self, "keeps")
         choose("ModelConfig.aggregator", self.aggregator, dict.fromkeys(AGGREGATORS))
         self.check_image_size(self.image_size)
         if self.encoder.layers:
@@ -428,24 +432,116 @@ def _nearest_side(side: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class MultiSimilarityConfig:
-    """Multi-similarity loss and miner (Wang et al., CVPR 2019), the constants of GSV-Cities."""
+    """Multi-similarity loss (Wang et al., CVPR 2019), the constants of GSV-Cities."""
 
     alpha: float = 1.0
     beta: float = 50.0
     base: float = 0.0
     """Similarity around which pairs are weighed. From a cold start 0.5 learns where 0 does not."""
-    epsilon: float = 0.1
-    """Margin of the miner."""
-    library_quirk: bool = False
-    """Return 0, as pytorch-metric-learning does, where at most one positive and at most one
-    negative pair are mined in the whole batch."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         _require_positive(self, "alpha", "beta")
+
+
+@dataclasses.dataclass(frozen=True)
+class ContrastiveConfig:
+    """Contrastive loss (Hadsell et al., CVPR 2006), the margins of GSV-Cities."""
+
+    positive_margin: float = 0.0
+    """Distance up to which a pair of one place costs nothing; unit vectors are at most 2 apart."""
+    negative_margin: float = 1.0
+    """Distance from which a pair of two places costs nothing."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("positive_margin", "negative_margin"):
+            value = getattr(self, name)
+            _require(0 <= value <= 2, f"ContrastiveConfig.{name}: found {value}, expected 0 to 2")
+
+
+@dataclasses.dataclass(frozen=True)
+class TripletConfig:
+    """Triplet margin loss (Schroff et al., CVPR 2015), the margin of GSV-Cities."""
+
+    margin: float = 0.1
+    """By how much a positive's distance must be smaller than a negative's."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "margin")
+
+
+@dataclasses.dataclass(frozen=True)
+class CircleConfig:
+    """Circle loss (Sun et al., CVPR 2020), the constants of GSV-Cities."""
+
+    margin: float = 0.4
+    """The paper's m."""
+    scale: float = 80.0
+    """The paper's gamma."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "scale")
+        _require_fraction(self, "margin")
+
+
+@dataclasses.dataclass(frozen=True)
+class SupConConfig:
+    """Supervised contrastive loss (Khosla et al., NeurIPS 2020), GSV-Cities' temperature."""
+
+    temperature: float = 0.07
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "temperature")
+
+
+@dataclasses.dataclass(frozen=True)
+class FastAPConfig:
+    """FastAP (Cakir et al., CVPR 2019), GSV-Cities' number of bins."""
+
+    bins: int = 30
+    """Of the histogram of squared distances, from 0 to 4."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_positive(self, "bins")
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Which loss is taken, of which pairs, and the constants of each."""
+
+    kind: Literal["multi-similarity", "contrastive", "triplet", "circle", "supcon", "fast-ap"] = (
+        "multi-similarity"
+    )
+    """The paper's multi-similarity loss, or another that the field trains with."""
+    miner: Literal["multi-similarity", "none"] = "multi-similarity"
+    """Which pairs enter it: those that the multi-similarity loss's miner finds hard, or all."""
+    epsilon: float = 0.1
+    """Margin of the miner."""
+    library_quirk: bool = False
+    """Return 0, as pytorch-metric-learning does, where at most one positive and at most one
+    negative pair enter in the whole batch (its triplet loss does not)."""
+    multi_similarity: MultiSimilarityConfig = MultiSimilarityConfig()
+    contrastive: ContrastiveConfig = ContrastiveConfig()
+    triplet: TripletConfig = TripletConfig()
+    circle: CircleConfig = CircleConfig()
+    supcon: SupConConfig = SupConConfig()
+    fast_ap: FastAPConfig = FastAPConfig()
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        _require_choice(self, "kind", "miner")
         _require(
-            self.epsilon >= 0,
-            f"MultiSimilarityConfig.epsilon: found {self.epsilon}, expected at least 0",
+            self.epsilon >= 0, f"LossConfig.epsilon: found {self.epsilon}, expected at least 0"
+        )
+        _require(
+            self.kind != "fast-ap" or self.miner == "none",
+            f"LossConfig.miner: found {self.miner!r} with the loss 'fast-ap', expected 'none': it "
+            "ranks all images",
         )
 
 
@@ -511,14 +607,24 @@ AugmentConfig = RandAugmentConfig | LightAugmentConfig
 
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
-    """AdamW with an optional warm-up and a linear decay per step."""
+    """AdamW or Adam with an optional warm-up and a learning rate that falls."""
 
+    kind: Literal["adamw", "adam"] = "adamw"
+    """In Adam the weight decay is part of the gradient."""
     learning_rate: float = 6e-5
+    schedule: Literal["linear", "step"] = "linear"
+    """Linear decay step by step, or one step down every few epochs."""
     final_fraction: float = 0.0
-    """Share of the learning rate that is left at the last step."""
+    """Share of the learning rate that is left at the end of a linear decay."""
+    decay_steps: int | None = None
+    """Length of a linear decay, after which the learning rate stays; None is the whole run."""
+    drop_epochs: int = 3
+    """Epochs from one step down to the next (CricaVPR's)."""
+    drop_factor: float = 0.5
+    """What a step down multiplies the learning rate by (CricaVPR's)."""
     warmup_steps: int = 0
     weight_decay: float = 0.01
-    """Torch's default; the paper names none."""
+    """Torch's default for AdamW; the paper names none."""
     b1: float = 0.9
     b2: float = 0.999
     clip_norm: float | None = None
@@ -526,7 +632,14 @@ class OptimiserConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        _require_positive(self, "learning_rate")
+        _require_choice(self, "kind", "schedule")
+        _require_positive(self, "learning_rate", "drop_epochs", "drop_factor")
+        if self.decay_steps is not None:
+            _require(
+                self.decay_steps > 0,
+                f"OptimiserConfig.decay_steps: found {self.decay_steps}, expected more than 0, or "
+                "None",
+            )
         for name in ("final_fraction", "warmup_steps", "weight_decay"):
             value = getattr(self, name)
             _require(value >= 0, f"OptimiserConfig.{name}: found {value}, expected at least 0")
@@ -540,7 +653,7 @@ class TrainConfig:
     """A whole training run, apart from where its files lie."""
 
     model: ModelConfig = ModelConfig()
-    loss: MultiSimilarityConfig = MultiSimilarityConfig()
+    loss: LossConfig = LossConfig()
     optimiser: OptimiserConfig = OptimiserConfig()
     trains: str = "adapters+head"
     """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), or all."""
@@ -549,6 +662,9 @@ class TrainConfig:
     light_augment: LightAugmentConfig = LightAugmentConfig()
     places_per_batch: int = 48
     images_per_place: int = 4
+    micro_batch: int | None = None
+    """So many images' activations are in memory at a time: a step takes less of it and a forward
+    pass longer, and is the same. None is the whole batch."""
     min_images: int = 4
     """Places with fewer images are left out."""
     batch_order: Literal["within-city", "shuffled"] = "within-city"
@@ -561,17 +677,25 @@ class TrainConfig:
     """Epochs from one validation to the next."""
     patience: int | None = 3
     """Validations without a better Recall@5 after which training stops; None never stops early."""
+    keep_best: int = 1
+    """So many validations' weights are kept, those of the best Recall@5."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         choose("TrainConfig.augment", self.augment, {"rand-augment": 0, "light": 0, "none": 0})
         choose("TrainConfig.batch_order", self.batch_order, {"within-city": 0, "shuffled": 0})
-        _require_positive(self, "places_per_batch", "epochs", "validate_every")
+        _require_positive(self, "places_per_batch", "epochs", "validate_every", "keep_best")
         _require(
             self.images_per_place >= 2,
             f"TrainConfig.images_per_place: found {self.images_per_place}, expected at least 2: "
             "the loss needs pairs of one place",
+        )
+        batch = self.places_per_batch * self.images_per_place
+        _require(
+            self.micro_batch is None or (self.micro_batch > 0 and batch % self.micro_batch == 0),
+            f"TrainConfig.micro_batch: found {self.micro_batch}, expected a divisor of the batch's "
+            f"{batch} images, or None",
         )
         _require(
             self.min_images >= self.images_per_place,
@@ -630,19 +754,72 @@ PRESETS: Mapping[str, ModelConfig] = {
 }
 
 
-def recipe(preset: str) -> TrainConfig:
-    """How a preset is trained: the paper's way, except for `tiny`, which starts from nothing.
+def recipe(preset: str, name: str | None = None) -> TrainConfig:
+    """How a model is trained, and which parts it has for that.
+
+    Args:
+        preset: the size of the model (PRESETS).
+        name: what to reproduce (RECIPES); None is the paper's way, except for `tiny`, which starts
+            from nothing.
 
     Raises:
-        InputError: no such preset.
+        InputError: no such preset or recipe, or one that does not fit the preset.
     """
     model = choose("preset", preset, PRESETS)
-    if preset != "tiny":
-        return TrainConfig(model=model)
+    default = "scratch" if preset == "tiny" else "crisalad"
+    return choose("recipe", default if name is None else name, RECIPES)(model)
+
+
+def _crisalad(model: ModelConfig) -> TrainConfig:
+    """The paper's section 4.2."""
+    return TrainConfig(model=model)
+
+
+def _varied(**optimiser: Any) -> Callable[[ModelConfig], TrainConfig]:
+    """A row of the paper's Table 2 with another optimiser."""
+    return lambda model: TrainConfig(model=model, optimiser=OptimiserConfig(**optimiser))
+
+
+def _salad(model: ModelConfig) -> TrainConfig:
+    """serizba/salad: no adapter and no encoder, the last four blocks train, mixed precision."""
+    backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
+    return TrainConfig(
+        model=dataclasses.replace(
+            model,
+            backbone=backbone,
+            encoder=dataclasses.replace(model.encoder, layers=0),
+            compute_dtype="bfloat16",
+        ),
+        optimiser=OptimiserConfig(weight_decay=9.5e-9, final_fraction=0.2, decay_steps=4000),
+        trains="last-4-blocks+head",
+        places_per_batch=60,
+        epochs=4,
+        patience=None,
+    )
+
+
+def _cricavpr(model: ModelConfig) -> TrainConfig:
+    """Lu-Feng/CricaVPR: multi-resolution adapters, a GeM pyramid, Adam that steps down."""
+    adapter = AdapterConfig(kind="multi-resolution")
+    return TrainConfig(
+        model=dataclasses.replace(
+            model,
+            backbone=dataclasses.replace(model.backbone, adapter=adapter),
+            aggregator="gem-pyramid",
+        ),
+        optimiser=OptimiserConfig(
+            kind="adam", learning_rate=1e-4, schedule="step", weight_decay=0.0
+        ),
+        places_per_batch=72,
+    )
+
+
+def _scratch(model: ModelConfig) -> TrainConfig:
+    """From random weights, all of the model: ours, for `tiny`."""
     return TrainConfig(
         model=model,
         # base 0.5: from a cold start base 0 drives all similarities to 0 together.
-        loss=MultiSimilarityConfig(base=0.5),
+        loss=LossConfig(multi_similarity=MultiSimilarityConfig(base=0.5)),
         optimiser=OptimiserConfig(
             learning_rate=1e-3,
             final_fraction=0.02,
@@ -661,3 +838,14 @@ def recipe(preset: str) -> TrainConfig:
         validate_every=10,
         patience=None,
     )
+
+
+RECIPES: Mapping[str, Callable[[ModelConfig], TrainConfig]] = {
+    "crisalad": _crisalad,
+    "crisalad-1e-4": _varied(learning_rate=1e-4),
+    "crisalad-step": _varied(schedule="step"),
+    "salad": _salad,
+    "cricavpr": _cricavpr,
+    "scratch": _scratch,
+}
+"""Named by what they reproduce. Table 2's other rows are one flag of `crisalad` each."""

@@ -17,7 +17,8 @@ from crisalad_jax.data.synthetic import SyntheticCityConfig, write_synthetic_cit
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import KS, GroupingResult, evaluate
 from crisalad_jax.files import atomic_path, write_json
-from crisalad_jax.fit import fit, read_metrics
+from crisalad_jax.fit import fit
+from crisalad_jax.metrics import read_metrics
 from crisalad_jax.model import init_crisalad
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.report import (

@@ -1,12 +1,11 @@
 """The training loop: epochs, validation, early stop, and the files of a run (paper section 4.2)."""
 
 import dataclasses
-import json
 import math
 import pathlib
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -25,20 +24,23 @@ from crisalad_jax.data.loader import (
     training_batches,
 )
 from crisalad_jax.data.places import Places, epoch_batches
-from crisalad_jax.errors import InputError
+from crisalad_jax.errors import InputError, Stopped
 from crisalad_jax.evaluation import evaluate
-from crisalad_jax.files import atomic_path, write_json
+from crisalad_jax.files import write_json
+from crisalad_jax.metrics import MetricsLog
 from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
 from crisalad_jax.platform import on_every_device, on_one_device, over_devices
+from crisalad_jax.processes import leaders, leads, meet
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.states import StateStore
+from crisalad_jax.stops import Stop, put_off_signals
 from crisalad_jax.training import (
     StepConfig,
     TrainState,
     init_state,
-    learning_rate_schedule,
     merge_params,
+    narrow,
     spreads_images,
     train_step,
 )
@@ -70,7 +72,10 @@ class _Record:
     """Of all parameters before the first step."""
     places_checksum: int
     """Of the names of all training images and of how they make places."""
-    best_recall: float | None = None
+    validated: int = 0
+    """The step of the last validation."""
+    best: list[list[Any]] = dataclasses.field(default_factory=list)
+    """Recall@5 and step of the best validations, best first."""
     without_gain: int = 0
     stopped_early: bool = False
     skipped_images: int = 0
@@ -88,9 +93,12 @@ def fit(
 ) -> FitResult:
     """Train, or go on with the run that `out` holds, and leave its files there.
 
-    Written: `config.json`; `metrics.jsonl`, a line a step and a line a validation; `state/`, what a
-    later call resumes from; `last.safetensors`; and with a validation `best.safetensors`, the
-    weights of the best Recall@5 (every image alone, see `evaluation.GROUPINGS`).
+    Written: `config.json`; `metrics.jsonl`, a line a step and a line a validation, and the same for
+    TensorBoard in `tensorboard/`; `state/`, what a later call resumes from; `last.safetensors`; and
+    with a validation `best.safetensors`, the weights of the best Recall@5 (every image alone, see
+    `evaluation.GROUPINGS`), and the best `config.keep_best` in `best/`.
+
+    A run that is killed at any moment and called again ends with the same bits as one that was not.
 
     Args:
         config: everything but the files.
@@ -103,47 +111,53 @@ def fit(
 
     Raises:
         InputError: `out` holds something else, or a run of another configuration or start; an image
-            cannot be read; there are too few places or images; or the loss is no longer finite (the
-            state before that step is saved).
+            cannot be read; there are too few places or images; the loss is no longer finite (the
+            state before that step is saved); or a file cannot be written.
+        Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
-    run = _Run(config, places, out, initial)
-    with progress_bar("training", run.steps, "steps", quiet=quiet, done=run.step) as bar:
-        while run.step < run.steps and not run.record.stopped_early:
-            epoch, start_step = divmod(run.step, run.steps_per_epoch)
-            batches = training_batches(
-                places,
-                image_size=config.model.image_size,
-                places_per_batch=config.places_per_batch,
-                images_per_place=config.images_per_place,
-                order=config.batch_order,
-                augment=config.augmentation,
-                seed=config.seed,
-                epoch=epoch,
-                start_step=start_step,
-                on_bad_image=on_bad_image,
-                cache=run.cache,
-            )
-            for batch in batches:
-                bar.advance(1, note=run.take_step(batch, epoch))
-            ended = epoch + 1
-            if validation is not None and (
-                ended % config.validate_every == 0 or ended == config.epochs
-            ):
-                bar.say(run.validate(validation, ended))
-                run.save()
-    run.save()
-    run.store.close()
+    run = _Run(config, places, out, initial, validation)
+    try:
+        _train(run, on_bad_image, quiet)
+        run.save()
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot write: {error.strerror or error}; the same command goes on from the "
+            "last state that was saved"
+        ) from error
+    finally:
+        run.close()
     record = run.record
-    return FitResult(
-        run.params(), run.step, record.best_recall, record.stopped_early, record.skipped_images
-    )
+    best = record.best[0][0] if record.best else None
+    return FitResult(run.params(), run.step, best, record.stopped_early, record.skipped_images)
+
+
+def _train(run: "_Run", on_bad_image: OnBadImage, quiet: bool) -> None:
+    bar = progress_bar("training", run.steps, "steps", quiet=quiet, done=run.step)
+    with put_off_signals() as stop, bar as bar:
+        try:
+            while not run.is_done():
+                if run.validation_is_due():
+                    bar.say(run.validate(stop))
+                    run.save()
+                for batch in run.rest_of_epoch(on_bad_image):
+                    bar.advance(1, note=run.take_step(batch))
+                    stop.check()
+        except Stopped as stopped:
+            run.save()
+            where = f"after step {run.step}; the same command goes on"
+            raise Stopped(stopped.number, where) from None
 
 
 class _Run:
     """The state of a run in memory and its files."""
 
     def __init__(
-        self, config: TrainConfig, places: Places, out: pathlib.Path, initial: Crisalad | None
+        self,
+        config: TrainConfig,
+        places: Places,
+        out: pathlib.Path,
+        initial: Crisalad | None,
+        validation: Benchmark | None,
     ) -> None:
         # What does not fit raises before claim_run writes the first file.
         self.steps_per_epoch = len(
@@ -157,17 +171,23 @@ class _Run:
             )
         )
         self.config, self.out = config, out
-        self._spread = spreads_images(config.trains)
+        self._places, self._validation = places, validation
+        self._spread = spreads_images(config.trains) or jax.process_count() > 1
         self.steps = self.steps_per_epoch * config.epochs
-        self.cache = ImageCache()
-        self._compiled = StepConfig(config.model, config.loss, config.optimiser, self.steps)
-        self._schedule = learning_rate_schedule(config.optimiser, self.steps)
+        self._cache = ImageCache()
+        lengths = self.steps, self.steps_per_epoch
+        self._compiled = StepConfig(
+            config.model, config.loss, config.optimiser, *lengths, config.micro_batch
+        )
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         params = init_crisalad(init_key, config.model) if initial is None else initial
         state, frozen = init_state(params, config.trains, self._compiled)
-        self._frozen = self._share(frozen)
-        claim_run(out, config)
-        self.store = StateStore(out / "state")
+        self._frozen: PyTree = jax.device_get(frozen)
+        self._frozen_there = self._share(narrow(self._frozen, config.model))
+        if leads():
+            claim_run(out, config)
+        meet("a folder for the run")
+        self._store = StateStore(out / "state")
         self.record = _Record(
             weights_checksum=_checksum(jax.tree.leaves(params)),
             places_checksum=_checksum(
@@ -175,7 +195,7 @@ class _Run:
             ),
         )
         self.step = 0
-        saved = self.store.load(state)
+        saved = self._store.load(state)
         if saved is not None:
             for what in ("weights", "places"):
                 if saved.record[f"{what}_checksum"] != getattr(self.record, f"{what}_checksum"):
@@ -184,39 +204,85 @@ class _Run:
                         "expected the same, or another folder"
                     )
             self.step, state, self.record = saved.step, saved.state, _Record(**saved.record)
+            if leads():
+                self._drop_old_best()
+        meet("the state that is gone on from")
+        self._saved = None if saved is None else (self.step, saved.record)
         # A copy of its own on each device: a step takes over the buffers of its state.
         self.state: TrainState = jax.tree.map(jnp.copy, self._share(state))
-        self._log = MetricsLog(out / "metrics.jsonl", keep_up_to=self.step)
+        # A validation that the state does not know of will be repeated.
+        self._log = (
+            MetricsLog(out, keep_up_to=self.step, validated=self.record.validated)
+            if leads()
+            else None
+        )
         self._saved_at = self._stepped_at = time.monotonic()
 
     def _share(self, tree: PyTree) -> PyTree:
         """On the devices that the images of a batch are spread over."""
         batch = self.config.places_per_batch * self.config.images_per_place
-        return on_every_device(tree, batch if self._spread else 1)
+        return on_every_device(tree, batch if self._spread else 1, everywhere=self._spread)
+
+    def is_done(self) -> bool:
+        """Whether nothing is left, validations included."""
+        trained = self.step == self.steps or self.record.stopped_early
+        return trained and not self.validation_is_due()
+
+    def validation_is_due(self) -> bool:
+        """Whether the epoch that has just ended asks for a validation that there has not been."""
+        epoch, step = divmod(self.step, self.steps_per_epoch)
+        asked = epoch % self.config.validate_every == 0 or epoch == self.config.epochs
+        new = step == 0 and self.step > self.record.validated
+        return self._validation is not None and new and asked
+
+    def rest_of_epoch(self, on_bad_image: OnBadImage) -> Iterator[ImageBatch]:
+        """The batches from the next step on to the end of its epoch; none if training is over."""
+        if self.is_done():
+            return iter(())
+        config = self.config
+        epoch, start_step = divmod(self.step, self.steps_per_epoch)
+        return training_batches(
+            self._places,
+            image_size=config.model.image_size,
+            places_per_batch=config.places_per_batch,
+            images_per_place=config.images_per_place,
+            order=config.batch_order,
+            augment=config.augmentation,
+            seed=config.seed,
+            epoch=epoch,
+            start_step=start_step,
+            part=(jax.process_index(), jax.process_count()),
+            on_bad_image=on_bad_image,
+            cache=self._cache,
+        )
+
+    def _over_devices(self, part: np.ndarray) -> jax.Array | np.ndarray:
+        return over_devices(part, everywhere=True) if self._spread else part
 
     def params(self) -> Crisalad:
-        return merge_params(*on_one_device((self.state.trainable, self._frozen)))
+        """The whole model as it is now, in float32."""
+        frozen = jax.tree.map(jnp.asarray, self._frozen)
+        return merge_params(on_one_device(self.state.trainable), frozen)
 
-    def take_step(self, batch: ImageBatch, epoch: int) -> str:
+    def take_step(self, batch: ImageBatch) -> str:
         """Train on a batch, log it, and say in a few words how it went."""
-        if not batch.valid.any():
-            raise InputError(
-                f"training: found none of the {len(batch.valid)} images of step {self.step + 1} "
-                "readable, expected at least one"
-            )
-        # Before the step: after an epoch's last one its validation still has to enter the state.
         if time.monotonic() - self._saved_at > SAVE_SECONDS:
             self.save()
         self.state, device_metrics = train_step(
             self.state,
-            self._frozen,
-            over_devices(batch.images) if self._spread else batch.images,
-            batch.labels,
-            batch.valid,
+            self._frozen_there,
+            *(self._over_devices(x) for x in (batch.images, batch.labels, batch.valid)),
             self._step_key,
             self._compiled,
         )
         metrics = {name: float(value) for name, value in device_metrics._asdict().items()}
+        size = len(batch.images) * jax.process_count()
+        skipped = size - int(metrics.pop("images"))
+        if skipped == size:
+            raise InputError(
+                f"training: found none of the {size} images of step {self.step + 1} readable, "
+                "expected at least one"
+            )
         if not all(math.isfinite(value) for value in metrics.values()):
             self.save()
             raise InputError(
@@ -224,47 +290,54 @@ class _Run:
                 f"numbers; the state after step {self.step} is kept in {self.out}"
             )
         now = time.monotonic()
-        rate, self._stepped_at = len(batch.images) / (now - self._stepped_at), now
-        skipped = int((~batch.valid).sum())
+        rate, self._stepped_at = size / (now - self._stepped_at), now
         self.record.skipped_images += skipped
-        learning_rate = float(np.asarray(self._schedule(self.step)))
         self.step += 1
-        self._log.write(
-            {
-                "step": self.step,
-                "epoch": epoch + 1,
-                **metrics,
-                "learning_rate": learning_rate,
-                "images_per_second": round(rate, 2),
-                "skipped_images": skipped,
-            }
-        )
+        if self._log is not None:
+            self._log.write(
+                {
+                    "step": self.step,
+                    "epoch": (self.step - 1) // self.steps_per_epoch + 1,
+                    **metrics,
+                    "images_per_second": round(rate, 2),
+                    "skipped_images": skipped,
+                }
+            )
         note = f"loss {metrics['loss']:.3f}  b_acc {metrics['b_acc']:.2f}  {rate:.0f} images/s"
-        if self.record.best_recall is not None:
-            note += f"  best R@5 {100 * self.record.best_recall:.1f}"
+        if self.record.best:
+            note += f"  best R@5 {100 * self.record.best[0][0]:.1f}"
         return note
 
-    def validate(self, benchmark: Benchmark, epoch: int) -> str:
+    def validate(self, stop: Stop) -> str:
         """Log the recalls, keep the best weights, decide on an early stop; the recalls in words."""
-        params, record = self.params(), self.record
-        (result,) = evaluate(
-            params,
-            self.config.model,
-            benchmark,
-            groupings=("single",),
-            cache=self.cache,
-            quiet=True,
-        )
+        assert self._validation is not None
+        params, record, benchmark = self.params(), self.record, self._validation
+        with stop.at_once():
+            (result,) = evaluate(
+                params,
+                self.config.model,
+                benchmark,
+                groupings=("single",),
+                cache=self._cache,
+                quiet=True,
+            )
+            watched = self._watch_transport(params, benchmark)
+        epoch = self.step // self.steps_per_epoch
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
-        watched = self._watch_transport(params, benchmark)
-        self._log.write({"step": self.step, "epoch": epoch, **recalls, **watched})
-        if record.best_recall is None or result.recalls[5] > record.best_recall:
-            record.best_recall, record.without_gain = result.recalls[5], 0
-            save_weights(self.out / "best.safetensors", params, self.config.model)
-        else:
-            record.without_gain += 1
+        if self._log is not None:
+            line = {"step": self.step, "epoch": epoch, **recalls, **watched}
+            self._log.write(line, of=benchmark.name)
+        found, keep = [leaders(result.recalls[5]), self.step], self.config.keep_best
+        # Of equal ones the first is the best.
+        record.best = sorted([*record.best, found], key=lambda one: (-one[0], one[1]))[:keep]
+        record.without_gain = 0 if record.best[0] == found else record.without_gain + 1
+        paths = [self.out / "best.safetensors"] if record.best[0] == found else []
+        paths += [self._best_path(self.step)] if keep > 1 and found in record.best else []
+        for path in paths if leads() else ():
+            save_weights(path, params, self.config.model)
         patience = self.config.patience
         record.stopped_early = patience is not None and record.without_gain >= patience
+        record.validated = self.step
         self._stepped_at = time.monotonic()
         words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
         return f"epoch {epoch}, step {self.step}: {words}"
@@ -276,16 +349,36 @@ class _Run:
             return {}
         paths = benchmark.queries[:WATCHED_QUERIES]
         batches = image_batches(
-            paths, image_size=model.image_size, batch_size=len(paths), cache=self.cache
+            paths, image_size=model.image_size, batch_size=len(paths), cache=self._cache
         )
         statistics = watch_transport(params, next(iter(batches)).images, model)
         return {name: float(value) for name, value in statistics._asdict().items()}
 
+    def _best_path(self, step: int) -> pathlib.Path:
+        return self.out / "best" / f"step-{step:08}.safetensors"
+
+    def _drop_old_best(self) -> None:
+        """Remove weights that the record does not count among the best, or not yet."""
+        kept = {self._best_path(step) for _, step in self.record.best}
+        for path in set((self.out / "best").glob("step-*.safetensors")) - kept:
+            self._store.wait()  # or a kill now would leave a state that still counts them
+            path.unlink()
+
     def save(self) -> None:
-        """Write the weights and the resumable state."""
-        save_weights(self.out / "last.safetensors", self.params(), self.config.model)
-        self.store.save(self.step, self.state, dataclasses.asdict(self.record))
+        """Write the weights and the resumable state, the latter while training goes on."""
+        record = dataclasses.asdict(self.record)
+        if leads() and self._saved != (self.step, record):
+            save_weights(self.out / "last.safetensors", self.params(), self.config.model)
+            self._store.save(self.step, self.state, record)
+            self._drop_old_best()
+            self._saved = self.step, record
         self._saved_at = time.monotonic()
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        self._store.close()
+        if self._log is not None:
+            self._log.close()
 
 
 def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
@@ -306,42 +399,6 @@ def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
         raise InputError(f"{out}: found files but no run, expected a run or a new or empty folder")
     else:
         write_json(path, to_plain(config))
-
-
-class MetricsLog:
-    """A file of JSON lines, one a step and one a validation."""
-
-    def __init__(self, path: pathlib.Path, *, keep_up_to: int) -> None:
-        """Open the log and drop lines past step `keep_up_to`, which a resumed run repeats."""
-        self._path = path
-        kept = [r for r in read_metrics(path) if r["step"] <= keep_up_to] if path.exists() else []
-        with atomic_path(path) as temporary:
-            temporary.write_text("".join(map(_line, kept)), encoding="utf-8")
-
-    def write(self, values: Mapping[str, float]) -> None:
-        """Append a line."""
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(_line(values))
-
-
-def _line(values: Mapping[str, float]) -> str:
-    return json.dumps(values) + "\n"
-
-
-def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
-    """The lines of a metrics file; a last line that was cut off by a kill is left out.
-
-    Raises:
-        InputError: the file is missing, or a line is no record of a step.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").split("\n")
-        records = [json.loads(line) for line in lines[:-1]]
-        if not all(isinstance(r, dict) and type(r.get("step")) is int for r in records):
-            raise ValueError("a line has no step")
-        return records
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot read this log of a run: {error}") from error
 
 
 def _words(metrics: Mapping[str, float]) -> str:

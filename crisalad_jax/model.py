@@ -7,14 +7,14 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
 from crisalad_jax import platform
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.nn.aggregators import Aggregator, aggregate, init_aggregator, join
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
-from crisalad_jax.nn.layers import split_key
+from crisalad_jax.nn.layers import Keys, split_key
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.salad import Salad, TransportStatistics, transport_statistics
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
@@ -52,7 +52,8 @@ def describe(
     config: ModelConfig,
     *,
     mask: Bool[Array, "image image"] | None = None,
-    key: PRNGKeyArray | None = None,
+    key: Key[Array, ""] | None = None,
+    micro_batch: int | None = None,
 ) -> Float[Array, "image descriptor"]:
     """Unit descriptors of a batch of RGB images.
 
@@ -66,24 +67,59 @@ def describe(
             that already are. The sides are multiples of 14; they need not be `config.image_size`.
         config: the model, static.
         mask: who looks at whom.
-        key: draws the dropout; None means inference.
+        key: draws the dropout (a `jax.random.key`); None means inference.
+        micro_batch: see `tokenise`; the images that see each other are the whole batch.
 
     Raises:
         InputError: while tracing, for images of the wrong rank, channels or sides, or with too few
-            patches for the clusters.
+            patches for the clusters; or a batch is no multiple of `micro_batch`.
     """
     tokens_key, encoder_key = split_key(key, 2)
-    tokens = tokenise(params, images, config, key=tokens_key)
+    tokens = tokenise(params, images, config, key=tokens_key, micro_batch=micro_batch)
     return relate(params, tokens, config, mask=mask, key=encoder_key)
 
 
-@functools.partial(platform.jit, static_argnames="config")
+@functools.partial(platform.jit, static_argnames=("config", "micro_batch"))
 def tokenise(
-    params: Crisalad, images: Images, config: ModelConfig, *, key: PRNGKeyArray | None = None
+    params: Crisalad,
+    images: Images,
+    config: ModelConfig,
+    *,
+    key: Key[Array, ""] | None = None,
+    micro_batch: int | None = None,
 ) -> Tokens:
-    """The first half of `describe`: every image's tokens, which owe nothing to other images."""
-    features = _features(params, images, config)
-    return aggregate(params.aggregator, features, grid_of(images[0]), config, key=key)
+    """The first half of `describe`: every image's tokens, which owe nothing to other images.
+
+    With a `micro_batch` the images go through the backbone so many at a time, and again for the
+    gradient, so that the activations of no more are in memory (as in GradCache, Gao et al. 2021).
+    Tokens and gradients are those of the whole batch to rounding, dropout included.
+
+    Raises:
+        InputError: as `describe`.
+    """
+
+    def part_of(images: Images, keys: Keys | None) -> Tokens:
+        features = _features(params, images, config)
+        return aggregate(params.aggregator, features, grid_of(images[0]), config, key=keys)
+
+    count = len(images)
+    keys = None if key is None else jax.random.split(key, count)
+    if micro_batch is None or micro_batch == count:
+        return part_of(images, keys)
+    if count % micro_batch:
+        raise InputError(
+            f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
+        )
+
+    # Every so-many-th image is a part: of a batch on several devices each has its share of it.
+    def split(x: Array) -> Array:
+        return x.reshape(micro_batch, -1, *x.shape[1:]).swapaxes(0, 1)
+
+    def whole(x: Array) -> Array:
+        return x.swapaxes(0, 1).reshape(count, *x.shape[2:])
+
+    once = jax.checkpoint(lambda part: part_of(*part), prevent_cse=False)
+    return jax.tree.map(whole, jax.lax.map(once, jax.tree.map(split, (images, keys))))
 
 
 def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
@@ -93,7 +129,8 @@ def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features
 
     if images.dtype == jnp.uint8:
         images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
-    return vit(params.backbone, images.astype(config.compute_dtype), config.backbone)
+    pixels = images.astype(config.compute_dtype)
+    return vit(params.backbone, pixels, config.backbone, keeps=config.keeps)
 
 
 @functools.partial(platform.jit, static_argnames="config")
@@ -116,7 +153,7 @@ def relate(
     config: ModelConfig,
     *,
     mask: Bool[Array, "image image"] | None = None,
-    key: PRNGKeyArray | None = None,
+    key: Key[Array, ""] | None = None,
 ) -> Float[Array, "image descriptor"]:
     """The second half of `describe`: images look at each other, then become descriptors.
 

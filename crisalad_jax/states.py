@@ -31,8 +31,18 @@ class StateStore:
         Raises:
             InputError: the folder cannot be made or read.
         """
+        # Of several processes each reads for itself, and the first one writes.
+        several, here = jax.process_count() > 1, jax.process_index()
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=here,
+            active_processes={here} if several else None,
+            barrier_sync_key_prefix=f"process{here}" if several else None,
+        )
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
+            multiprocessing_options=alone,
+            max_to_keep=keep,
+            enable_async_checkpointing=True,
+            cleanup_tmp_directories=True,
         )
         try:
             self._manager = ocp.CheckpointManager(
@@ -47,10 +57,15 @@ class StateStore:
             raise InputError(f"{folder}: cannot keep states here: {error.strerror}") from error
 
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
-        """Write the arrays of `state` and the JSON values of `record`; an existing step stays."""
+        """Write the arrays of `state` and the JSON values of `record`, in place of that step's.
+
+        Copies are made before it returns, what is written is written while other work goes on.
+        """
         if step in self._manager.all_steps():
-            return
-        arrays = ocp.args.StandardSave(_stored(state))
+            self._manager.wait_until_finished()
+            self._manager.delete(step)
+        # Copies: the next step takes over the buffers of this one's state.
+        arrays = ocp.args.StandardSave(jax.tree.map(np.array, _stored(state)))
         self._manager.save(
             step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonSave(record))
         )
@@ -61,6 +76,7 @@ class StateStore:
         Raises:
             InputError: the stored arrays are damaged or do not fit the template.
         """
+        self.wait()
         step = self._manager.latest_step()
         if step is None:
             return None
@@ -94,6 +110,10 @@ class StateStore:
         return Saved(
             step, jax.tree.unflatten(jax.tree.structure(template), leaves), saved["record"]
         )
+
+    def wait(self) -> None:
+        """Return when all that was saved is on the disk."""
+        self._manager.wait_until_finished()
 
     def close(self) -> None:
         """Wait for what is being written."""

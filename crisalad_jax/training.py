@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,9 +12,9 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from crisalad_jax import platform
-from crisalad_jax.config import ModelConfig, MultiSimilarityConfig, OptimiserConfig
+from crisalad_jax.config import LossConfig, ModelConfig, OptimiserConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.losses import multi_similarity_loss
+from crisalad_jax.losses import metric_loss
 from crisalad_jax.model import Crisalad, among, describe
 from crisalad_jax.nn.vit import Block
 from crisalad_jax.pytree import named_leaves
@@ -23,6 +23,8 @@ ADAPTERS_AND_HEAD, ALL = "adapters+head", "all"
 STATISTICS = (".running_mean", ".running_var")
 """Batch-norm statistics, which never train: they are measured, not learnt."""
 _LAST_BLOCKS = re.compile(r"last-(\d+)-blocks\+head")
+_ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
+"""Weights of linear layers, which `layers.linear` casts to the type of what they multiply."""
 
 
 class TrainState(NamedTuple):
@@ -39,6 +41,10 @@ class Metrics(NamedTuple):
     loss: Float[Array, ""]
     b_acc: Float[Array, ""]
     gradient_norm: Float[Array, ""]
+    learning_rate: Float[Array, ""]
+    """Of this step."""
+    images: Int[Array, ""]
+    """How many were valid."""
 
 
 def spreads_images(trains: str) -> bool:
@@ -112,10 +118,22 @@ def merge_params(trainable: PyTree, frozen: PyTree) -> Crisalad:
     return dataclasses.replace(params, backbone=backbone)
 
 
-def learning_rate_schedule(config: OptimiserConfig, steps: int) -> optax.Schedule:
-    """Linear warm-up, then linear decay that reaches `final_fraction` after the last of `steps`."""
+def learning_rate_schedule(
+    config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
+) -> optax.Schedule:
+    """Linear warm-up, then the decay that `config.schedule` names.
+
+    A linear one reaches `final_fraction` after `config.decay_steps`, or after the last of `steps`;
+    the other multiplies by `drop_factor` every `drop_epochs`, counted from the end of the warm-up.
+    """
     peak, end = config.learning_rate, config.learning_rate * config.final_fraction
-    decay = optax.linear_schedule(peak, end, max(steps - config.warmup_steps, 1))
+    if config.schedule == "linear":
+        length = config.decay_steps or max(steps - config.warmup_steps, 1)
+        decay = optax.linear_schedule(peak, end, length)
+    else:
+        decay = optax.exponential_decay(
+            peak, config.drop_epochs * steps_per_epoch, config.drop_factor, staircase=True
+        )
     if not config.warmup_steps:
         return _of_real_steps(decay)
     # The first step of a warm-up of n is 1 / n of the peak, not a step of length 0.
@@ -130,17 +148,23 @@ def _of_real_steps(schedule: optax.Schedule) -> optax.Schedule:
     return lambda count: schedule(jnp.asarray(count, float))
 
 
-def make_optimiser(config: OptimiserConfig, steps: int) -> optax.GradientTransformation:
-    """AdamW as torch's (Loshchilov and Hutter 2019; decay on every parameter), clipped if asked."""
-    adamw = optax.adamw(
-        learning_rate_schedule(config, steps),
-        b1=config.b1,
-        b2=config.b2,
-        weight_decay=config.weight_decay,
-    )
+def make_optimiser(
+    config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
+) -> optax.GradientTransformation:
+    """Torch's AdamW (Loshchilov and Hutter 2019) or Adam (Kingma and Ba 2015), clipped if asked.
+
+    Both decay every parameter: AdamW the parameter itself, Adam by way of its gradient.
+    """
+    schedule = learning_rate_schedule(config, steps, steps_per_epoch)
+    b1, b2 = config.b1, config.b2
+    if config.kind == "adamw":
+        optimiser = optax.adamw(schedule, b1, b2, weight_decay=config.weight_decay)
+    else:
+        decay = optax.add_decayed_weights(config.weight_decay)
+        optimiser = optax.chain(decay, optax.adam(schedule, b1, b2))
     if config.clip_norm is None:
-        return adamw
-    return optax.chain(optax.clip_by_global_norm(config.clip_norm), adamw)
+        return optimiser
+    return optax.chain(optax.clip_by_global_norm(config.clip_norm), optimiser)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,9 +172,22 @@ class StepConfig:
     """What a compiled step depends on."""
 
     model: ModelConfig
-    loss: MultiSimilarityConfig
+    loss: LossConfig
     optimiser: OptimiserConfig
     steps: int
+    steps_per_epoch: int = 1
+    """What a learning rate that falls every few epochs counts by."""
+    micro_batch: int | None = None
+    """See `model.tokenise`."""
+
+    @property
+    def schedule(self) -> optax.Schedule:
+        """The learning rate of a step, from 0."""
+        return learning_rate_schedule(self.optimiser, self.steps, self.steps_per_epoch)
+
+    def make_optimiser(self) -> optax.GradientTransformation:
+        """The optimiser of a run of so many steps."""
+        return make_optimiser(self.optimiser, self.steps, self.steps_per_epoch)
 
     @property
     def compute_dtype(self) -> str:
@@ -161,8 +198,23 @@ class StepConfig:
 def init_state(params: Crisalad, trains: str, config: StepConfig) -> tuple[TrainState, PyTree]:
     """The state before step 0, and the frozen parameters, which no step touches."""
     trainable, frozen = split_params(params, trains)
-    optimiser = make_optimiser(config.optimiser, config.steps).init(trainable)
+    optimiser = config.make_optimiser().init(trainable)
     return TrainState(jnp.zeros((), jnp.int32), trainable, optimiser), frozen
+
+
+def narrow(frozen: PyTree, config: ModelConfig) -> PyTree:
+    """Frozen weights of the backbone's linear layers in the type that they are multiplied in.
+
+    What a step computes stays the same to the bit; in bfloat16 they take half the memory.
+    """
+
+    dtype = jnp.dtype(config.compute_dtype)
+    names = iter(named_leaves(frozen))
+
+    def narrowed(leaf: Any) -> Any:
+        return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
+
+    return jax.tree.map(narrowed, frozen)
 
 
 @functools.partial(platform.jit, runs_long=True, static_argnames="config", donate_argnames="state")
@@ -175,24 +227,31 @@ def train_step(
     key: PRNGKeyArray,
     config: StepConfig,
 ) -> tuple[TrainState, Metrics]:
-    """One step of AdamW on the mean multi-similarity loss of a batch.
+    """One step of the optimiser on the loss of a batch.
 
     The gradient is taken of the trainable parameters alone. Dropout is drawn from `key` and the
     step's number, so that a resumed run repeats an uninterrupted one. Where loss or gradient is not
-    finite the state is returned as it was, and the metrics tell.
+    finite, or no image valid, the state is returned as it was, and the metrics tell.
     """
     step_key = jax.random.fold_in(key, state.step)
 
     def loss_of(trainable: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
         params = eqx.combine(trainable, frozen)
-        descriptors = describe(params, images, config.model, mask=among(valid), key=step_key)
-        return multi_similarity_loss(descriptors, labels, config.loss, valid=valid)
+        descriptors = describe(
+            params,
+            images,
+            config.model,
+            mask=among(valid),
+            key=step_key,
+            micro_batch=config.micro_batch,
+        )
+        return metric_loss(descriptors, labels, config.loss, valid=valid)
 
     (loss, b_acc), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
     norm = optax.tree.norm(gradient)
-    optimiser = make_optimiser(config.optimiser, config.steps)
+    optimiser = config.make_optimiser()
     updates, new_optimiser = optimiser.update(gradient, state.optimiser, state.trainable)
     new = TrainState(state.step + 1, optax.apply_updates(state.trainable, updates), new_optimiser)
-    finite = jnp.isfinite(loss) & jnp.isfinite(norm)
-    kept = jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state)
-    return kept, Metrics(loss, b_acc, norm)
+    usable = jnp.isfinite(loss) & jnp.isfinite(norm) & valid.any()
+    kept = jax.tree.map(lambda after, before: jnp.where(usable, after, before), new, state)
+    return kept, Metrics(loss, b_acc, norm, config.schedule(state.step), valid.sum())

@@ -34,6 +34,7 @@ from transformers import (
 from crisalad_jax.config import (
     AdapterConfig,
     CrossImageConfig,
+    LossConfig,
     ModelConfig,
     MultiSimilarityConfig,
     OptimiserConfig,
@@ -314,7 +315,7 @@ def test_training_is_that_of_the_libraries(tmp_path: pathlib.Path) -> None:
     with jax.enable_x64(True):
         config = StepConfig(
             dataclasses.replace(found.config, compute_dtype="float64"),
-            MultiSimilarityConfig(base=0.5, library_quirk=True),
+            LossConfig(library_quirk=True, multi_similarity=MultiSimilarityConfig(base=0.5)),
             OptimiserConfig(learning_rate=rate, weight_decay=weight_decay),
             planned,
         )

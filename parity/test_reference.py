@@ -25,6 +25,7 @@ from torch.nn import functional as F
 from crisalad_jax.config import (
     AdapterConfig,
     CrossImageConfig,
+    LossConfig,
     ModelConfig,
     MultiSimilarityConfig,
     OptimiserConfig,
@@ -313,7 +314,7 @@ def random_batch(seed: int) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("base", [0.0, 0.5])
 def test_miner_and_loss_are_the_librarys(base: float) -> None:
-    config = MultiSimilarityConfig(base=base, library_quirk=True)
+    config = LossConfig(library_quirk=True, multi_similarity=MultiSimilarityConfig(base=base))
     distance = DotProductSimilarity(normalize_embeddings=False)
     miner = MultiSimilarityMiner(config.epsilon, distance=distance)
     # Any: a type checker takes them for int, after the library's defaults.

@@ -42,7 +42,7 @@ import torch  # isort: skip
 from crisalad_jax import platform
 from crisalad_jax.config import TrainConfig, recipe
 from crisalad_jax.costs import part_costs
-from crisalad_jax.losses import multi_similarity_loss
+from crisalad_jax.losses import metric_loss
 from crisalad_jax.model import describe
 from crisalad_jax.training import StepConfig, init_state, spreads_images, train_step
 from parity.reference.losses import multi_similarity_loss as torch_loss
@@ -118,7 +118,7 @@ def check(both: Sides, config: TrainConfig, tolerance: float) -> None:
     expected = float(torch_loss(theirs.float().cpu(), torch.from_numpy(places), config.loss).loss)
     ours = describe(both.ours, jax.device_put(both.images), both.config)
     everyone = jnp.ones(len(places), bool)
-    found = float(multi_similarity_loss(ours, jnp.asarray(places), config.loss, valid=everyone)[0])
+    found = float(metric_loss(ours, jnp.asarray(places), config.loss, valid=everyone)[0])
     if not abs(found - expected) < tolerance * expected:
         raise RuntimeError(f"ours: loss {found} differs from torch's {expected}")
 

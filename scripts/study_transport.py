@@ -21,7 +21,8 @@ from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.demo import DemoConfig, demo_recipe
 from crisalad_jax.evaluation import evaluate
-from crisalad_jax.fit import fit, read_metrics
+from crisalad_jax.fit import fit
+from crisalad_jax.metrics import read_metrics
 from crisalad_jax.progress import progress_bar
 
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -25,6 +25,7 @@ from crisalad_jax import platform
 from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import (
     CrossImageConfig,
+    LossConfig,
     ModelConfig,
     MultiSimilarityConfig,
     OptimiserConfig,
@@ -50,7 +51,7 @@ MODEL = ModelConfig(
 # light augmentation draw random numbers in every step.
 RECIPE = TrainConfig(
     model=MODEL,
-    loss=MultiSimilarityConfig(base=0.5),
+    loss=LossConfig(multi_similarity=MultiSimilarityConfig(base=0.5)),
     optimiser=OptimiserConfig(learning_rate=1e-3),
     trains="all",
     augment="light",

@@ -7,16 +7,23 @@ import pytest
 
 from crisalad_jax.config import (
     PRESETS,
+    RECIPES,
     AdapterConfig,
+    CircleConfig,
+    ContrastiveConfig,
     CrossImageConfig,
+    FastAPConfig,
     LightAugmentConfig,
+    LossConfig,
     ModelConfig,
     MultiSimilarityConfig,
     OptimiserConfig,
     RandAugmentConfig,
     SaladConfig,
     SinkhornConfig,
+    SupConConfig,
     TrainConfig,
+    TripletConfig,
     ViTConfig,
     check_image_size,
     choose,
@@ -48,8 +55,48 @@ def test_the_recipe_is_the_papers():
     assert (config.places_per_batch, config.images_per_place) == (48, 4)
     assert config.trains == "adapters+head"
     assert config.model.image_size == (224, 224)
-    assert (config.loss.alpha, config.loss.beta, config.loss.epsilon) == (1.0, 50.0, 0.1)
+    loss = config.loss
+    assert (loss.kind, loss.miner, loss.epsilon) == ("multi-similarity", "multi-similarity", 0.1)
+    assert (loss.multi_similarity.alpha, loss.multi_similarity.beta) == (1.0, 50.0)
     assert config.augmentation == RandAugmentConfig(operations=3)
+
+
+def test_the_recipes_are_their_papers():
+    """serizba/salad and Lu-Feng/CricaVPR as published; Table 2's rows."""
+    salad = recipe("b14", "salad")
+    assert (salad.places_per_batch, salad.images_per_place, salad.epochs) == (60, 4, 4)
+    assert salad.trains == "last-4-blocks+head"
+    assert (salad.model.backbone.adapter.kind, salad.model.encoder.layers) == ("none", 0)
+    optimiser = salad.optimiser
+    assert (optimiser.kind, optimiser.learning_rate) == ("adamw", 6e-5)
+    assert optimiser.weight_decay == 9.5e-9
+    assert (optimiser.schedule, optimiser.final_fraction, optimiser.decay_steps) == (
+        "linear",
+        0.2,
+        4000,
+    )
+    cricavpr = recipe("b14", "cricavpr")
+    assert (cricavpr.places_per_batch, cricavpr.images_per_place) == (72, 4)
+    assert cricavpr.model.descriptor_dim == 10_752
+    assert cricavpr.model.backbone.adapter.kind == "multi-resolution"
+    optimiser = cricavpr.optimiser
+    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
+    assert (optimiser.schedule, optimiser.drop_epochs, optimiser.drop_factor) == ("step", 3, 0.5)
+    paper = recipe("b14")
+    for name, change in (
+        ("crisalad-1e-4", {"learning_rate": 1e-4}),
+        ("crisalad-step", {"schedule": "step"}),
+    ):
+        varied = dataclasses.replace(paper.optimiser, **change)
+        assert recipe("b14", name) == dataclasses.replace(paper, optimiser=varied)
+    assert recipe("b14", "crisalad") == paper
+    assert recipe("tiny", "scratch") == recipe("tiny")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_fits_every_preset(preset: str, name: str):
+    assert recipe(preset, name).model.backbone.dim == PRESETS[preset].backbone.dim
 
 
 def test_augmentation_is_the_one_named():
@@ -67,6 +114,8 @@ def test_equal_configurations_name_one_program():
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
         recipe("b16")
+    with pytest.raises(InputError, match=r"^recipe: found 'boq', expected one of cricavpr, crisal"):
+        recipe("b14", "boq")
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})
 
@@ -157,7 +206,23 @@ def test_one_patch_more_than_clusters_is_enough():
             "SaladConfig.token_dim: found 200, expected a multiple of cluster_dim 128",
         ),
         (MultiSimilarityConfig, {"beta": 0.0}, "MultiSimilarityConfig.beta: found 0.0"),
-        (MultiSimilarityConfig, {"epsilon": -0.1}, "MultiSimilarityConfig.epsilon: found -0.1"),
+        (LossConfig, {"epsilon": -0.1}, "LossConfig.epsilon: found -0.1"),
+        (
+            LossConfig,
+            {"kind": "softmax"},
+            "LossConfig.kind: found 'softmax', expected one of circle",
+        ),
+        (LossConfig, {"miner": "hard"}, "LossConfig.miner: found 'hard'"),
+        (LossConfig, {"kind": "fast-ap"}, "expected 'none': it ranks all images"),
+        (
+            ContrastiveConfig,
+            {"negative_margin": 2.1},
+            "negative_margin: found 2.1, expected 0 to 2",
+        ),
+        (TripletConfig, {"margin": 0.0}, "TripletConfig.margin: found 0.0"),
+        (CircleConfig, {"margin": 1.0}, "CircleConfig.margin: found 1.0"),
+        (SupConConfig, {"temperature": 0.0}, "SupConConfig.temperature: found 0.0"),
+        (FastAPConfig, {"bins": 0}, "FastAPConfig.bins: found 0"),
         (RandAugmentConfig, {"magnitude": 31}, "RandAugmentConfig.magnitude: found 31"),
         (RandAugmentConfig, {"operations": -1}, "RandAugmentConfig.operations: found -1"),
         (LightAugmentConfig, {"crop": 1.0}, "LightAugmentConfig.crop: found 1.0"),

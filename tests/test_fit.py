@@ -18,12 +18,14 @@ from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GroupingResult, evaluate
-from crisalad_jax.fit import FitResult, MetricsLog, claim_run, fit, read_metrics
+from crisalad_jax.fit import FitResult, claim_run, fit
+from crisalad_jax.metrics import MetricsLog, read_metrics
 from crisalad_jax.model import Crisalad, watch_transport
 from crisalad_jax.nn.salad import TransportStatistics
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.retrieval import Neighbours
 from crisalad_jax.serial import read_config
+from crisalad_jax.stops import Stop
 from crisalad_jax.training import Metrics, train_step
 from tests.conftest import RECIPE, STEPS, random_params
 
@@ -58,6 +60,10 @@ def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert_same_params(load_weights(found / name)[0], load_weights(expected / name)[0])
 
 
+def open_run(config, places, out, params, validation=None) -> crisalad_jax.fit._Run:
+    return crisalad_jax.fit._Run(config, places, out, params, validation)
+
+
 def fail_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> None:
     """Let the given call, counted from 1, of a function that `fit` uses end the process."""
     function = getattr(crisalad_jax.fit, name)
@@ -76,6 +82,7 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     assert {path.name for path in run.iterdir()} == {
         "config.json",
         "metrics.jsonl",
+        "tensorboard",
         "state",
         "last.safetensors",
         "best.safetensors",
@@ -128,7 +135,7 @@ def test_training_changes_every_parameter_and_leaves_the_initial_ones_to_the_cal
         # The last step of an epoch is done, its validation is not: the state in hand must not be
         # one that would go on without it.
         ("evaluate", 2, 3),
-        ("save_weights", 6, 2),  # after the weights, before the state
+        ("save_weights", 5, 2),  # before the state that would follow
     ],
 )
 def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
@@ -233,9 +240,9 @@ def test_a_validation_watches_the_transport_on_the_first_queries(
     monkeypatch.setattr(crisalad_jax.fit, "watch_transport", watch)
     monkeypatch.setattr(crisalad_jax.fit, "WATCHED_QUERIES", 2)
     scripted(monkeypatch, [0.5])
-    run = crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
-    run.validate(benchmark, 1)
-    run.store.close()
+    run = open_run(RECIPE, places, tmp_path, params, benchmark)
+    run.validate(Stop())
+    run.close()
     first = [resize_image(read_image(q), RECIPE.model.image_size) for q in benchmark.queries[:2]]
     np.testing.assert_array_equal(seen, [first])
     (line,) = metrics_of(tmp_path)
@@ -249,11 +256,35 @@ def test_without_salad_a_validation_has_no_transport_to_watch(
     scripted(monkeypatch, [0.5])
     model = dataclasses.replace(RECIPE.model, aggregator="class-token")
     config = dataclasses.replace(RECIPE, model=model)
-    run = crisalad_jax.fit._Run(config, places, tmp_path, random_params(model))
-    run.validate(benchmark, 1)
-    run.store.close()
+    run = open_run(config, places, tmp_path, random_params(model), benchmark)
+    run.validate(Stop())
+    run.close()
     (line,) = metrics_of(tmp_path)
     assert line.keys() == {"step", "epoch", "R@1", "R@5", "R@10"}
+
+
+def test_nothing_is_compiled_after_the_first_step_and_validation(
+    tmp_path, places, params, benchmark, monkeypatch
+):
+    compiled, after_step = [], []
+
+    def count(name: str, *_: object, **__: object) -> None:
+        if name.endswith("backend_compile_duration"):
+            compiled.append(name)
+
+    def step(*args):
+        result = train_step(*args)
+        after_step.append(len(compiled))
+        return result
+
+    jax.clear_caches()
+    jax.monitoring.register_event_duration_secs_listener(count)
+    monkeypatch.setattr(crisalad_jax.fit, "train_step", step)
+    fit(ENDLESS, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    jax.monitoring.unregister_event_duration_listener(count)
+    assert len(after_step) == STEPS
+    assert 0 < after_step[0] == after_step[1] < after_step[2]  # a validation is between
+    assert len(compiled) == after_step[2]
 
 
 def test_without_validation_there_is_no_best(tmp_path, places, params):
@@ -269,7 +300,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
 
     def step(state, *args):
         if len(good) == 3:
-            return state, Metrics(*map(np.float32, (np.nan, 0.0, 1.0)))
+            return state, Metrics(*map(np.float32, (np.nan, 0.0, 1.0, 1e-3, 6.0)))
         state, metrics = train_step(state, *args)
         good.append(jax.device_get(state.trainable))
         return state, metrics
@@ -336,34 +367,34 @@ def test_what_does_not_fit_is_found_before_anything_is_written(tmp_path, places,
 @pytest.mark.parametrize("trains", ["adapters+head", "all"])
 def test_a_run_is_gone_on_with_only_from_the_same_weights(tmp_path, places, params, trains):
     config = dataclasses.replace(RECIPE, trains=trains)
-    run = crisalad_jax.fit._Run(config, places, tmp_path, params)
+    run = open_run(config, places, tmp_path, params)
     run.save()
-    run.store.close()
+    run.close()
     other = jax.tree.map(lambda leaf: leaf + 1, params)
     with pytest.raises(InputError, match=f"{tmp_path}: the run started from other weights"):
-        crisalad_jax.fit._Run(config, places, tmp_path, other)
+        open_run(config, places, tmp_path, other)
 
 
 def test_a_run_is_gone_on_with_only_on_the_same_places(tmp_path, places, params):
-    run = crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
+    run = open_run(RECIPE, places, tmp_path, params)
     run.save()
-    run.store.close()
+    run.close()
     other = dataclasses.replace(places, files=(*places.files[:-1], "Images/Brill/another.jpg"))
     with pytest.raises(InputError, match=f"{tmp_path}: the run started from other places"):
-        crisalad_jax.fit._Run(RECIPE, other, tmp_path, params)
+        open_run(RECIPE, other, tmp_path, params)
 
 
 def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, places, params):
-    run = crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
+    run = open_run(RECIPE, places, tmp_path, params)
     run.save()
     run.step = 2
     run.save()
-    run.store.close()
+    run.close()
     for path in (tmp_path / "state" / "2" / "state").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[:3])
     with pytest.raises(InputError, match=r"damaged.*delete it to go on from step 0") as error:
-        crisalad_jax.fit._Run(RECIPE, places, tmp_path, params)
+        open_run(RECIPE, places, tmp_path, params)
     assert str(error.value).startswith(str(tmp_path / "state" / "2"))
     assert "\n" not in str(error.value)
 
@@ -386,12 +417,11 @@ def test_a_folder_of_other_files_is_left_alone(tmp_path):
 
 def test_the_log_drops_what_will_be_repeated_and_a_line_cut_off(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    path.write_text('{"step": 1}\n{"step": 2}\n{"step": 2, "R@5": 0.5}\n{"step": 3}\n{"st')
-    log = MetricsLog(path, keep_up_to=2)
+    first, second, third = ({"step": step, "loss": 0.5} for step in (1, 2, 3))
+    validations = [{"step": 1, "R@5": 0.5}, {"step": 2, "R@5": 0.6}]
+    lines = [first, validations[0], second, validations[1], third]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"st')
+    log = MetricsLog(tmp_path, keep_up_to=2, validated=1)
     log.write({"step": 3, "loss": 0.1})
-    assert read_metrics(path) == [
-        {"step": 1},
-        {"step": 2},
-        {"step": 2, "R@5": 0.5},
-        {"step": 3, "loss": 0.1},
-    ]
+    log.close()
+    assert read_metrics(path) == [first, validations[0], second, {"step": 3, "loss": 0.1}]

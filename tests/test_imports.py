@@ -14,8 +14,8 @@ SOURCE = pathlib.Path(__file__).parents[1] / PACKAGE
 # A module imports from layers above its own line only; a package, from itself as well.
 LAYERS = (
     ("errors", "cores"),
-    ("config", "pytree", "files", "progress", "platform"),
-    ("sinkhorn", "losses", "serial", "data"),
+    ("config", "pytree", "files", "progress", "platform", "processes"),
+    ("sinkhorn", "losses", "serial", "data", "metrics", "stops"),
     ("nn",),
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),

@@ -1,9 +1,10 @@
-"""Multi-similarity loss and miner against pytorch-metric-learning 2.9.0: values and gradients.
+"""Losses and miner against pytorch-metric-learning 2.9.0: values and gradients.
 
 Values agree to 1e-5 relative and gradients to 1e-4: float32 inner products of order 1 times
-beta = 50 in an exponent carry 50 x 6e-8 each.
+50 or 80 in an exponent carry 50 x 6e-8 each.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -11,58 +12,93 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
-from pytorch_metric_learning.distances import CosineSimilarity, DotProductSimilarity
-from pytorch_metric_learning.losses import MultiSimilarityLoss
+from pytorch_metric_learning.distances import CosineSimilarity, DotProductSimilarity, LpDistance
+from pytorch_metric_learning.losses import (
+    CircleLoss,
+    ContrastiveLoss,
+    FastAPLoss,
+    MultiSimilarityLoss,
+    SupConLoss,
+    TripletMarginLoss,
+)
 from pytorch_metric_learning.miners import MultiSimilarityMiner
 
-from crisalad_jax.config import MultiSimilarityConfig
-from crisalad_jax.losses import mine, multi_similarity_loss
+from crisalad_jax.config import (
+    CircleConfig,
+    ContrastiveConfig,
+    FastAPConfig,
+    LossConfig,
+    MultiSimilarityConfig,
+    SupConConfig,
+    TripletConfig,
+)
+from crisalad_jax.losses import all_pairs, metric_loss, mine
 
-PAPER = MultiSimilarityConfig()
+PAPER = LossConfig()
 
 
 def unit(x: np.ndarray) -> np.ndarray:
     return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
 
 
-def random_batch(seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_batch(seed: int, images: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Places of different sizes and tightness, so that miners find many, few or no pairs."""
     generator = np.random.default_rng(seed)
-    places, images = int(generator.integers(1, 9)), int(generator.integers(2, 24))
+    places, drawn = int(generator.integers(1, 9)), int(generator.integers(2, 24))
+    images = drawn if images is None else images
     labels = generator.integers(0, places, images)
     centres = generator.standard_normal((places, 6))
     noise = generator.choice([0.05, 1.0, 2.0])
     return unit(centres[labels] + noise * generator.standard_normal((images, 6))), labels
 
 
+def library_loss(config: LossConfig) -> torch.nn.Module:
+    """The library's loss with our constants, on unit vectors as they are."""
+    dot = DotProductSimilarity(normalize_embeddings=False)
+    ms, contrastive = config.multi_similarity, config.contrastive
+    return {
+        "multi-similarity": lambda: MultiSimilarityLoss(ms.alpha, ms.beta, ms.base, distance=dot),
+        "contrastive": lambda: ContrastiveLoss(
+            contrastive.positive_margin, contrastive.negative_margin
+        ),
+        "triplet": lambda: TripletMarginLoss(config.triplet.margin),
+        "circle": lambda: CircleLoss(config.circle.margin, config.circle.scale),
+        "supcon": lambda: SupConLoss(config.supcon.temperature),
+        "fast-ap": lambda: FastAPLoss(config.fast_ap.bins, distance=LpDistance(power=2)),
+    }[config.kind]()
+
+
 def theirs(
-    x: np.ndarray, labels: np.ndarray, config: MultiSimilarityConfig
+    x: np.ndarray, labels: np.ndarray, config: LossConfig
 ) -> tuple[float, np.ndarray, tuple[torch.Tensor, ...]]:
     tensor = torch.tensor(x, requires_grad=True)
-    distance = DotProductSimilarity(normalize_embeddings=False)
-    loss_of = MultiSimilarityLoss(config.alpha, config.beta, config.base, distance=distance)
     pairs = MultiSimilarityMiner(config.epsilon, distance=CosineSimilarity())(
         tensor, torch.tensor(labels)
     )
-    loss = loss_of(tensor, torch.tensor(labels), pairs)
+    chosen = pairs if config.miner == "multi-similarity" else None
+    loss = library_loss(config)(tensor, torch.tensor(labels), chosen)
     loss.backward()
     return float(loss.detach()), tensor.grad.numpy(), pairs
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def ours(x: jax.Array, labels: jax.Array, config: MultiSimilarityConfig):
-    return jax.value_and_grad(lambda x: multi_similarity_loss(x, labels, config).loss)(x)
+def ours(x: jax.Array, labels: jax.Array, config: LossConfig):
+    return jax.value_and_grad(lambda x: metric_loss(x, labels, config).loss)(x)
 
 
 @pytest.mark.parametrize("base", [0.0, 0.5])
 @pytest.mark.parametrize("epsilon", [0.1, 0.0])
 def test_value_gradient_and_pairs_equal_the_library(base: float, epsilon: float) -> None:
-    config = MultiSimilarityConfig(base=base, epsilon=epsilon, library_quirk=True)
+    config = LossConfig(
+        epsilon=epsilon,
+        library_quirk=True,
+        multi_similarity=MultiSimilarityConfig(base=base),
+    )
     nonzero = 0
     for seed in range(40):
         x, labels = random_batch(seed)
         loss, gradient, (a1, p, a2, n) = theirs(x, labels, config)
-        pairs = mine(jnp.asarray(x @ x.T), jnp.asarray(labels), epsilon=epsilon)
+        pairs = mine(jnp.asarray(x @ x.T), all_pairs(jnp.asarray(labels)), epsilon=epsilon)
         for mask, (anchors, others) in zip(pairs, ((a1, p), (a2, n)), strict=True):
             found = {tuple(pair) for pair in np.argwhere(np.asarray(mask))}
             assert found == set(zip(anchors.tolist(), others.tolist(), strict=True))
@@ -74,11 +110,88 @@ def test_value_gradient_and_pairs_equal_the_library(base: float, epsilon: float)
     assert nonzero > 10  # the comparison is not of zeros alone
 
 
+OTHERS = [
+    LossConfig(kind="contrastive", contrastive=ContrastiveConfig(0.2, 1.1)),
+    LossConfig(kind="contrastive", miner="none"),
+    LossConfig(kind="triplet", triplet=TripletConfig(0.3)),
+    LossConfig(kind="triplet", miner="none"),
+    LossConfig(kind="circle", circle=CircleConfig(0.25, 20.0)),
+    LossConfig(kind="circle", miner="none"),
+    LossConfig(kind="supcon", supcon=SupConConfig(0.2)),
+    LossConfig(kind="supcon", miner="none"),
+    LossConfig(kind="fast-ap", miner="none"),
+    LossConfig(kind="fast-ap", miner="none", fast_ap=FastAPConfig(7)),
+]
+
+
+@pytest.mark.parametrize("config", OTHERS, ids=lambda c: f"{c.kind}, miner {c.miner}")
+def test_every_loss_and_its_gradient_equal_the_librarys(config: LossConfig) -> None:
+    """In float64: float32 tells little of the distance of descriptors that are nearly equal."""
+    # The library's triplets know no quirk, and its FastAP none either.
+    quirk = config.kind in ("contrastive", "circle", "supcon")
+    config = dataclasses.replace(config, library_quirk=quirk)
+    nonzero = 0
+    for seed in range(40):
+        x, labels = random_batch(seed, images=5 if seed % 2 else 16)
+        x = x.astype(np.float64)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        loss, gradient, _ = theirs(x, labels, config)
+        with jax.enable_x64(True):
+            value, our_gradient = ours(jnp.asarray(x), jnp.asarray(labels), config)
+        # Squares of distances of 1e-2 and more are off by 2e-16, and exponents by 80 times that.
+        np.testing.assert_allclose(value, loss, rtol=1e-11, atol=1e-13, err_msg=str(seed))
+        # Along the sphere: a gradient along the descriptor itself does nothing to a unit vector,
+        # and the library takes distances of vectors that it normalises once more.
+        found, expected = (along_sphere(np.asarray(g), x) for g in (our_gradient, gradient))
+        np.testing.assert_allclose(found, expected, atol=1e-10 * max(1, np.abs(expected).max()))
+        nonzero += loss > 1e-6
+    assert nonzero > 10  # the comparison is not of zeros alone
+
+
+def along_sphere(gradient: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return gradient - (gradient * x).sum(axis=1, keepdims=True) * x
+
+
+@pytest.mark.parametrize("config", OTHERS, ids=lambda c: f"{c.kind}, miner {c.miner}")
+def test_every_loss_has_finite_gradients_where_images_are_the_same_or_pairs_are_missing(
+    config: LossConfig,
+) -> None:
+    same = np.full((6, 4), 0.5, np.float32)
+    apart = np.eye(4, dtype=np.float32)
+    for x, labels in (
+        (same, [0, 0, 1, 1, 2, 2]),
+        (apart, [0, 0, 0, 0]),
+        (apart, [0, 1, 2, 3]),
+        (apart, [0, 0, 1, 2]),
+    ):
+        value, gradient = ours(jnp.asarray(x), jnp.asarray(labels), config)
+        loss, _, _ = theirs(x, np.array(labels), config)
+        np.testing.assert_allclose(value, loss, rtol=1e-5, atol=1e-6)
+        assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("config", OTHERS, ids=lambda c: f"{c.kind}, miner {c.miner}")
+def test_images_that_are_not_valid_take_no_part_in_any_loss(config: LossConfig) -> None:
+    x, labels = random_batch(2)
+    padded = np.concatenate([x, unit(np.random.default_rng(9).standard_normal((3, 6)))])
+    padded_labels = jnp.asarray(np.concatenate([labels, labels[:3]]))
+    valid = jnp.arange(len(padded)) < len(x)
+    alone, _ = ours(jnp.asarray(x), jnp.asarray(labels), config)
+
+    def loss(padded: jax.Array) -> jax.Array:
+        return metric_loss(padded, padded_labels, config, valid=valid).loss
+
+    value, gradient = jax.value_and_grad(loss)(jnp.asarray(padded))
+    assert alone > 0
+    np.testing.assert_allclose(value, alone, rtol=1e-6)  # sums of other lengths round otherwise
+    np.testing.assert_array_equal(gradient[len(x) :], 0)
+
+
 def test_the_paper_batch() -> None:
     generator = np.random.default_rng(0)
     labels = np.repeat(np.arange(48), 4)
     x = unit(generator.standard_normal((48, 64))[labels] + generator.standard_normal((192, 64)))
-    config = MultiSimilarityConfig()
+    config = LossConfig()
     loss, gradient, _ = theirs(x, labels, config)
     value, our_gradient = ours(jnp.asarray(x), jnp.asarray(labels), config)
     np.testing.assert_allclose(value, loss, rtol=1e-5)
@@ -92,21 +205,21 @@ def test_the_paper_batch() -> None:
 )
 def test_batches_without_pairs_have_loss_and_gradient_zero(labels: list[int]) -> None:
     x = unit(np.random.default_rng(0).standard_normal((4, 8)))
-    value, gradient = ours(jnp.asarray(x), jnp.asarray(labels), MultiSimilarityConfig())
+    value, gradient = ours(jnp.asarray(x), jnp.asarray(labels), LossConfig())
     assert value == 0
     np.testing.assert_array_equal(gradient, 0)
-    assert multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).b_acc == 1
+    assert metric_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).b_acc == 1
 
 
 def test_a_nan_is_not_taken_for_a_perfect_batch() -> None:
     x, labels = random_batch(0)
     x[0] = np.nan
-    assert jnp.isnan(multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).loss)
+    assert jnp.isnan(metric_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).loss)
 
 
 def test_identical_images_stay_finite() -> None:
     x, labels = np.ones((6, 4), np.float32) / 2, np.array([0, 0, 1, 1, 2, 2])
-    config = MultiSimilarityConfig()
+    config = LossConfig()
     loss, theirs_gradient, _ = theirs(x, labels, config)
     value, gradient = ours(jnp.asarray(x), jnp.asarray(labels), config)
     np.testing.assert_allclose(value, loss, rtol=1e-6)
@@ -122,14 +235,12 @@ def test_the_librarys_quirk_is_an_option() -> None:
     similarities = np.array([[1.0, 0.60, 0.55], [0.60, 1.0, 0.10], [0.55, 0.10, 1.0]])
     x = np.linalg.cholesky(similarities).astype(np.float32)
     labels = np.array([0, 0, 1])
-    pairs = mine(jnp.asarray(x @ x.T), jnp.asarray(labels), epsilon=0.1)
+    pairs = mine(jnp.asarray(x @ x.T), all_pairs(jnp.asarray(labels)), epsilon=0.1)
     assert pairs.positives.sum() == 1
     assert pairs.negatives.sum() == 1
-    assert theirs(x, labels, MultiSimilarityConfig())[0] == 0
+    assert theirs(x, labels, LossConfig())[0] == 0
     quirk, plain = (
-        multi_similarity_loss(
-            jnp.asarray(x), jnp.asarray(labels), MultiSimilarityConfig(library_quirk=option)
-        ).loss
+        metric_loss(jnp.asarray(x), jnp.asarray(labels), LossConfig(library_quirk=option)).loss
         for option in (True, False)
     )
     assert quirk == 0
@@ -141,10 +252,10 @@ def test_ties_with_the_margin_mine_nothing() -> None:
     """Strict on both sides: similarity minus (plus) epsilon equal to the hardest other is easy."""
     similarities = jnp.array([[1.0, 0.75, 0.5], [0.75, 1.0, 0.5], [0.5, 0.5, 1.0]])
     labels = jnp.array([0, 0, 1])
-    tied = mine(similarities, labels, epsilon=0.25)
+    tied = mine(similarities, all_pairs(labels), epsilon=0.25)
     assert not tied.positives.any()
     assert not tied.negatives.any()
-    wider = mine(similarities, labels, epsilon=0.3125)
+    wider = mine(similarities, all_pairs(labels), epsilon=0.3125)
     assert wider.positives.sum() == 2
     assert wider.negatives.sum() == 2
 
@@ -170,10 +281,10 @@ def test_the_quirk_needs_few_pairs_on_both_sides(
     similarities[np.triu_indices(4, 1)] = (*to_first, *others)
     similarities = np.maximum(similarities, similarities.T)
     x = np.linalg.cholesky(similarities).astype(np.float32)
-    pairs = mine(jnp.asarray(x @ x.T), jnp.asarray(labels), epsilon=0.1)
+    pairs = mine(jnp.asarray(x @ x.T), all_pairs(jnp.asarray(labels)), epsilon=0.1)
     assert pairs.positives.sum() == positives
     assert pairs.negatives.sum() == negatives
-    config = MultiSimilarityConfig(library_quirk=True)
+    config = LossConfig(library_quirk=True)
     loss, _, _ = theirs(x, np.array(labels), config)
     assert loss > 0
     value, _ = ours(jnp.asarray(x), jnp.asarray(labels), config)
@@ -185,23 +296,18 @@ def test_images_that_are_not_valid_take_no_part() -> None:
     full = np.concatenate([x, unit(np.random.default_rng(9).standard_normal((5, 6)))])
     full_labels = np.concatenate([labels, labels[:5] if len(labels) >= 5 else np.zeros(5, int)])
     valid = jnp.arange(len(full)) < len(x)
-    alone = multi_similarity_loss(jnp.asarray(x), jnp.asarray(labels), PAPER)
+    alone = metric_loss(jnp.asarray(x), jnp.asarray(labels), PAPER)
 
     def loss(full: jax.Array) -> jax.Array:
-        return multi_similarity_loss(full, jnp.asarray(full_labels), PAPER, valid=valid).loss
+        return metric_loss(full, jnp.asarray(full_labels), PAPER, valid=valid).loss
 
-    padded = multi_similarity_loss(jnp.asarray(full), jnp.asarray(full_labels), PAPER, valid=valid)
+    padded = metric_loss(jnp.asarray(full), jnp.asarray(full_labels), PAPER, valid=valid)
     assert alone.loss > 0
     np.testing.assert_allclose(padded.loss, alone.loss, rtol=1e-6)
     np.testing.assert_allclose(padded.b_acc, alone.b_acc, rtol=1e-6)
     np.testing.assert_array_equal(jax.grad(loss)(jnp.asarray(full))[len(x) :], 0)
     nothing = jnp.zeros(len(full), bool)
-    assert (
-        multi_similarity_loss(
-            jnp.asarray(full), jnp.asarray(full_labels), PAPER, valid=nothing
-        ).loss
-        == 0
-    )
+    assert metric_loss(jnp.asarray(full), jnp.asarray(full_labels), PAPER, valid=nothing).loss == 0
 
 
 def test_b_acc_counts_anchors_without_a_hard_positive() -> None:
@@ -210,6 +316,6 @@ def test_b_acc_counts_anchors_without_a_hard_positive() -> None:
     labels = jnp.array([0, 0, 1, 1])
     # Anchors 2 and 3 each have the other as a hard positive; 0 and 1 have each other at similarity
     # 1, while the stray is as similar: within epsilon, so hard too. b_acc = 0.
-    assert multi_similarity_loss(jnp.asarray(x), labels, PAPER).b_acc == 0
+    assert metric_loss(jnp.asarray(x), labels, PAPER).b_acc == 0
     x[3] = [0, 1]
-    assert multi_similarity_loss(jnp.asarray(x), labels, PAPER).b_acc == 1
+    assert metric_loss(jnp.asarray(x), labels, PAPER).b_acc == 1

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax import platform
-from crisalad_jax.fit import read_metrics
+from crisalad_jax.metrics import read_metrics
 
 
 def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment: str) -> str:

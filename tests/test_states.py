@@ -25,15 +25,16 @@ def test_a_state_survives_bit_for_bit_and_the_last_ones_stay(tmp_path, state):
     for step in (1, 2, 5):
         moved = jax.tree.map(lambda leaf, step=step: leaf + step, state)
         store.save(step, moved, {"best": 0.1 * step})
-    store.save(5, state, {"best": 9.0})  # there already: stays as it is
+    moved = jax.tree.map(lambda leaf: leaf + 6, state)
+    store.save(5, moved, {"best": 9.0})  # in place of the other
     store.close()
     assert sorted(os.listdir(tmp_path / "state")) == ["2", "5"]
     again = StateStore(tmp_path / "state")
     saved = again.load(state)
     again.close()
     assert saved is not None
-    assert (saved.step, saved.record) == (5, {"best": 0.5})
-    assert_equal(saved.state, jax.tree.map(lambda leaf: leaf + 5, state))
+    assert (saved.step, saved.record) == (5, {"best": 9.0})
+    assert_equal(saved.state, moved)
 
 
 def test_a_state_of_another_model_is_refused(tmp_path, state):
@@ -56,6 +57,7 @@ def test_a_damaged_state_is_refused_and_the_older_one_named(tmp_path, state):
     store = StateStore(tmp_path / "state")
     store.save(1, state, {})
     store.save(2, state, {})
+    store.wait()
     files = [file for file in (tmp_path / "state" / "2" / "state").rglob("*") if file.is_file()]
     largest = max(files, key=lambda file: file.stat().st_size)
     largest.write_bytes(largest.read_bytes()[:100])

@@ -10,13 +10,16 @@ import torch
 
 from crisalad_jax.config import (
     AdapterConfig,
+    LossConfig,
+    ModelConfig,
     MultiSimilarityConfig,
     OptimiserConfig,
     SinkhornConfig,
 )
 from crisalad_jax.errors import InputError
-from crisalad_jax.losses import multi_similarity_loss
-from crisalad_jax.model import describe, init_crisalad
+from crisalad_jax.losses import metric_loss
+from crisalad_jax.model import Crisalad, describe, init_crisalad
+from crisalad_jax.nn.layers import dropout
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.training import (
     StepConfig,
@@ -24,10 +27,12 @@ from crisalad_jax.training import (
     learning_rate_schedule,
     make_optimiser,
     merge_params,
+    narrow,
     split_params,
     train_step,
 )
 from tests.conftest import MODEL as CONFIG
+from tests.conftest import assert_equal, random_params
 from tests.test_model import pictures
 
 # No dropout, so that a step can be compared with one taken by hand.
@@ -36,7 +41,12 @@ MODEL = dataclasses.replace(
     salad=dataclasses.replace(CONFIG.salad, dropout=0.0),
     encoder=dataclasses.replace(CONFIG.encoder, dropout=0.0),
 )
-STEP = StepConfig(MODEL, MultiSimilarityConfig(base=0.5), OptimiserConfig(learning_rate=1e-3), 10)
+STEP = StepConfig(
+    MODEL,
+    LossConfig(multi_similarity=MultiSimilarityConfig(base=0.5)),
+    OptimiserConfig(learning_rate=1e-3),
+    10,
+)
 LABELS = jnp.array([0, 0, 1, 1, 2, 2])
 VALID = np.ones(6, bool)
 
@@ -174,7 +184,7 @@ def test_the_step_is_adamw_on_the_losss_gradient(params) -> None:
     stepped, metrics = train_step(state, frozen, images, LABELS, VALID, jax.random.key(0), STEP)
 
     def loss(p):
-        return multi_similarity_loss(describe(p, images, MODEL), LABELS, STEP.loss).loss
+        return metric_loss(describe(p, images, MODEL), LABELS, STEP.loss).loss
 
     value, gradient = jax.value_and_grad(loss)(params)
     np.testing.assert_allclose(metrics.loss, value, rtol=1e-5)
@@ -214,6 +224,43 @@ def test_several_steps_of_the_optimiser_equal_torch() -> None:
         theirs.step()
         linear.step()
     np.testing.assert_allclose(ours, tensor.detach().numpy(), atol=2e-6)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.1])
+def test_adam_with_steps_down_equals_torch(decay: float) -> None:
+    """Nine steps of two an epoch, down to a half every three epochs: CricaVPR's, and with decay."""
+    config = OptimiserConfig(
+        kind="adam", learning_rate=0.1, schedule="step", drop_epochs=3, weight_decay=decay
+    )
+    generator = np.random.default_rng(0)
+    start = generator.standard_normal(7).astype(np.float32)
+    gradients = generator.standard_normal((9, 7)).astype(np.float32)
+    optimiser = make_optimiser(config, steps=9, steps_per_epoch=2)
+    ours, state = jnp.asarray(start), optimiser.init(jnp.asarray(start))
+    tensor = torch.tensor(start, requires_grad=True)
+    theirs = torch.optim.Adam([tensor], lr=0.1, weight_decay=decay)
+    down = torch.optim.lr_scheduler.StepLR(theirs, step_size=3, gamma=0.5)
+    for step, gradient in enumerate(gradients):
+        updates, state = optimiser.update(jnp.asarray(gradient), state, ours)
+        ours = ours + updates
+        tensor.grad = torch.tensor(gradient)
+        theirs.step()
+        if step % 2 == 1:
+            down.step()
+    # Nine steps of 0.1, rounded to 1e-7 of numbers of order 1 each, and optax's bias corrections.
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), atol=2e-6)
+
+
+def test_a_linear_decay_may_end_before_the_run() -> None:
+    config = OptimiserConfig(learning_rate=1.0, final_fraction=0.2, decay_steps=4)
+    schedule = learning_rate_schedule(config, 10)
+    parameter = torch.nn.Parameter(torch.zeros(1))
+    theirs = torch.optim.SGD([parameter], lr=1.0)
+    decay = torch.optim.lr_scheduler.LinearLR(theirs, 1.0, 0.2, total_iters=4)
+    for step in range(8):
+        np.testing.assert_allclose(schedule(step), decay.get_last_lr()[0], rtol=1e-6)
+        theirs.step()
+        decay.step()
 
 
 def test_schedule_by_hand() -> None:
@@ -276,7 +323,7 @@ def test_a_finite_loss_with_an_infinite_gradient_keeps_the_state(params) -> None
 
 def test_an_infinite_loss_with_a_finite_gradient_keeps_the_state(params) -> None:
     """Over a tiny alpha the positives' logarithms overflow; alpha leaves their slopes."""
-    loss = MultiSimilarityConfig(alpha=1.2e-38)
+    loss = LossConfig(multi_similarity=MultiSimilarityConfig(alpha=1.2e-38))
     config, labels = dataclasses.replace(STEP, loss=loss), jnp.array([0, 0, 0, 1, 1, 1])
     state, frozen = init_state(fresh(params), "adapters+head", config)
     before = named_leaves(fresh(state.trainable))
@@ -315,6 +362,85 @@ def test_same_key_same_bits_and_dropout_changes_with_the_step() -> None:
 
     # The same parameters, batch and key: only the step's number tells the two draws apart.
     assert loss_at(1) != loss_at(0) == losses(0, 1)[0]
+
+
+def gradient_of(config: ModelConfig, micro_batch: int | None, key: jax.Array | None):
+    start = random_params(config)
+
+    def loss(params: Crisalad) -> jax.Array:
+        found = describe(params, images, config, key=key, micro_batch=micro_batch)
+        return metric_loss(found, LABELS, STEP.loss).loss
+
+    images = pictures(6)
+    return jax.jit(jax.value_and_grad(loss))(start)
+
+
+WIDE = dataclasses.replace(CONFIG, compute_dtype="float64")
+
+
+@pytest.fixture(scope="module")
+def whole_batch():
+    """Loss and gradient of all images at once, with dropout."""
+    with jax.enable_x64(True):
+        return gradient_of(WIDE, None, jax.random.key(3))
+
+
+@pytest.mark.parametrize(
+    ("micro_batch", "keeps"),
+    [(None, "blocks"), (None, "everything"), (1, "products"), (2, "blocks"), (3, "products")],
+)
+def test_micro_batches_and_what_is_kept_change_no_gradient(
+    whole_batch, micro_batch: int | None, keeps: str
+) -> None:
+    """Dropout included; encoder, miner and loss see the whole batch."""
+    with jax.enable_x64(True):
+        config = dataclasses.replace(WIDE, keeps=keeps)
+        value, found = gradient_of(config, micro_batch, jax.random.key(3))
+    whole, expected = whole_batch
+    np.testing.assert_allclose(value, whole, rtol=1e-12)
+    found, expected = named_leaves(found), named_leaves(expected)
+    total = np.sqrt(sum(np.sum(np.square(leaf)) for leaf in expected.values()))
+    assert total > 0.1
+    for name, leaf in expected.items():
+        # Parameters are float32, and so are their gradients, each part's rounded once; a thousandth
+        # of the whole is what those have whose terms cancel.
+        bound = 3e-7 * max(np.linalg.norm(leaf), 1e-3 * total)
+        assert np.linalg.norm(found[name] - leaf) < bound, name
+
+
+def test_each_image_draws_its_own_dropout(params) -> None:
+    """Another image's place in the batch, and how many there are, do not change it."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    x = jnp.ones((3, 5, 7))
+    together = dropout(x, 0.5, key=keys)
+    assert 0 < float((together == 0).mean()) < 1
+    for one, key in zip(together, keys, strict=True):
+        np.testing.assert_array_equal(one, dropout(x[0], 0.5, key=key))
+
+
+def test_a_micro_batch_divides_the_batch(params) -> None:
+    with pytest.raises(
+        InputError, match=r"^micro_batch: found 4, expected a divisor of .* 6 images"
+    ):
+        describe(params, pictures(6), MODEL, micro_batch=4)
+
+
+def test_frozen_weights_in_half_the_memory_change_no_bit() -> None:
+    """In bfloat16 they are multiplied in that type anyway."""
+    model = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
+    config = dataclasses.replace(STEP, model=model)
+    results = []
+    for change in (lambda frozen, _: frozen, narrow):
+        state, frozen = init_state(random_params(model), "adapters+head", config)
+        frozen = change(frozen, model)
+        state, metrics = train_step(
+            state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), config
+        )
+        results.append((state, metrics))
+    kinds = {name: leaf.dtype for name, leaf in named_leaves(frozen).items()}
+    assert kinds["backbone.blocks.1.mlp.fc1.weight"] == jnp.bfloat16
+    assert {k for n, k in kinds.items() if "fc1.weight" not in n and "norm" in n} == {jnp.float32}
+    assert_equal(*results)
 
 
 def test_training_learns(params) -> None:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import PYRAMID_LEVELS, ModelConfig
-from crisalad_jax.nn.layers import l2_normalise, widen
+from crisalad_jax.nn.layers import Keys, l2_normalise, widen
 from crisalad_jax.nn.salad import Salad, init_salad, published_order, salad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
@@ -39,11 +39,12 @@ def aggregate(
     grid: tuple[int, int],
     config: ModelConfig,
     *,
-    key: PRNGKeyArray | None,
+    key: Keys | None,
 ) -> Tokens:
     """Tokens of one image or of a batch, in float32 at least.
 
-    `grid` is the rows and columns of patches. `key` draws dropout, None means inference.
+    `grid` is the rows and columns of patches. `key` draws dropout, one for all or one an
+    image; None means inference.
 
     Raises:
         InputError: SALAD finds no more patches than clusters.

@@ -5,10 +5,13 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from crisalad_jax.platform import product_dtype
 from crisalad_jax.pytree import params
+
+Keys = Key[Array, "*keys"]
+"""One for all, or one for each of a batch."""
 
 
 @params
@@ -219,19 +222,24 @@ def _gelu_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
     return (wide * below).astype(x.dtype), (slope * widen(change)).astype(x.dtype)
 
 
-def dropout(
-    x: Float[Array, "*shape"], rate: float, *, key: PRNGKeyArray | None
-) -> Float[Array, "*shape"]:
-    """Zero a share `rate` of `x` and scale the rest up. `key=None` means inference: `x` itself."""
+def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys | None) -> Float[Array, "*shape"]:
+    """Zero a share `rate` of `x` and scale the rest up. `key=None` means inference: `x` itself.
+
+    Given a key for each of the leading axis, what one draws does not depend on the others.
+    """
     if key is None or rate == 0:
         return x
-    keep = jax.random.bernoulli(key, 1 - rate, x.shape)
+    draw = functools.partial(jax.random.bernoulli, p=1 - rate, shape=x.shape[key.ndim :])
+    keep = jax.vmap(draw)(key) if key.ndim else draw(key)
     return jnp.where(keep, x / (1 - rate), 0)
 
 
-def split_key(key: PRNGKeyArray | None, count: int) -> list[PRNGKeyArray | None]:
-    """`count` keys from one, or as many None where there is no randomness."""
-    return [None] * count if key is None else list(jax.random.split(key, count))
+def split_key(key: Keys | None, count: int) -> list[Keys | None]:
+    """`count` keys from one, or from each of several; None as often where nothing is random."""
+    if key is None:
+        return [None] * count
+    split = functools.partial(jax.random.split, num=count)
+    return list(jnp.moveaxis(jax.vmap(split)(key), 1, 0) if key.ndim else split(key))
 
 
 def l2_normalise(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:

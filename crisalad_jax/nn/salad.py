@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import SaladConfig
 from crisalad_jax.nn.layers import (
+    Keys,
     Linear,
     dropout,
     init_linear,
@@ -68,7 +69,7 @@ def _init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> Tw
 
 
 def _two_layer(
-    params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: PRNGKeyArray | None
+    params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys | None
 ) -> Float[Array, "*batch d_out"]:
     hidden = dropout(linear(params.fc1, x), rate, key=key)
     return linear(params.fc2, jax.nn.relu(hidden))
@@ -79,7 +80,7 @@ def transport(
     patches: Float[Array, "*batch patch dim"],
     config: SaladConfig,
     *,
-    key: PRNGKeyArray | None,
+    key: Keys | None,
 ) -> SinkhornResult:
     """Assignment of patches to clusters, dustbin last (paper Eqs. 3 to 5), in float32.
 
@@ -93,14 +94,12 @@ def transport(
     return assign(scores, dustbin, config.sinkhorn)
 
 
-def salad(
-    params: Salad, features: Features, config: SaladConfig, *, key: PRNGKeyArray | None
-) -> Tokens:
+def salad(params: Salad, features: Features, config: SaladConfig, *, key: Keys | None) -> Tokens:
     """Global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
 
     Of one image, or of a batch at once, which the transport does faster than `vmap` could: its
-    choice of domain is one for all. `key` draws the dropout of the cluster and score networks; None
-    means inference.
+    choice of domain is one for all. `key` draws the dropout of the cluster and score networks, one
+    for all or one an image; None means inference.
 
     Raises:
         InputError: no more patches than clusters.

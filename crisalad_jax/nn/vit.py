@@ -13,7 +13,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
-from crisalad_jax.config import PATCH_SIZE, ViTConfig
+from crisalad_jax.config import PATCH_SIZE, ViTConfig, choose
 from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
 from crisalad_jax.nn.attention import Attention, attention
 from crisalad_jax.nn.layers import (
@@ -28,9 +28,13 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.pytree import params
 
 NORM_EPSILON = 1e-6
-KEPT = ("qkv", "attended", "hidden", "down", "mixed")
-"""What a block keeps for its gradient, beside its input: results of its large products and the
-tokens between its halves, by their names. The rest is made again: softmax, activations and such."""
+_PRODUCTS = ("qkv", "attended", "hidden", "down", "mixed")
+"""Results of a block's large products and the tokens between its halves, by their names."""
+_POLICIES = {
+    "products": jax.checkpoint_policies.save_only_these_names(*_PRODUCTS),
+    "blocks": jax.checkpoint_policies.nothing_saveable,
+    "everything": jax.checkpoint_policies.everything_saveable,
+}
 
 
 @params
@@ -141,10 +145,19 @@ def _sincos_positions(side: int, dim: int) -> np.ndarray:
     return np.concatenate([rows, columns], axis=-1)
 
 
-def vit(params: ViT, images: Float[Array, "image height width 3"], config: ViTConfig) -> Features:
-    """Features of a batch of normalised images whose sides are multiples of 14."""
+def vit(
+    params: ViT,
+    images: Float[Array, "image height width 3"],
+    config: ViTConfig,
+    *,
+    keeps: str = "products",
+) -> Features:
+    """Features of a batch of normalised images whose sides are multiples of 14.
+
+    `keeps` is `ModelConfig.keeps`.
+    """
     tokens = jax.vmap(lambda image: embed(params, image, config))(images)
-    tokens = run_blocks(params, tokens, grid_of(images[0]), config)
+    tokens = run_blocks(params, tokens, grid_of(images[0]), config, keeps=keeps)
     tokens = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
     return Features(tokens[:, 0], tokens[:, 1 + config.registers :])
 
@@ -168,18 +181,22 @@ def embed(
 
 
 def run_blocks(
-    params: ViT, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+    params: ViT,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: ViTConfig,
+    *,
+    keeps: str = "products",
 ) -> Float[Array, "image token dim"]:
-    """All blocks in turn, by one compiled body, of whose work the gradient keeps `KEPT`."""
+    """All blocks in turn, by one compiled body; `keeps` is `ModelConfig.keeps`."""
 
     def body(
         carry: Float[Array, "image token dim"], one: Block
     ) -> tuple[Float[Array, "image token dim"], None]:
         return block(one, carry, grid, config), None
 
-    policy = jax.checkpoint_policies.save_only_these_names(*KEPT)
     # prevent_cse=False: in a scan nothing can undo the saving.
-    body = jax.checkpoint(body, prevent_cse=False, policy=policy)
+    body = jax.checkpoint(body, prevent_cse=False, policy=choose("keeps", keeps, _POLICIES))
     stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
     for stack in stacks:
         tokens, _ = jax.lax.scan(body, tokens, stack)

@@ -11,8 +11,8 @@ import jax
 import torch
 from torch import Tensor
 
-from crisalad_jax.config import ModelConfig, MultiSimilarityConfig
-from crisalad_jax.losses import mine, multi_similarity_loss
+from crisalad_jax.config import LossConfig, ModelConfig, MultiSimilarityConfig
+from crisalad_jax.losses import all_pairs, metric_loss, mine
 from crisalad_jax.model import Crisalad, describe
 from crisalad_jax.nn.aggregators import aggregate
 from crisalad_jax.nn.attention import attention
@@ -29,7 +29,7 @@ from parity.reference.vit import Features as TorchFeatures
 
 GRID = (3, 4)
 """Rows and columns of patches wherever a case needs a grid: not square, so axes cannot be mixed."""
-LOSS = MultiSimilarityConfig(base=0.5)
+LOSS = LossConfig(multi_similarity=MultiSimilarityConfig(base=0.5))
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """ImageNet's, as torchvision's models publish them: our own constants are what is tested."""
 
@@ -158,7 +158,9 @@ ENCODER = Part(
 )
 
 MINER = Part(
-    lambda _, x, __: mine(x["similarities"], x["labels"], epsilon=LOSS.epsilon)._asdict(),
+    lambda _, x, __: mine(
+        x["similarities"], all_pairs(x["labels"]), epsilon=LOSS.epsilon
+    )._asdict(),
     lambda _, x, __: torch_losses.mine(
         x["similarities"], x["labels"], epsilon=LOSS.epsilon
     )._asdict(),
@@ -167,7 +169,7 @@ MINER = Part(
 
 def _our_loss(_: Crisalad, x: Inputs, __: ModelConfig) -> dict[str, jax.Array]:
     valid = x.get("valid")
-    return multi_similarity_loss(x["descriptors"], x["labels"], LOSS, valid=valid)._asdict()
+    return metric_loss(x["descriptors"], x["labels"], LOSS, valid=valid)._asdict()
 
 
 def _their_loss(_: TorchCrisalad, x: Inputs, __: ModelConfig) -> dict[str, Tensor]:

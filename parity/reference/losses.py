@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from crisalad_jax.config import MultiSimilarityConfig
+from crisalad_jax.config import LossConfig
 from parity.reference.layers import widen
 
 
@@ -48,9 +48,7 @@ def mine(similarities: Tensor, labels: Tensor, *, epsilon: float) -> MinedPairs:
     )
 
 
-def multi_similarity_loss(
-    descriptors: Tensor, labels: Tensor, config: MultiSimilarityConfig
-) -> LossResult:
+def multi_similarity_loss(descriptors: Tensor, labels: Tensor, config: LossConfig) -> LossResult:
     """Mean over all anchors of the loss of their mined pairs; the miner passes no gradient.
 
     Args:
@@ -61,10 +59,11 @@ def multi_similarity_loss(
     wide = widen(descriptors)
     similarities = wide @ wide.T
     pairs = mine(similarities.detach(), labels, epsilon=config.epsilon)
-    centred = similarities - config.base
+    constants = config.multi_similarity
+    centred = similarities - constants.base
     per_anchor = (
-        _log1p_sum_exp(-config.alpha * centred, pairs.positives) / config.alpha
-        + _log1p_sum_exp(config.beta * centred, pairs.negatives) / config.beta
+        _log1p_sum_exp(-constants.alpha * centred, pairs.positives) / constants.alpha
+        + _log1p_sum_exp(constants.beta * centred, pairs.negatives) / constants.beta
     )
     loss = per_anchor.mean()
     if config.library_quirk and max(pairs.positives.sum(), pairs.negatives.sum()) <= 1:

@@ -1,0 +1,72 @@
+"""The log of a run: JSON lines for programs, TensorBoard's event files for people."""
+
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import tensorboardX
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import atomic_path
+
+
+class MetricsLog:
+    """Numbers by step, in `metrics.jsonl` (a line each time) and `tensorboard/`."""
+
+    def __init__(self, folder: pathlib.Path, *, keep_up_to: int, validated: int) -> None:
+        """Open the log of the run in `folder` and drop what a resumed run repeats.
+
+        That is what is past step `keep_up_to`, and validations past step `validated`.
+
+        Raises:
+            InputError: a log that is there cannot be read.
+        """
+        self._path = folder / "metrics.jsonl"
+        kept = read_metrics(self._path) if self._path.exists() else []
+        with atomic_path(self._path) as temporary:
+            lines = [
+                _line(record)
+                for record in kept
+                if record["step"] <= (keep_up_to if "loss" in record else validated)
+            ]
+            temporary.write_text("".join(lines), encoding="utf-8")
+        self._events = tensorboardX.SummaryWriter(
+            str(folder / "tensorboard"), purge_step=keep_up_to + 1 if kept else None
+        )
+
+    def write(self, values: Mapping[str, float], *, of: str = "") -> None:
+        """Append a line; `of` names a validation set, whose numbers TensorBoard shows apart.
+
+        There the names are those of other VPR tools: `loss`, `{set}/R5`.
+        """
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(_line(values))
+        for name, value in values.items():
+            if name not in ("step", "epoch"):
+                tag = f"{of}/{name.replace('@', '')}" if of else name
+                self._events.add_scalar(tag, value, int(values["step"]))
+
+    def close(self) -> None:
+        """Write out what TensorBoard's writer still holds."""
+        self._events.close()
+
+
+def _line(values: Mapping[str, float]) -> str:
+    return json.dumps(values) + "\n"
+
+
+def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
+    """The lines of a metrics file; a last line that was cut off by a kill is left out.
+
+    Raises:
+        InputError: the file is missing, or a line is no record of a step.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").split("\n")
+        records = [json.loads(line) for line in lines[:-1]]
+        if not all(isinstance(r, dict) and type(r.get("step")) is int for r in records):
+            raise ValueError("a line has no step")
+        return records
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read this log of a run: {error}") from error

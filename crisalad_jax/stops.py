@@ -1,0 +1,67 @@
+"""Signals that end a program, put off until its work is saved."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+import jax
+
+from crisalad_jax.errors import Stopped
+from crisalad_jax.processes import any_of
+
+_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
+
+class Stop:
+    """Whether a signal has come."""
+
+    def __init__(self) -> None:
+        """None has."""
+        self._number: int | None = None
+        self._at_once = False
+
+    def check(self) -> None:
+        """Raise `Stopped` if a signal has come, to this process or another of the run."""
+        if any_of(self._number is not None):
+            raise Stopped(self._number or signal.SIGTERM)
+
+    @contextlib.contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Where nothing can be left half done: a signal raises `Stopped` when it comes.
+
+        Of several processes it would leave the others alone, so that it waits there too.
+        """
+        self._at_once = jax.process_count() == 1
+        try:
+            self.check()
+            yield
+        finally:
+            self._at_once = False
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """What the signals call."""
+        first, self._number = self._number is None, number
+        if not first:  # who asks twice does not want to wait
+            raise KeyboardInterrupt
+        if self._at_once:
+            raise Stopped(number)
+
+
+@contextlib.contextmanager
+def put_off_signals() -> Iterator[Stop]:
+    """While the block runs SIGTERM and SIGINT (Ctrl-C) wait for `Stop.check`.
+
+    In other threads than the main one, where Python sets no handlers, they stay what they are.
+    """
+    stop = Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.signal(number, stop.handle) for number in _SIGNALS}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
