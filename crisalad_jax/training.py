@@ -254,4 +254,5 @@ def train_step(
     new = TrainState(state.step + 1, optax.apply_updates(state.trainable, updates), new_optimiser)
     usable = jnp.isfinite(loss) & jnp.isfinite(norm) & valid.any()
     kept = jax.tree.map(lambda after, before: jnp.where(usable, after, before), new, state)
-    return kept, Metrics(loss, b_acc, norm, config.schedule(state.step), valid.sum())
+    rate = jnp.asarray(config.schedule(state.step))
+    return kept, Metrics(loss, b_acc, norm, rate, valid.sum())

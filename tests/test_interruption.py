@@ -102,7 +102,7 @@ def assert_same_end(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert (found / name).read_bytes() == (expected / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("kills", [6, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
 def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tmp_path, kills):
     generator = random.Random(kills)
     out, killed = tmp_path / "run", 0
@@ -124,13 +124,13 @@ def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tm
     assert_same_end(out, whole)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+)
 def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_path, number):
     out = tmp_path / "run"
     # Without these saves, what is resumed from was saved because of the signal.
-    seldom = (
-        "crisalad_jax.fit.SAVE_SECONDS = 1e9; CONFIG = __import__('dataclasses').replace(CONFIG)"
-    )
+    seldom = "crisalad_jax.fit.SAVE_SECONDS = 1e9"
     program = start(out, seldom)
     wait_for_lines(program, out, 4)
     program.send_signal(number)
@@ -145,6 +145,7 @@ def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_pat
     assert_same_end(out, whole)
 
 
+@pytest.mark.slow
 def test_a_signal_during_a_validation_does_not_wait_for_its_end(start, whole, tmp_path):
     """The validation is repeated, and is in the log once."""
     slow = (
@@ -169,7 +170,8 @@ def test_a_signal_during_a_validation_does_not_wait_for_its_end(start, whole, tm
     assert_same_end(out, whole)
 
 
-@pytest.mark.parametrize("kilobytes", [1, 40])
+@pytest.mark.slow
+@pytest.mark.parametrize("kilobytes", [1, 230])
 def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
     start, whole, tmp_path, kilobytes
 ):
