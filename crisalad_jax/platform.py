@@ -18,11 +18,11 @@ from crisalad_jax.cores import usable_cores
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
-    # By default jaxlib gives attention as a whole, and other products, to a library (YNN) that
-    # takes longer than Eigen's products do, one by one (docs/performance.md).
+    # By default jaxlib gives attention as a whole to a library (YNN) that takes longer than Eigen's
+    # products do, one by one; of a single product the two are as fast (docs/performance.md).
     "Eigen": {_FUSIONS: ""},
-    # Takes a few percent less again where matrices are large (and half as long again where they are
-    # small), but a program with its products cannot be kept in a file.
+    # Takes a few percent less again where matrices are large, and longer where they are small; but
+    # a program with its products cannot be kept in a file.
     "oneDNN": {
         _FUSIONS: "",
         "xla_cpu_use_onednn": True,
