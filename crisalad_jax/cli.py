@@ -24,7 +24,7 @@ from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.places import read_places
-from crisalad_jax.descriptors import writer_for
+from crisalad_jax.descriptors import config_of, targets, writer_for
 from crisalad_jax.errors import InputError, Stopped
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate, group, read_tokens
 from crisalad_jax.files import check_target, write_json
@@ -310,7 +310,8 @@ class Extract:
 
 def _extract(arguments: Extract) -> None:
     write = writer_for(arguments.out)
-    check_target(arguments.out)
+    for target in targets(arguments.out):
+        check_target(target)
     check_grouping([arguments.grouping], arguments.batch_size, arguments.seed)
     params, config, _ = _model(arguments, "")
     paths = list_images(arguments.images)
@@ -338,7 +339,7 @@ def _extract(arguments: Extract) -> None:
         raise InputError(f"{arguments.images}: found {len(paths)} images, none of them readable")
     write(arguments.out, descriptors, kept)
     write_json(
-        arguments.out.with_suffix(".config.json"),
+        config_of(arguments.out),
         {
             "weights": str(arguments.weights),
             "images": str(arguments.images),
@@ -551,6 +552,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run(chosen)
     except InputError as error:
         print("crisalad:", *str(error).splitlines(), file=sys.stderr)
+        return 2
+    except OSError as error:  # a disk that is full, or a file that no check could foresee
+        print(f"crisalad: {error}", file=sys.stderr)
         return 2
     except SystemExit:  # from tyro, after --help
         return 0

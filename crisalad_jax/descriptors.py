@@ -31,9 +31,24 @@ def writer_for(
     return choose(f"{path}: suffix of the descriptors' file", path.suffix, writers)
 
 
+def config_of(path: pathlib.Path) -> pathlib.Path:
+    """Where what made the descriptors in `path` is written."""
+    return path.with_suffix(".config.json")
+
+
+def targets(path: pathlib.Path) -> list[pathlib.Path]:
+    """All files that a set of descriptors in `path` is made of."""
+    names = [_names_of(path)] if path.suffix == ".npy" else []
+    return [path, *names, config_of(path)]
+
+
+def _names_of(path: pathlib.Path) -> pathlib.Path:
+    return path.with_suffix(".names.txt")
+
+
 def _write_npy(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:
     """Row i of the array is the image of line i of `path` with the suffix .names.txt."""
-    with atomic_path(path.with_suffix(".names.txt")) as temporary:
+    with atomic_path(_names_of(path)) as temporary:
         temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
     with atomic_path(path) as temporary:
         np.save(temporary, descriptors)

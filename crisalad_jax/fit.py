@@ -30,7 +30,6 @@ from crisalad_jax.files import write_json
 from crisalad_jax.metrics import MetricsLog
 from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
 from crisalad_jax.platform import on_every_device, on_one_device, over_devices
-from crisalad_jax.processes import leaders, leads, meet
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.states import StateStore
@@ -172,7 +171,7 @@ class _Run:
         )
         self.config, self.out = config, out
         self._places, self._validation = places, validation
-        self._spread = spreads_images(config.trains) or jax.process_count() > 1
+        self._spread = spreads_images(config.trains)
         self.steps = self.steps_per_epoch * config.epochs
         self._cache = ImageCache()
         lengths = self.steps, self.steps_per_epoch
@@ -184,9 +183,7 @@ class _Run:
         state, frozen = init_state(params, config.trains, self._compiled)
         self._frozen: PyTree = jax.device_get(frozen)
         self._frozen_there = self._share(narrow(self._frozen, config.model))
-        if leads():
-            claim_run(out, config)
-        meet("a folder for the run")
+        claim_run(out, config)
         self._store = StateStore(out / "state")
         self.record = _Record(
             weights_checksum=_checksum(jax.tree.leaves(params)),
@@ -204,24 +201,18 @@ class _Run:
                         "expected the same, or another folder"
                     )
             self.step, state, self.record = saved.step, saved.state, _Record(**saved.record)
-            if leads():
-                self._drop_old_best()
-        meet("the state that is gone on from")
+            self._drop_old_best()
         self._saved = None if saved is None else (self.step, saved.record)
         # A copy of its own on each device: a step takes over the buffers of its state.
         self.state: TrainState = jax.tree.map(jnp.copy, self._share(state))
         # A validation that the state does not know of will be repeated.
-        self._log = (
-            MetricsLog(out, keep_up_to=self.step, validated=self.record.validated)
-            if leads()
-            else None
-        )
+        self._log = MetricsLog(out, keep_up_to=self.step, validated=self.record.validated)
         self._saved_at = self._stepped_at = time.monotonic()
 
     def _share(self, tree: PyTree) -> PyTree:
         """On the devices that the images of a batch are spread over."""
         batch = self.config.places_per_batch * self.config.images_per_place
-        return on_every_device(tree, batch if self._spread else 1, everywhere=self._spread)
+        return on_every_device(tree, batch if self._spread else 1)
 
     def is_done(self) -> bool:
         """Whether nothing is left, validations included."""
@@ -251,13 +242,9 @@ class _Run:
             seed=config.seed,
             epoch=epoch,
             start_step=start_step,
-            part=(jax.process_index(), jax.process_count()),
             on_bad_image=on_bad_image,
             cache=self._cache,
         )
-
-    def _over_devices(self, part: np.ndarray) -> jax.Array | np.ndarray:
-        return over_devices(part, everywhere=True) if self._spread else part
 
     def params(self) -> Crisalad:
         """The whole model as it is now, in float32."""
@@ -271,12 +258,14 @@ class _Run:
         self.state, device_metrics = train_step(
             self.state,
             self._frozen_there,
-            *(self._over_devices(x) for x in (batch.images, batch.labels, batch.valid)),
+            over_devices(batch.images) if self._spread else batch.images,
+            batch.labels,
+            batch.valid,
             self._step_key,
             self._compiled,
         )
         metrics = {name: float(value) for name, value in device_metrics._asdict().items()}
-        size = len(batch.images) * jax.process_count()
+        size = len(batch.images)
         skipped = size - int(metrics.pop("images"))
         if skipped == size:
             raise InputError(
@@ -293,16 +282,15 @@ class _Run:
         rate, self._stepped_at = size / (now - self._stepped_at), now
         self.record.skipped_images += skipped
         self.step += 1
-        if self._log is not None:
-            self._log.write(
-                {
-                    "step": self.step,
-                    "epoch": (self.step - 1) // self.steps_per_epoch + 1,
-                    **metrics,
-                    "images_per_second": round(rate, 2),
-                    "skipped_images": skipped,
-                }
-            )
+        self._log.write(
+            {
+                "step": self.step,
+                "epoch": (self.step - 1) // self.steps_per_epoch + 1,
+                **metrics,
+                "images_per_second": round(rate, 2),
+                "skipped_images": skipped,
+            }
+        )
         note = f"loss {metrics['loss']:.3f}  b_acc {metrics['b_acc']:.2f}  {rate:.0f} images/s"
         if self.record.best:
             note += f"  best R@5 {100 * self.record.best[0][0]:.1f}"
@@ -324,16 +312,15 @@ class _Run:
             watched = self._watch_transport(params, benchmark)
         epoch = self.step // self.steps_per_epoch
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
-        if self._log is not None:
-            line = {"step": self.step, "epoch": epoch, **recalls, **watched}
-            self._log.write(line, of=benchmark.name)
-        found, keep = [leaders(result.recalls[5]), self.step], self.config.keep_best
+        line = {"step": self.step, "epoch": epoch, **recalls, **watched}
+        self._log.write(line, of=benchmark.name)
+        found, keep = [result.recalls[5], self.step], self.config.keep_best
         # Of equal ones the first is the best.
         record.best = sorted([*record.best, found], key=lambda one: (-one[0], one[1]))[:keep]
         record.without_gain = 0 if record.best[0] == found else record.without_gain + 1
         paths = [self.out / "best.safetensors"] if record.best[0] == found else []
         paths += [self._best_path(self.step)] if keep > 1 and found in record.best else []
-        for path in paths if leads() else ():
+        for path in paths:
             save_weights(path, params, self.config.model)
         patience = self.config.patience
         record.stopped_early = patience is not None and record.without_gain >= patience
@@ -367,7 +354,7 @@ class _Run:
     def save(self) -> None:
         """Write the weights and the resumable state, the latter while training goes on."""
         record = dataclasses.asdict(self.record)
-        if leads() and self._saved != (self.step, record):
+        if self._saved != (self.step, record):
             save_weights(self.out / "last.safetensors", self.params(), self.config.model)
             self._store.save(self.step, self.state, record)
             self._drop_old_best()
@@ -377,8 +364,7 @@ class _Run:
     def close(self) -> None:
         """Wait for what is being written."""
         self._store.close()
-        if self._log is not None:
-            self._log.close()
+        self._log.close()
 
 
 def claim_run(out: pathlib.Path, config: TrainConfig) -> None:

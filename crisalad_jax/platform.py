@@ -15,15 +15,14 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from crisalad_jax.cores import usable_cores
-from crisalad_jax.errors import InputError
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
-    # By default jaxlib gives attention as a whole, and other products, to a library (YNN) that
-    # takes longer than Eigen's products do, one by one (docs/performance.md).
+    # By default jaxlib gives attention as a whole to a library (YNN) that takes longer than Eigen's
+    # products do, one by one; of a single product the two are as fast (docs/performance.md).
     "Eigen": {_FUSIONS: ""},
-    # Takes a few percent less again where matrices are large (and half as long again where they are
-    # small), but a program with its products cannot be kept in a file.
+    # Takes a few percent less again where matrices are large, and longer where they are small; but
+    # a program with its products cannot be kept in a file.
     "oneDNN": {
         _FUSIONS: "",
         "xla_cpu_use_onednn": True,
@@ -155,48 +154,27 @@ def set_up() -> None:
     warnings.filterwarnings("ignore", "Error writing .* onednn-fusion")  # see `jit`
 
 
-def _mesh(count: int, everywhere: bool) -> Mesh:
-    """As many devices as share `count` images alike: this process's, or those of all processes."""
-    devices = jax.devices() if everywhere else jax.local_devices()
-    if everywhere and jax.process_count() > 1 and count % len(devices):
-        raise InputError(
-            f"batch: found {count} images, expected a multiple of the {len(devices)} devices of "
-            f"{jax.process_count()} processes"
-        )
+def _mesh(count: int) -> Mesh:
+    """As many local devices as share `count` images alike."""
+    devices = jax.local_devices()
     most = max(n for n in range(1, len(devices) + 1) if count % n == 0)
     return Mesh(np.array(devices[:most]), ("image",))
 
 
-def over_devices(images: np.ndarray, *, everywhere: bool = False) -> jax.Array:
-    """A batch of images on the devices, each having as many (or on one, where it cannot be).
-
-    Everywhere means the devices of all processes; `images` are then this one's part of the batch.
-
-    Raises:
-        InputError: the devices of several processes do not share a batch alike.
-    """
-    count = len(images) * (jax.process_count() if everywhere else 1)
-    sharding = NamedSharding(_mesh(count, everywhere), PartitionSpec("image"))
-    if count == len(images):
-        return jax.device_put(images, sharding)
-    return jax.make_array_from_process_local_data(sharding, images)
+def over_devices(images: np.ndarray) -> jax.Array:
+    """A batch of images on the devices, each having as many (or on one, where it cannot be)."""
+    return jax.device_put(images, NamedSharding(_mesh(len(images)), PartitionSpec("image")))
 
 
-def on_every_device(tree: _Tree, count: int, *, everywhere: bool = False) -> _Tree:
+def on_every_device(tree: _Tree, count: int) -> _Tree:
     """Arrays that programs on batches of `count` images read: on all the devices of such a batch.
 
-    Everywhere means the devices of all processes. The virtual devices of a CPU share one copy: that
-    of a numpy array must stay as it is.
-
-    Raises:
-        InputError: as `over_devices`.
+    The virtual devices of a CPU share one copy: that of a numpy array must stay as it is.
     """
-    sharding = NamedSharding(_mesh(count, everywhere), PartitionSpec())
+    sharding = NamedSharding(_mesh(count), PartitionSpec())
 
     def put(leaf: Any) -> jax.Array:
         host = np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
-        if jax.process_count() > 1 and everywhere:
-            return jax.make_array_from_process_local_data(sharding, np.asarray(leaf))
         return jax.device_put(host, sharding, may_alias=True)
 
     return jax.tree.map(put, tree)

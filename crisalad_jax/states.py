@@ -31,15 +31,7 @@ class StateStore:
         Raises:
             InputError: the folder cannot be made or read.
         """
-        # Of several processes each reads for itself, and the first one writes.
-        several, here = jax.process_count() > 1, jax.process_index()
-        alone = ocp.options.MultiprocessingOptions(
-            primary_host=here,
-            active_processes={here} if several else None,
-            barrier_sync_key_prefix=f"process{here}" if several else None,
-        )
         options = ocp.CheckpointManagerOptions(
-            multiprocessing_options=alone,
             max_to_keep=keep,
             enable_async_checkpointing=True,
             cleanup_tmp_directories=True,

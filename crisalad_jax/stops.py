@@ -6,10 +6,7 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-import jax
-
 from crisalad_jax.errors import Stopped
-from crisalad_jax.processes import any_of
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
@@ -23,17 +20,14 @@ class Stop:
         self._at_once = False
 
     def check(self) -> None:
-        """Raise `Stopped` if a signal has come, to this process or another of the run."""
-        if any_of(self._number is not None):
-            raise Stopped(self._number or signal.SIGTERM)
+        """Raise `Stopped` if a signal has come."""
+        if self._number is not None:
+            raise Stopped(self._number)
 
     @contextlib.contextmanager
     def at_once(self) -> Iterator[None]:
-        """Where nothing can be left half done: a signal raises `Stopped` when it comes.
-
-        Of several processes it would leave the others alone, so that it waits there too.
-        """
-        self._at_once = jax.process_count() == 1
+        """Where nothing can be left half done: a signal raises `Stopped` when it comes."""
+        self._at_once = True
         try:
             self.check()
             yield

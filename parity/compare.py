@@ -1,7 +1,8 @@
 """Errors between two implementations, the tolerances they are held to and why, rows of the table.
 
 The error of an array is the norm of the difference over the norm of the reference's array. A row
-shows the array with the largest error of those that it covers, so every one of them is held to it.
+shows the array with the largest error of those that it covers, so every one of them is held to it;
+or, where that is said, the error of all of them together.
 """
 
 import dataclasses
@@ -29,9 +30,10 @@ TRUTH_FACTOR = 1.5
 EXACT = Tolerance(0.0, "choices, not numbers: every mined pair is the same")
 FROZEN = Tolerance(0.0, "no step touches what is frozen, batch norm's statistics among it")
 
-STEP, OWN_STEP, AFTER = (
+STEP, OWN_STEP, OTHER_SIGNS, AFTER = (
     "AdamW step, same gradient",
     "AdamW step, own gradient",
+    "elements of it with another sign",
     "parameters after it",
 )
 
@@ -55,8 +57,9 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
             "2e-7 after a step of 1e-2, and optax's 1 - 0.999^1 in float32 is 1e-5 off",
         ),
         OWN_STEP: Tolerance(
-            1.2e-4,
-            "a step's slope is 1 / epsilon at a gradient of 0; three times the measured 3.7e-5",
+            3e-4,
+            "a step's slope is 1 / epsilon at a gradient of 0; three times the measured 1e-4 "
+            "(seed 0: 9e-5)",
         ),
         AFTER: Tolerance(
             1.5e-4,
@@ -91,6 +94,11 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
             "one sign in 2000 may differ, which is 4.5e-2 of all elements together; one of 3,381 "
             "does at seed 0, 3.4e-2; 9.3e-3 where none does",
         ),
+        OTHER_SIGNS: Tolerance(
+            1.0,
+            "in any one array: a gradient just above those left out may round to either side of 0; "
+            "one is measured, at seeds 0 and 1",
+        ),
         AFTER: Tolerance(
             1e-1,
             "all elements: a sign that differs is a step of 2e-2, beside weights of some 4e-2; "
@@ -121,7 +129,7 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
             2e-13, "the parameter's rounding over the step of 1e-2; four times the measured 4.6e-14"
         ),
         OWN_STEP: Tolerance(
-            2.5e-12, "as in float32; three times the measured 7.3e-13 (seed 0: 1.1e-13)"
+            1e-11, "as in float32; three times the measured 3.4e-12 (seed 0: 2.2e-13)"
         ),
         AFTER: Tolerance(
             6e-13,
@@ -209,7 +217,7 @@ def compare(
     noise = noise or {}
     rows = []
     for name in {**theirs, **ours}:
-        if name not in ours or name not in theirs or ours[name].shape != theirs[name].shape:
+        if not _on_both(name, ours, theirs):
             known = theirs if name in theirs else ours
             rows.append((math.inf, math.inf, f"{name} (on one side only)", known[name].shape))
             continue
@@ -250,7 +258,14 @@ def compare_joined(
     *,
     note: str = "",
 ) -> Row:
-    """The row of all arrays of `theirs` joined to one, for what is only true of many elements."""
+    """The row of all arrays of `theirs` joined to one, for what is only true of many elements.
+
+    Where ours lacks one, or has it in another shape, the error is infinite.
+    """
+    missing = [name for name in theirs if not _on_both(name, ours, theirs)]
+    if missing:
+        worst = {name: theirs[name] for name in missing}
+        return compare(case, quantity, precision, {}, worst, tolerance, note=note)
     mine, other = (_join(side[name] for name in theirs) for side in (ours, theirs))
     return Row(
         case=case,
@@ -285,6 +300,38 @@ def compare_truth(
         f"{TRUTH_FACTOR} times torch's own error: as many roundings of the same size",
     )
     return compare_joined(case, quantity, precision, ours, truth, tolerance)
+
+
+def compare_signs(
+    case: str,
+    quantity: str,
+    precision: str,
+    ours: Arrays,
+    theirs: Arrays,
+    tolerance: Tolerance,
+    *,
+    note: str = "",
+) -> Row:
+    """The row of the array with the most elements of another sign; its error is their number."""
+    row = compare_joined(case, quantity, precision, ours, theirs, tolerance, note=note)
+    if not math.isfinite(row.relative):
+        return row
+    counts = {
+        name: float(np.sum(np.sign(as_double(ours[name])) != np.sign(as_double(array))))
+        for name, array in theirs.items()
+    }
+    worst = max(counts, key=lambda name: counts[name])
+    return dataclasses.replace(
+        row,
+        worst=worst,
+        shape=theirs[worst].shape,
+        max_abs=float(np.abs(as_double(ours[worst]) - as_double(theirs[worst])).max(initial=0.0)),
+        relative=counts[worst],
+    )
+
+
+def _on_both(name: str, ours: Arrays, theirs: Arrays) -> bool:
+    return name in ours and name in theirs and ours[name].shape == theirs[name].shape
 
 
 def _join(arrays: Iterable[np.ndarray]) -> np.ndarray:

@@ -11,7 +11,15 @@ import pytest
 import parity.cases.parts
 from parity.__main__ import main
 from parity.cases import CASES, RUNS, checks
-from parity.compare import Row, Tolerance, compare, compare_truth, relative_error
+from parity.compare import (
+    Row,
+    Tolerance,
+    compare,
+    compare_joined,
+    compare_signs,
+    compare_truth,
+    relative_error,
+)
 from parity.full_size import cosine_row
 from parity.report import terminal_table, write_report
 
@@ -46,6 +54,35 @@ def test_a_row_shows_the_worst_array() -> None:
 )
 def test_what_is_wrong_or_missing_is_a_miss(ours: dict[str, list[float]]) -> None:
     assert not row_of(ours, {"a": [1.0]}).passed
+
+
+def pair(ours: dict[str, list[float]], theirs: dict[str, list[float]]) -> list[dict]:
+    return [{k: np.array(v) for k, v in side.items()} for side in (ours, theirs)]
+
+
+def test_arrays_joined_are_one() -> None:
+    sides = pair({"a": [1.0, 0.0], "b": [3.0, 5.0]}, {"a": [1.0, 0.0], "b": [3.0, 4.0]})
+    row = compare_joined("layer", "step", "bfloat16", *sides, LOOSE)
+    assert (row.worst, row.shape, row.arrays, row.max_abs) == ("all together", (4,), 2, 1)
+    assert row.relative == pytest.approx(1 / math.sqrt(26))
+
+
+def test_signs_are_counted_in_each_array() -> None:
+    """A zero has a sign of its own."""
+    theirs = {"a": [1.0, -2.0, 0.0], "b": [3.0, 4.0, 5.0]}
+    sides = pair({"a": [1.0, 2.0, 1.0], "b": [3.0, -4.0, 5.0]}, theirs)
+    row = compare_signs("layer", "signs", "bfloat16", *sides, LOOSE)
+    assert (row.worst, row.relative, row.max_abs, row.passed) == ("a", 2, 4, False)
+    assert compare_signs("layer", "signs", "bfloat16", *pair(theirs, theirs), LOOSE).relative == 0
+
+
+@pytest.mark.parametrize("check", [compare_joined, compare_signs])
+@pytest.mark.parametrize("ours", [{"a": [math.nan]}, {"a": [1.0, 1.0]}, {}])
+def test_joined_too_what_is_wrong_or_missing_is_a_miss(check, ours) -> None:
+    row = check(
+        "layer", "step", "bfloat16", *pair(ours, {"a": [1.0]}), Tolerance(1e9, "for a test")
+    )
+    assert not row.passed
 
 
 def test_noise_is_measured_by_what_cancels() -> None:

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from fragments import Study, Table, bars, flags, leave
+from fragments import Study, Table, bars, count, flags, leave, read
 from racing import (
     measured,
     megabytes,
@@ -44,6 +44,7 @@ import torch  # isort: skip
 from crisalad_jax import platform
 from crisalad_jax.config import PRESETS, ModelConfig
 from crisalad_jax.costs import part_costs
+from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, describe
 from parity.cases.case import build, convert, random
 from parity.reference.model import Crisalad as TorchCrisalad
@@ -207,18 +208,37 @@ def title(preset: str, config: ModelConfig) -> str:
 def race_flags(description: str) -> argparse.ArgumentParser:
     parser = flags(description, "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
-    parser.add_argument("--batches", type=int, nargs="+", default=[8, 16])
+    parser.add_argument(
+        "--sizes", type=image_size, nargs="+", default=[None], help="such as 322x322"
+    )
+    parser.add_argument("--batches", type=count, nargs="+", default=[8, 16])
     parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--calls", type=int, default=2)
+    parser.add_argument("--rounds", type=count, default=5)
+    parser.add_argument("--calls", type=count, default=2)
     return parser
 
 
-def at_size(config: ModelConfig, size: str | None) -> ModelConfig:
-    if size is None:
-        return config
-    height, width = map(int, size.split("x"))
-    return dataclasses.replace(config, image_size=(height, width))
+def image_size(text: str) -> tuple[int, int]:
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal()):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a size such as 322x322")
+    return int(height), int(width)
+
+
+def at_size(config: ModelConfig, size: tuple[int, int] | None) -> ModelConfig:
+    return config if size is None else dataclasses.replace(config, image_size=size)
+
+
+def read_race(description: str, name: str) -> argparse.Namespace:
+    """The flags of a race, whose presets can have the sizes."""
+    parser = race_flags(description)
+    arguments = read(parser, name)
+    try:
+        for preset, size in itertools.product(arguments.presets, arguments.sizes):
+            at_size(PRESETS[preset], size)
+    except InputError as error:
+        parser.error(str(error))
+    return arguments
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:
@@ -237,9 +257,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
 
 
 def main() -> None:
-    parser = race_flags(__doc__ or "")
-    parser.add_argument("--sizes", nargs="+", default=[None], help="such as 322x322")
-    arguments = parser.parse_args()
+    arguments = read_race(__doc__ or "", "bench_describe")
     compare("bench_describe", "Descriptors of a batch", cases(arguments), arguments)
 
 

@@ -38,7 +38,7 @@ from unittest import mock
 import cv2
 import numpy as np
 from bench_describe import TOLERANCES, Sides, sides, title
-from fragments import Study, Table, bars, flags, leave
+from fragments import Study, Table, bars, count, flags, leave, read
 from racing import PAUSE, Timed, measured, ratio, times
 
 # After racing, which says how many devices there are.
@@ -296,10 +296,10 @@ def row(value: dict[str, Any]) -> tuple[str, ...]:
 def main() -> None:
     parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["tiny", "s14"], choices=PRESETS)
-    parser.add_argument("--images", type=int, default=2000)
-    parser.add_argument("--batch", type=int, default=16)
-    parser.add_argument("--rounds", type=int, default=3)
-    arguments = parser.parse_args()
+    parser.add_argument("--images", type=count, default=2000)
+    parser.add_argument("--batch", type=count, default=16)
+    parser.add_argument("--rounds", type=count, default=3)
+    arguments = read(parser, "bench_extract")
     platform.set_up()
     # The workers that are forked do not use JAX.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called")

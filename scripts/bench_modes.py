@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from fragments import Study, Table, bars, flags, leave
+from fragments import Study, Table, bars, count, flags, leave, read
 from racing import measured, race, ratio, times
 
 # After racing, which says how many devices there are.
@@ -150,16 +150,18 @@ def recall(arguments: argparse.Namespace) -> Study:
 def main() -> None:
     parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["s14", "b14"], choices=PRESETS)
-    parser.add_argument("--batch", type=int, default=8)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--calls", type=int, default=2)
+    parser.add_argument("--batch", type=count, default=8)
+    parser.add_argument("--rounds", type=count, default=5)
+    parser.add_argument("--calls", type=count, default=2)
     parser.add_argument(
         "--weights", type=pathlib.Path, default=pathlib.Path("demo/run/last.safetensors")
     )
     parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("demo/city/test"))
-    arguments = parser.parse_args()
+    arguments = read(parser, "bench_products", "bench_bfloat16", "bench_recall")
     studies = {"bench_products": products, "bench_bfloat16": speed}
     if arguments.weights.exists():
+        if not arguments.data.is_dir():
+            parser.error(f"{arguments.data}: found no folder, expected an evaluation set")
         studies["bench_recall"] = recall
     else:
         print(f"{arguments.weights}: not there, so no recall is compared; scripts/demo.sh makes it")

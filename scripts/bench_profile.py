@@ -19,7 +19,7 @@ from typing import Any
 
 from bench_describe import Contender, by_us, sides, title
 from bench_train import our_step
-from fragments import COLOURS, Study, Table, flags, leave, panels
+from fragments import COLOURS, Study, Table, count, flags, leave, panels, read
 from matplotlib.figure import Figure
 from racing import machine
 
@@ -109,8 +109,8 @@ def stacked(values: list[dict[str, Any]]) -> Figure:
 def main() -> None:
     parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
-    parser.add_argument("--batch", type=int, default=8)
-    arguments = parser.parse_args()
+    parser.add_argument("--batch", type=count, default=8)
+    arguments = read(parser, "bench_profile")
     values, rows = [], []
     for preset in arguments.presets:
         config = recipe(preset)

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
-from fragments import Study, Table, bars, flags, leave
+from fragments import Study, Table, bars, count, flags, leave, read
 from racing import measured, megabytes, race, ratio, times, torch_memory, wait
 
 from crisalad_jax.config import SinkhornConfig
@@ -377,16 +377,16 @@ BENCHES = {"bench_fixed": fixed, "bench_converged": converged}
 def main() -> None:
     parser = flags("Time the transport; see the top.", "docs/sinkhorn")
     parser.add_argument("benches", nargs="*", metavar="BENCH", help=f"of {', '.join(BENCHES)}")
-    parser.add_argument("--images", type=int, default=32)
-    parser.add_argument("--clusters", type=int, default=64)
-    parser.add_argument("--patches", type=int, nargs="+", default=[256, 529])
-    parser.add_argument("--iterations", type=int, nargs="+", default=[3, 20])
+    parser.add_argument("--images", type=count, default=32)
+    parser.add_argument("--clusters", type=count, default=64)
+    parser.add_argument("--patches", type=count, nargs="+", default=[256, 529])
+    parser.add_argument("--iterations", type=count, nargs="+", default=[3, 20])
     parser.add_argument("--errors", type=float, nargs="+", default=[1e-3, 1e-5])
     parser.add_argument("--std", type=float, default=3.0)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--calls", type=int, default=20)
-    parser.add_argument("--batches", type=int, default=8, help="to count failures in")
-    arguments = parser.parse_args()
+    parser.add_argument("--rounds", type=count, default=5)
+    parser.add_argument("--calls", type=count, default=20)
+    parser.add_argument("--batches", type=count, default=8, help="to count failures in")
+    arguments = read(parser, *BENCHES)
     if unknown := set(arguments.benches) - set(BENCHES):
         parser.error(f"found {', '.join(sorted(unknown))}, expected of {', '.join(BENCHES)}")
     for name in arguments.benches or BENCHES:

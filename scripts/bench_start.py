@@ -22,7 +22,7 @@ import cv2
 import jax
 import numpy as np
 import torch
-from fragments import Study, Table, bars, flags, leave
+from fragments import Study, Table, bars, count, flags, leave, read
 from racing import Timed, measured, ratio, times
 
 from crisalad_jax.checkpoint import save_weights
@@ -95,8 +95,8 @@ def programs(folder: pathlib.Path, preset: str) -> dict[str, Callable[[], None]]
 def main() -> None:
     parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--preset", default="b14", choices=PRESETS)
-    parser.add_argument("--rounds", type=int, default=3)
-    arguments = parser.parse_args()
+    parser.add_argument("--rounds", type=count, default=3)
+    arguments = read(parser, "bench_start")
     timed = {name: Timed([]) for name in NAMES}
     with tempfile.TemporaryDirectory(prefix="bench-start-") as folder:
         calls = programs(pathlib.Path(folder), arguments.preset)

@@ -14,6 +14,7 @@ forward's for what passes the gradient on, and three times for what trains too.
 """
 
 import argparse
+import dataclasses
 import itertools
 from collections.abc import Iterator
 from typing import Any
@@ -25,9 +26,10 @@ from bench_describe import (
     Case,
     Contender,
     Sides,
+    at_size,
     by_torch,
     compare,
-    race_flags,
+    read_race,
     seconds,
     sides,
     title,
@@ -135,8 +137,11 @@ def operations(config: TrainConfig, batch: int) -> float:
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:
-    for preset, batch in itertools.product(arguments.presets, arguments.batches):
+    for preset, size, batch in itertools.product(
+        arguments.presets, arguments.sizes, arguments.batches
+    ):
         config = recipe(preset)
+        config = dataclasses.replace(config, model=at_size(config.model, size))
         both = sides(config.model, preset, batch, arguments.dtype)
         check(both, config, LOSS_TOLERANCES[arguments.dtype])
         contenders = [
@@ -151,7 +156,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
 
 
 def main() -> None:
-    arguments = race_flags(__doc__ or "").parse_args()
+    arguments = read_race(__doc__ or "", "bench_train")
     compare("bench_train", "A training step", cases(arguments), arguments)
 
 

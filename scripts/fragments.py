@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, write_json
+from crisalad_jax.files import atomic_path, check_source, check_target, write_json
 
 INK, GREY, PALE = "#222222", "#757575", "#e4e4e4"
 # Okabe and Ito's: told apart by the colour-blind.
@@ -59,14 +59,20 @@ def splice(page: pathlib.Path, name: str, table: Table) -> None:
     Raises:
         InputError: the page has no such comments.
     """
-    text = page.read_text(encoding="utf-8")
+    before, after = around(page, name)
+    with atomic_path(page) as temporary:
+        temporary.write_text(before + markdown(table) + after, encoding="utf-8")
+
+
+def around(page: pathlib.Path, name: str) -> tuple[str, str]:
+    """The page up to the place of a study's table, and from there on; as `splice`."""
+    check_source(page, "a page with a place for the table")
     start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-    before, found, rest = text.partition(start)
+    before, found, rest = page.read_text(encoding="utf-8").partition(start)
     _, closed, after = rest.partition(end)
     if not found or not closed:
         raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
-    with atomic_path(page) as temporary:
-        temporary.write_text(before + start + markdown(table) + end + after, encoding="utf-8")
+    return before + start, end + after
 
 
 def flags(description: str, out: str) -> argparse.ArgumentParser:
@@ -75,6 +81,30 @@ def flags(description: str, out: str) -> argparse.ArgumentParser:
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(out))
     parser.add_argument("--page", type=pathlib.Path, help="also put what is tabled into this page")
     return parser
+
+
+def count(text: str) -> int:
+    """An argument that is a whole number from 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number from 1")
+    return int(text)
+
+
+def read(parser: argparse.ArgumentParser, *names: str) -> argparse.Namespace:
+    """The arguments of `flags`, once it is known that the studies of these names can be left there.
+
+    What is wrong ends the program in one line, before the work whose result would have no place.
+    """
+    arguments = parser.parse_args()
+    try:
+        for name in names:
+            for suffix in (".md", ".json", ".png"):
+                check_target(arguments.out / f"{name}{suffix}")
+            if arguments.page is not None:
+                around(arguments.page, name)
+    except (InputError, OSError) as error:
+        parser.error(str(error))
+    return arguments
 
 
 def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import itertools
+import sys
 from types import ModuleType
 from typing import Any
 
@@ -141,3 +142,27 @@ def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
         "copies": 0.004 + 0.008,
         "numbers one by one, sums": 0.016 + 0.064 + 1.024,
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "words"),
+    [
+        ("bench_describe", "--batches 0", "argument --batches: found '0', expected a whole number"),
+        ("bench_describe", "--sizes 98", "argument --sizes: found '98', expected a size such as"),
+        ("bench_describe", "--sizes 99x99", "image size: found 99 x 99, expected sides that are"),
+        ("bench_train", "--rounds 0", "argument --rounds: found '0'"),
+        ("bench_train", "--page missing.md", "missing.md: found no such file, expected a page"),
+        ("bench_extract", "--images none", "argument --images: found 'none'"),
+        ("bench_profile", "--out pyproject.toml", "expected a folder that can be written to"),
+        ("bench_start", "--page README.md", "README.md: found no <!-- bench_start -->"),
+        ("bench_modes", "--page CONTRIBUTING.md", "found no <!-- bench_products -->"),
+        ("bench_sinkhorn", "--calls -1", "argument --calls: found '-1'"),
+    ],
+)
+def test_what_cannot_be_is_said_before_the_work(scripts, monkeypatch, capsys, name, flags, words):
+    bench = scripts(name)
+    monkeypatch.setattr(sys, "argv", [name, *flags.split()])
+    with pytest.raises(SystemExit) as stop:
+        bench.main()
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err

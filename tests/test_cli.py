@@ -1,6 +1,7 @@
 """The command line: what it writes, and for every bad input one line on stderr and exit code 2."""
 
 import dataclasses
+import errno
 import json
 import pathlib
 import re
@@ -623,6 +624,23 @@ def described(params: Crisalad, paths: list[pathlib.Path]) -> np.ndarray:
         image = resize_image(read_image(path), MODEL.image_size)
         rows.append(describe(params, image[None], MODEL)[0])
     return np.stack(rows)
+
+
+@pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.config.json"])
+def test_extract_knows_at_once_that_one_of_its_files_cannot_be(capfd, tmp_path, shared, name):
+    (tmp_path / name).mkdir()
+    start = extract(shared, shared / "town", tmp_path / "d.npy")
+    fails(capfd, *start, words=(f"{tmp_path / name}: found a folder",))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_what_the_disk_refuses_is_one_line(capfd, tmp_path, shared, monkeypatch):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "d.npy")
+
+    monkeypatch.setattr(np, "save", full)
+    start = extract(shared, shared / "town", tmp_path / "d.npy")
+    fails(capfd, *start, words=("No space left on device: 'd.npy'",))
 
 
 def test_extract_writes_descriptors_names_and_configuration(capfd, tmp_path, shared, params):

@@ -83,21 +83,19 @@ def training_batches(
     seed: int,
     epoch: int,
     start_step: int = 0,
-    part: tuple[int, int] = (0, 1),
     on_bad_image: OnBadImage = "stop",
     threads: int = THREADS,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Batches of one epoch, places_per_batch x images_per_place images each, place after place.
 
-    The same (seed, epoch, step) gives the same bits, whatever the rest of the arguments. Images
+    The same (seed, epoch, step) gives the same bits, whatever `threads` and `start_step`. Images
     are resized to `image_size` (height, width), then augmented. An image that cannot be read stops
     the epoch or, under "skip", leaves a slot that is not valid.
 
     Args:
         places: what to draw from; see `epoch_batches` for the order.
         start_step: the first batch to give, to go on with an epoch that was interrupted.
-        part: (i, n): of every batch only the i-th of n parts, as one of n processes reads it.
         threads: how many decode ahead; 0 decodes in the caller's thread.
         cache: keeps decoded images from epoch to epoch.
 
@@ -116,13 +114,7 @@ def training_batches(
     if not 0 <= start_step <= len(chosen):
         raise InputError(f"start_step: found {start_step}, expected 0 to {len(chosen)}")
     batch_size = places_per_batch * images_per_place
-    number, parts = part
-    if not 0 <= number < parts or batch_size % parts:
-        raise InputError(
-            f"part: found {part} of {batch_size} images, expected one of equal parts, from 0"
-        )
     indices = chosen.reshape(-1)
-    positions = np.arange(indices.size).reshape(len(chosen), parts, -1)[start_step:, number]
     read = _read if cache is None else cache.read
 
     def load(position: int) -> _Image:
@@ -140,11 +132,11 @@ def training_batches(
 
     return _batches(
         load,
-        positions=positions.reshape(-1),
         labels=places.image_place[indices],
         indices=indices,
         image_size=image_size,
-        batch_size=batch_size // parts,
+        batch_size=batch_size,
+        first=start_step * batch_size,
         on_bad_image=on_bad_image,
         threads=threads,
     )
@@ -174,11 +166,11 @@ def image_batches(
     indices = np.arange(len(paths))
     return _batches(
         lambda position: read(paths[position], image_size),
-        positions=indices,
         labels=indices,
         indices=indices,
         image_size=image_size,
         batch_size=batch_size,
+        first=0,
         on_bad_image=on_bad_image,
         threads=threads,
     )
@@ -187,11 +179,11 @@ def image_batches(
 def _batches(
     load: Callable[[int], _Image],
     *,
-    positions: np.ndarray,
     labels: np.ndarray,
     indices: np.ndarray,
     image_size: tuple[int, int],
     batch_size: int,
+    first: int,
     on_bad_image: OnBadImage,
     threads: int,
 ) -> Iterator[ImageBatch]:
@@ -205,29 +197,29 @@ def _batches(
             f"image_size: found {image_size}, expected a height and width of at least 1"
         )
 
-    def load_or_skip(number: int) -> tuple[_Image | None]:
+    def load_or_skip(position: int) -> tuple[_Image | None]:
         # In a tuple, because grain drops an element that is None.
         try:
-            return (load(int(positions[number])),)
+            return (load(position),)
         except InputError:
             if on_bad_image == "stop":
                 raise
             return (None,)
 
     def batches() -> Iterator[ImageBatch]:
-        dataset = grain.MapDataset.range(len(positions)).map(load_or_skip)
+        dataset = grain.MapDataset.range(first, len(indices)).map(load_or_skip)
         # An element is an image, not a batch, so that the threads share the batch in hand.
         options = grain.ReadOptions(
             num_threads=threads, prefetch_buffer_size=BATCHES_AHEAD * batch_size if threads else 0
         )
         stream = iter(dataset.to_iter_dataset(options))
         try:
-            for start in range(0, len(positions), batch_size):
-                here = positions[start : start + batch_size]
+            for start in range(first, len(indices), batch_size):
+                part = slice(start, min(start + batch_size, len(indices)))
                 batch = _empty_batch(batch_size, image_size)
-                filled = len(here)
-                batch.labels[:filled] = labels[here]
-                batch.indices[:filled] = indices[here]
+                filled = part.stop - part.start
+                batch.labels[:filled] = labels[part]
+                batch.indices[:filled] = indices[part]
                 for slot in range(filled):
                     (image,) = next(stream)
                     if image is not None:

@@ -24,6 +24,7 @@ from parity.cases.weights import random_state
 from parity.compare import (
     AFTER,
     EXACT,
+    OTHER_SIGNS,
     OWN_STEP,
     STEP,
     TOLERANCES,
@@ -32,6 +33,7 @@ from parity.compare import (
     as_double,
     compare,
     compare_joined,
+    compare_signs,
     compare_truth,
     relative_error,
 )
@@ -293,8 +295,9 @@ def _check_step(
 
     AdamW's first step is the sign of the gradient, whatever its size. Where a gradient is rounding
     noise, the two sides' own signs have nothing to do with each other: such elements are left out
-    of the row of the steps along own gradients, and counted in its note. That row is of all arrays
-    joined: of the few elements of a small array a single other sign would be a large part.
+    of the row of the steps along own gradients, and counted in its note. In bfloat16 single ones of
+    the others may still have another sign, which of a small array would be a large part: there that
+    row is of all arrays joined, and another counts such signs in each array.
     """
     names = [name for name in their_gradients if name in our_gradients]
     start = {name: model.get_parameter(name).detach().numpy() for name in names}
@@ -341,9 +344,12 @@ def _check_step(
         return {name: state[name] for name in compared}
 
     everywhere = dict.fromkeys(compared, True)
+    steps = ((compare, OWN_STEP),)
+    if precision == "bfloat16":
+        steps = ((compare_joined, OWN_STEP), (compare_signs, OTHER_SIGNS))
     return [
         row(compare, STEP, moved(same, everywhere), moved(theirs, everywhere)),
-        row(compare_joined, OWN_STEP, moved(own, told), moved(theirs, told), note),
+        *(row(check, name, moved(own, told), moved(theirs, told), note) for check, name in steps),
         row(compare, AFTER, there(own), there(theirs)),
     ]
 
