@@ -45,7 +45,7 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     )
 
 
-@functools.partial(platform.jit, static_argnames="config")
+@functools.partial(platform.jit, static_argnames=("config", "micro_batch"))
 def describe(
     params: Crisalad,
     images: Images,
