@@ -550,11 +550,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         chosen = _parse(kind, given, options)
         platform.set_up()
         run(chosen)
-    except InputError as error:
+    except (InputError, OSError) as error:  # the disk's: it is full, or what no check foresaw
         print("crisalad:", *str(error).splitlines(), file=sys.stderr)
-        return 2
-    except OSError as error:  # a disk that is full, or a file that no check could foresee
-        print(f"crisalad: {error}", file=sys.stderr)
         return 2
     except SystemExit:  # from tyro, after --help
         return 0

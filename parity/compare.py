@@ -6,8 +6,9 @@ or, where that is said, the error of all of them together.
 """
 
 import dataclasses
+import functools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -207,8 +208,9 @@ def compare(
     *,
     noise: Mapping[str, str] | None = None,
     note: str = "",
+    error_of: Callable[[np.ndarray, np.ndarray], float] = relative_error,
 ) -> Row:
-    """The row of the worst of several arrays.
+    """The row of the worst of several arrays, by `error_of` (ours, theirs).
 
     `noise` names arrays that are 0 but for rounding, each with an array that tells the size of
     the terms that cancel: the error is then what either side has in place of 0, over that norm.
@@ -217,12 +219,12 @@ def compare(
     noise = noise or {}
     rows = []
     for name in {**theirs, **ours}:
-        if not _on_both(name, ours, theirs):
+        if name not in ours or name not in theirs or ours[name].shape != theirs[name].shape:
             known = theirs if name in theirs else ours
             rows.append((math.inf, math.inf, f"{name} (on one side only)", known[name].shape))
             continue
         mine, other = as_double(ours[name]), as_double(theirs[name])
-        error = relative_error(mine, other)
+        error = error_of(mine, other)
         if name in noise:
             scale = np.linalg.norm(as_double(theirs[noise[name]]))
             # Numpy's maximum: Python's would drop a NaN.
@@ -247,7 +249,17 @@ def compare(
     )
 
 
-@np.errstate(invalid="ignore")
+def other_signs(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """How many elements have another sign; infinite where one is no number."""
+    if not np.isfinite([ours, theirs]).all():
+        return math.inf
+    return float(np.sum(np.sign(ours) != np.sign(theirs)))
+
+
+compare_signs = functools.partial(compare, error_of=other_signs)
+"""The row of the array with the most elements of another sign; its error is their number."""
+
+
 def compare_joined(
     case: str,
     quantity: str,
@@ -262,24 +274,13 @@ def compare_joined(
 
     Where ours lacks one, or has it in another shape, the error is infinite.
     """
-    missing = [name for name in theirs if not _on_both(name, ours, theirs)]
-    if missing:
-        worst = {name: theirs[name] for name in missing}
-        return compare(case, quantity, precision, {}, worst, tolerance, note=note)
-    mine, other = (_join(side[name] for name in theirs) for side in (ours, theirs))
-    return Row(
-        case=case,
-        quantity=quantity,
-        precision=precision,
-        worst="all together",
-        shape=other.shape,
-        max_abs=float(np.abs(mine - other).max(initial=0.0)),
-        relative=relative_error(mine, other),
-        tolerance=tolerance.value,
-        why=tolerance.why,
-        arrays=len(theirs),
-        note=note,
-    )
+    mine, other = {name: ours[name] for name in theirs if name in ours}, theirs
+    if {n: x.shape for n, x in mine.items()} == {n: x.shape for n, x in theirs.items()}:
+        mine, other = (
+            {"all together": _join(side[name] for name in theirs)} for side in (ours, theirs)
+        )
+    row = compare(case, quantity, precision, mine, other, tolerance, note=note)
+    return dataclasses.replace(row, arrays=len(theirs))
 
 
 def compare_truth(
@@ -300,38 +301,6 @@ def compare_truth(
         f"{TRUTH_FACTOR} times torch's own error: as many roundings of the same size",
     )
     return compare_joined(case, quantity, precision, ours, truth, tolerance)
-
-
-def compare_signs(
-    case: str,
-    quantity: str,
-    precision: str,
-    ours: Arrays,
-    theirs: Arrays,
-    tolerance: Tolerance,
-    *,
-    note: str = "",
-) -> Row:
-    """The row of the array with the most elements of another sign; its error is their number."""
-    row = compare_joined(case, quantity, precision, ours, theirs, tolerance, note=note)
-    if not math.isfinite(row.relative):
-        return row
-    counts = {
-        name: float(np.sum(np.sign(as_double(ours[name])) != np.sign(as_double(array))))
-        for name, array in theirs.items()
-    }
-    worst = max(counts, key=lambda name: counts[name])
-    return dataclasses.replace(
-        row,
-        worst=worst,
-        shape=theirs[worst].shape,
-        max_abs=float(np.abs(as_double(ours[worst]) - as_double(theirs[worst])).max(initial=0.0)),
-        relative=counts[worst],
-    )
-
-
-def _on_both(name: str, ours: Arrays, theirs: Arrays) -> bool:
-    return name in ours and name in theirs and ours[name].shape == theirs[name].shape
 
 
 def _join(arrays: Iterable[np.ndarray]) -> np.ndarray:

@@ -205,19 +205,6 @@ def title(preset: str, config: ModelConfig) -> str:
     return f"{preset} at {config.image_size[0]} x {config.image_size[1]}"
 
 
-def race_flags(description: str) -> argparse.ArgumentParser:
-    parser = flags(description, "docs/performance")
-    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
-    parser.add_argument(
-        "--sizes", type=image_size, nargs="+", default=[None], help="such as 322x322"
-    )
-    parser.add_argument("--batches", type=count, nargs="+", default=[8, 16])
-    parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
-    parser.add_argument("--rounds", type=count, default=5)
-    parser.add_argument("--calls", type=count, default=2)
-    return parser
-
-
 def image_size(text: str) -> tuple[int, int]:
     height, _, width = text.partition("x")
     if not (height.isdecimal() and width.isdecimal()):
@@ -231,7 +218,15 @@ def at_size(config: ModelConfig, size: tuple[int, int] | None) -> ModelConfig:
 
 def read_race(description: str, name: str) -> argparse.Namespace:
     """The flags of a race, whose presets can have the sizes."""
-    parser = race_flags(description)
+    parser = flags(description, "docs/performance")
+    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
+    parser.add_argument(
+        "--sizes", type=image_size, nargs="+", default=[None], help="such as 322x322"
+    )
+    parser.add_argument("--batches", type=count, nargs="+", default=[8, 16])
+    parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
+    parser.add_argument("--rounds", type=count, default=5)
+    parser.add_argument("--calls", type=count, default=2)
     arguments = read(parser, name)
     try:
         for preset, size in itertools.product(arguments.presets, arguments.sizes):

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
-from fragments import Study, Table, bars, count, flags, leave, read
+from fragments import Study, Table, bars, check_places, count, flags, leave
 from racing import measured, megabytes, race, ratio, times, torch_memory, wait
 
 from crisalad_jax.config import SinkhornConfig
@@ -386,9 +386,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=count, default=5)
     parser.add_argument("--calls", type=count, default=20)
     parser.add_argument("--batches", type=count, default=8, help="to count failures in")
-    arguments = read(parser, *BENCHES)
+    arguments = parser.parse_args()
     if unknown := set(arguments.benches) - set(BENCHES):
         parser.error(f"found {', '.join(sorted(unknown))}, expected of {', '.join(BENCHES)}")
+    check_places(parser, arguments, arguments.benches or BENCHES)
     for name in arguments.benches or BENCHES:
         leave(name, BENCHES[name](arguments), arguments)
 

@@ -2,7 +2,7 @@
 
 import argparse
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
@@ -44,12 +44,18 @@ def markdown(table: Table) -> str:
     return table.caption + "\n\n" + "\n".join(lines) + "\n"
 
 
+def files_of(name: str, out: pathlib.Path) -> list[pathlib.Path]:
+    """What a study is saved in: its table, its numbers, its picture."""
+    return [out / f"{name}{suffix}" for suffix in (".md", ".json", ".png")]
+
+
 def save(name: str, study: Study, out: pathlib.Path) -> None:
     """Write NAME.md, NAME.json and NAME.png."""
-    with atomic_path(out / f"{name}.md") as temporary:
+    text, numbers, picture = files_of(name, out)
+    with atomic_path(text) as temporary:
         temporary.write_text(markdown(study.table), encoding="utf-8")
-    write_json(out / f"{name}.json", study.values)
-    with atomic_path(out / f"{name}.png") as temporary:
+    write_json(numbers, study.values)
+    with atomic_path(picture) as temporary:
         study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
 
 
@@ -91,20 +97,24 @@ def count(text: str) -> int:
 
 
 def read(parser: argparse.ArgumentParser, *names: str) -> argparse.Namespace:
-    """The arguments of `flags`, once it is known that the studies of these names can be left there.
-
-    What is wrong ends the program in one line, before the work whose result would have no place.
-    """
+    """The arguments of `flags`, once it is known that the studies of these names have a place."""
     arguments = parser.parse_args()
+    check_places(parser, arguments, names)
+    return arguments
+
+
+def check_places(
+    parser: argparse.ArgumentParser, arguments: argparse.Namespace, names: Iterable[str]
+) -> None:
+    """End the program in one line if a study cannot be left where the arguments say, before it."""
     try:
         for name in names:
-            for suffix in (".md", ".json", ".png"):
-                check_target(arguments.out / f"{name}{suffix}")
+            for path in files_of(name, arguments.out):
+                check_target(path)
             if arguments.page is not None:
                 around(arguments.page, name)
     except (InputError, OSError) as error:
         parser.error(str(error))
-    return arguments
 
 
 def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:

@@ -13,7 +13,7 @@ import pathlib
 import statistics
 from typing import Any
 
-from fragments import COLOURS, INK, Study, Table, flags, leave, panels
+from fragments import COLOURS, INK, Study, Table, count, flags, leave, panels, read
 
 from crisalad_jax.config import SinkhornConfig, TrainConfig, recipe
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
@@ -99,8 +99,8 @@ def main() -> None:
     parser.add_argument("--data", type=pathlib.Path, help="also train and test on its sped_*")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--epochs", type=int, default=12)
-    arguments = parser.parse_args()
+    parser.add_argument("--epochs", type=count, default=12)
+    arguments = read(parser, "recall")
     demo = DemoConfig(epochs=arguments.epochs)
     city = SyntheticCityConfig(train_places=demo.train_places, test_places=demo.test_places)
     root = arguments.runs / "city"
