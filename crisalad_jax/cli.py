@@ -93,20 +93,33 @@ class Train:
     """Height and width, multiples of 14; replaces --model.image-size after all other flags."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or skip it (masked out of attention and loss, and counted)."""
+    coordinator: str | None = None
+    """In several processes, of one host or many, which each run this command: HOST:PORT of process
+    0, or auto under Slurm, Open MPI or Kubernetes. Process 0 alone writes into --out."""
+    processes: int | None = None
+    """How many processes there are, with --coordinator HOST:PORT."""
+    process: int | None = None
+    """Which of them this is, from 0."""
     quiet: bool = False
     """No progress bars."""
 
 
 def _train(arguments: Train) -> None:
+    from crisalad_jax import processes
     from crisalad_jax.fit import fit
     from crisalad_jax.metrics import read_metrics
     from crisalad_jax.report import training_curves
 
+    if arguments.coordinator is not None:
+        processes.join(arguments.coordinator, arguments.processes, arguments.process)
+    elif (arguments.processes, arguments.process) != (None, None):
+        raise InputError("--processes, --process: found no --coordinator, expected it beside them")
     config = arguments.settings
     if arguments.image_size is not None:
         model = dataclasses.replace(config.model, image_size=arguments.image_size)
         config = dataclasses.replace(config, model=model)
     initial = _start(arguments, config)
+    _console.quiet = not processes.leads()
     if initial is None and config.trains != "all":
         _console.print(
             "Note: no --weights or --backbone, so the frozen part of the model "
@@ -129,6 +142,8 @@ def _train(arguments: Train) -> None:
         on_bad_image=arguments.on_bad_image,
         quiet=arguments.quiet,
     )
+    if not processes.leads():
+        return
     picture = arguments.out / "curves.png"
     training_curves(picture, read_metrics(arguments.out / "metrics.jsonl"))
     words = f"{result.steps} steps"

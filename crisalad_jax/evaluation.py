@@ -15,7 +15,7 @@ from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, alone, among, relate, tokenise
 from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.platform import on_every_device, over_devices
+from crisalad_jax.platform import devices_for
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.retrieval import Neighbours, recalls, search
 
@@ -73,7 +73,8 @@ def read_tokens(
         on_bad_image=on_bad_image,
         cache=cache,
     )
-    params = on_every_device(params, batch_size)
+    devices = devices_for(batch_size)
+    params = devices.share(params)
     with progress_bar(label, len(paths), "images", quiet=quiet) as bar:
 
         def collect(tokens: Tokens, valid: Bool[np.ndarray, " image"], used: int) -> None:
@@ -82,7 +83,7 @@ def read_tokens(
 
         ahead = None
         for batch in batches:
-            tokens = tokenise(params, over_devices(batch.images), config)
+            tokens = tokenise(params, devices.spread(batch.images), config)
             # While the device is at this one, the one before comes back.
             if ahead is not None:
                 collect(*ahead)

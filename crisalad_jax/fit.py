@@ -1,11 +1,13 @@
 """The training loop: epochs, validation, early stop, and the files of a run (paper section 4.2)."""
 
+import copy
 import dataclasses
+import json
 import math
 import pathlib
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,14 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from crisalad_jax import processes
 from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import TrainConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import (
-    ImageBatch,
     ImageCache,
     OnBadImage,
     image_batches,
+    one_ahead,
     training_batches,
 )
 from crisalad_jax.data.places import Places, epoch_batches
@@ -29,7 +32,7 @@ from crisalad_jax.evaluation import evaluate
 from crisalad_jax.files import write_json
 from crisalad_jax.metrics import MetricsLog
 from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
-from crisalad_jax.platform import on_every_device, on_one_device, over_devices
+from crisalad_jax.platform import Devices, devices_for, on_one_device
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.states import StateStore
@@ -48,6 +51,14 @@ WATCHED_QUERIES = 16
 """So many images show how the transport does, at every validation."""
 SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
+
+
+class _Batch(NamedTuple):
+    """On the devices."""
+
+    images: jax.Array
+    labels: jax.Array
+    valid: jax.Array
 
 
 class FitResult(NamedTuple):
@@ -131,16 +142,17 @@ def fit(
 
 
 def _train(run: "_Run", on_bad_image: OnBadImage, quiet: bool) -> None:
-    bar = progress_bar("training", run.steps, "steps", quiet=quiet, done=run.step)
+    silent = quiet or not processes.leads()
+    bar = progress_bar("training", run.steps, "steps", quiet=silent, done=run.step)
     with put_off_signals() as stop, bar as bar:
         try:
             while not run.is_done():
                 if run.validation_is_due():
                     bar.say(run.validate(stop))
                     run.save()
-                for batch in run.rest_of_epoch(on_bad_image):
+                for batch in processes.together(run.rest_of_epoch(on_bad_image)):
                     bar.advance(1, note=run.take_step(batch))
-                    stop.check()
+                    stop.check(processes.largest)
         except Stopped as stopped:
             run.save()
             where = f"after step {run.step}; the same command goes on"
@@ -171,7 +183,7 @@ class _Run:
         )
         self.config, self.out = config, out
         self._places, self._validation = places, validation
-        self._spread = spreads_images(config.trains)
+        self._devices = _devices(config)
         self.steps = self.steps_per_epoch * config.epochs
         self._cache = ImageCache()
         lengths = self.steps, self.steps_per_epoch
@@ -182,37 +194,48 @@ class _Run:
         params = init_crisalad(init_key, config.model) if initial is None else initial
         state, frozen = init_state(params, config.trains, self._compiled)
         self._frozen: PyTree = jax.device_get(frozen)
-        self._frozen_there = self._share(narrow(self._frozen, config.model))
-        claim_run(out, config)
-        self._store = StateStore(out / "state")
+        self._frozen_there = self._devices.share(narrow(self._frozen, config.model))
         self.record = _Record(
             weights_checksum=_checksum(jax.tree.leaves(params)),
             places_checksum=_checksum(
                 [np.frombuffer("\n".join(places.files).encode(), np.uint8), places.place_start]
             ),
         )
-        self.step = 0
-        saved = self._store.load(state)
-        if saved is not None:
-            for what in ("weights", "places"):
-                if saved.record[f"{what}_checksum"] != getattr(self.record, f"{what}_checksum"):
-                    raise InputError(
-                        f"{out}: the run started from other {what} than are given now; "
-                        "expected the same, or another folder"
-                    )
-            self.step, state, self.record = saved.step, saved.state, _Record(**saved.record)
-            self._drop_old_best()
-        self._saved = None if saved is None else (self.step, saved.record)
+        for what in ("weights", "places"):
+            processes.check_same(what, getattr(self.record, f"{what}_checksum"))
+        settings = json.dumps(to_plain(config)).encode()
+        processes.check_same("configuration", zlib.crc32(settings))
+        self._files: _Files | None = None
+        state = self._open_files(state)
         # A copy of its own on each device: a step takes over the buffers of its state.
-        self.state: TrainState = jax.tree.map(jnp.copy, self._share(state))
-        # A validation that the state does not know of will be repeated.
-        self._log = MetricsLog(out, keep_up_to=self.step, validated=self.record.validated)
+        self.state: TrainState = _copied(self._devices.share(state))
         self._saved_at = self._stepped_at = time.monotonic()
 
-    def _share(self, tree: PyTree) -> PyTree:
-        """On the devices that the images of a batch are spread over."""
-        batch = self.config.places_per_batch * self.config.images_per_place
-        return on_every_device(tree, batch if self._spread else 1)
+    def _open_files(self, state: TrainState) -> TrainState:
+        """Open the run's files, where this process leads; the state that all processes go on from.
+
+        That is the saved one, or `state`.
+        """
+
+        def find() -> tuple[int, dict[str, Any]]:
+            nonlocal state
+            self._files = files = _Files(self.out, self.config)
+            saved = files.states.load(state)
+            step, record = 0, dataclasses.asdict(self.record)
+            if saved is not None:
+                for what in ("weights", "places"):
+                    if saved.record[f"{what}_checksum"] != record[f"{what}_checksum"]:
+                        raise InputError(
+                            f"{self.out}: the run started from other {what} than are given now; "
+                            "expected the same, or another folder"
+                        )
+                step, state, record = saved
+            files.go_on(step, _Record(**record), is_saved=saved is not None)
+            return step, record
+
+        self.step, record = processes.led(find)
+        self.record = _Record(**record)
+        return processes.handed_out(state)
 
     def is_done(self) -> bool:
         """Whether nothing is left, validations included."""
@@ -226,13 +249,16 @@ class _Run:
         new = step == 0 and self.step > self.record.validated
         return self._validation is not None and new and asked
 
-    def rest_of_epoch(self, on_bad_image: OnBadImage) -> Iterator[ImageBatch]:
-        """The batches from the next step on to the end of its epoch; none if training is over."""
+    def rest_of_epoch(self, on_bad_image: OnBadImage) -> Iterator[_Batch]:
+        """The batches from the next step on to the end of its epoch; none if training is over.
+
+        Each is put on the devices while they are at the one before.
+        """
         if self.is_done():
             return iter(())
         config = self.config
         epoch, start_step = divmod(self.step, self.steps_per_epoch)
-        return training_batches(
+        batches = training_batches(
             self._places,
             image_size=config.model.image_size,
             places_per_batch=config.places_per_batch,
@@ -242,8 +268,13 @@ class _Run:
             seed=config.seed,
             epoch=epoch,
             start_step=start_step,
+            part=(jax.process_index(), jax.process_count()),
             on_bad_image=on_bad_image,
             cache=self._cache,
+        )
+        return one_ahead(
+            _Batch(*map(self._devices.spread, (batch.images, batch.labels, batch.valid)))
+            for batch in batches
         )
 
     def params(self) -> Crisalad:
@@ -251,16 +282,15 @@ class _Run:
         frozen = jax.tree.map(jnp.asarray, self._frozen)
         return merge_params(on_one_device(self.state.trainable), frozen)
 
-    def take_step(self, batch: ImageBatch) -> str:
+    def take_step(self, batch: _Batch) -> str:
         """Train on a batch, log it, and say in a few words how it went."""
+        came = time.monotonic()
         if time.monotonic() - self._saved_at > SAVE_SECONDS:
             self.save()
         self.state, device_metrics = train_step(
             self.state,
             self._frozen_there,
-            over_devices(batch.images) if self._spread else batch.images,
-            batch.labels,
-            batch.valid,
+            *batch,
             self._step_key,
             self._compiled,
         )
@@ -279,26 +309,43 @@ class _Run:
                 f"numbers; the state after step {self.step} is kept in {self.out}"
             )
         now = time.monotonic()
-        rate, self._stepped_at = size / (now - self._stepped_at), now
+        seconds, waited = now - self._stepped_at, came - self._stepped_at
+        rate, self._stepped_at = size / seconds, now
         self.record.skipped_images += skipped
         self.step += 1
-        self._log.write(
-            {
-                "step": self.step,
-                "epoch": (self.step - 1) // self.steps_per_epoch + 1,
-                **metrics,
-                "images_per_second": round(rate, 2),
-                "skipped_images": skipped,
-            }
-        )
+        if self._files is not None:
+            self._files.log.write(
+                {
+                    "step": self.step,
+                    "epoch": (self.step - 1) // self.steps_per_epoch + 1,
+                    **metrics,
+                    "images_per_second": round(rate, 2),
+                    "waited_for_images": round(waited / seconds, 4),
+                    "skipped_images": skipped,
+                }
+            )
         note = f"loss {metrics['loss']:.3f}  b_acc {metrics['b_acc']:.2f}  {rate:.0f} images/s"
         if self.record.best:
             note += f"  best R@5 {100 * self.record.best[0][0]:.1f}"
         return note
 
     def validate(self, stop: Stop) -> str:
-        """Log the recalls, keep the best weights, decide on an early stop; the recalls in words."""
+        """Log the recalls, keep the best weights, decide on an early stop; the recalls in words.
+
+        The process that leads does it, and the others wait.
+        """
+
+        def validated() -> tuple[str, dict[str, Any]]:
+            return self._validate(stop), dataclasses.asdict(self.record)
+
+        words, record = processes.led(validated)
+        self.record = _Record(**record)
+        self._stepped_at = time.monotonic()
+        return words
+
+    def _validate(self, stop: Stop) -> str:
         assert self._validation is not None
+        assert self._files is not None
         params, record, benchmark = self.params(), self.record, self._validation
         with stop.at_once():
             (result,) = evaluate(
@@ -313,19 +360,15 @@ class _Run:
         epoch = self.step // self.steps_per_epoch
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
         line = {"step": self.step, "epoch": epoch, **recalls, **watched}
-        self._log.write(line, of=benchmark.name)
+        self._files.log.write(line, of=benchmark.name)
         found, keep = [result.recalls[5], self.step], self.config.keep_best
         # Of equal ones the first is the best.
         record.best = sorted([*record.best, found], key=lambda one: (-one[0], one[1]))[:keep]
         record.without_gain = 0 if record.best[0] == found else record.without_gain + 1
-        paths = [self.out / "best.safetensors"] if record.best[0] == found else []
-        paths += [self._best_path(self.step)] if keep > 1 and found in record.best else []
-        for path in paths:
-            save_weights(path, params, self.config.model)
+        self._files.keep_if_best(self.step, record, params)
         patience = self.config.patience
         record.stopped_early = patience is not None and record.without_gain >= patience
         record.validated = self.step
-        self._stepped_at = time.monotonic()
         words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
         return f"epoch {epoch}, step {self.step}: {words}"
 
@@ -341,30 +384,79 @@ class _Run:
         statistics = watch_transport(params, next(iter(batches)).images, model)
         return {name: float(value) for name, value in statistics._asdict().items()}
 
-    def _best_path(self, step: int) -> pathlib.Path:
-        return self.out / "best" / f"step-{step:08}.safetensors"
-
-    def _drop_old_best(self) -> None:
-        """Remove weights that the record does not count among the best, or not yet."""
-        kept = {self._best_path(step) for _, step in self.record.best}
-        for path in set((self.out / "best").glob("step-*.safetensors")) - kept:
-            self._store.wait()  # or a kill now would leave a state that still counts them
-            path.unlink()
-
     def save(self) -> None:
         """Write the weights and the resumable state, the latter while training goes on."""
-        record = dataclasses.asdict(self.record)
-        if self._saved != (self.step, record):
-            save_weights(self.out / "last.safetensors", self.params(), self.config.model)
-            self._store.save(self.step, self.state, record)
-            self._drop_old_best()
-            self._saved = self.step, record
+        if self._files is not None:
+            self._files.save(self.step, self.record, self.state, self.params)
         self._saved_at = time.monotonic()
 
     def close(self) -> None:
         """Wait for what is being written."""
-        self._store.close()
-        self._log.close()
+        if self._files is not None:
+            self._files.close()
+
+
+class _Files:
+    """What a run leaves in its folder, in the hands of the process that leads."""
+
+    def __init__(self, out: pathlib.Path, config: TrainConfig) -> None:
+        claim_run(out, config)
+        self._out, self._config = out, config
+        self.states = StateStore(out / "state")
+        self._saved: tuple[int, _Record] | None = None
+
+    def go_on(self, step: int, record: _Record, *, is_saved: bool) -> None:
+        """Make the files those of a run at this step, whose state may be among them."""
+        self._saved = (step, record) if is_saved else None
+        self._drop_old_best(record)
+        # A validation that the state does not know of will be repeated.
+        self.log = MetricsLog(self._out, keep_up_to=step, validated=record.validated)
+
+    def keep_if_best(self, step: int, record: _Record, params: Crisalad) -> None:
+        """Write the weights of this step, if the record counts it among the best."""
+        steps = [best_step for _, best_step in record.best]
+        paths = [self._out / "best.safetensors"] if steps[0] == step else []
+        paths += [self._best_path(step)] if self._config.keep_best > 1 and step in steps else []
+        for path in paths:
+            save_weights(path, params, self._config.model)
+
+    def save(
+        self, step: int, record: _Record, state: TrainState, params: Callable[[], Crisalad]
+    ) -> None:
+        """Write weights and state, unless they are there."""
+        record = copy.deepcopy(record)
+        if self._saved != (step, record):
+            save_weights(self._out / "last.safetensors", params(), self._config.model)
+            self.states.save(step, on_one_device(state), dataclasses.asdict(record))
+            self._drop_old_best(record)
+            self._saved = step, record
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        self.states.close()
+        self.log.close()
+
+    def _best_path(self, step: int) -> pathlib.Path:
+        return self._out / "best" / f"step-{step:08}.safetensors"
+
+    def _drop_old_best(self, record: _Record) -> None:
+        """Remove weights that the record does not count among the best, or not yet."""
+        kept = {self._best_path(step) for _, step in record.best}
+        for path in set((self._out / "best").glob("step-*.safetensors")) - kept:
+            self.states.wait()  # or a kill now would leave a state that still counts them
+            path.unlink()
+
+
+@jax.jit
+def _copied(tree: PyTree) -> PyTree:
+    return jax.tree.map(jnp.copy, tree)
+
+
+def _devices(config: TrainConfig) -> Devices:
+    """Those of the images of a step, or where these are not spread one of each process."""
+    spread = spreads_images(config.trains)
+    images = config.places_per_batch * config.images_per_place
+    return devices_for(images if spread else jax.process_count(), processes=True)
 
 
 def claim_run(out: pathlib.Path, config: TrainConfig) -> None:

@@ -6,7 +6,7 @@ import os
 import pathlib
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from crisalad_jax.cores import usable_cores
+from crisalad_jax.errors import InputError
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
@@ -131,8 +132,8 @@ def _numbers(leaves: Sequence[Any]) -> int:
 def set_up() -> None:
     """For a program of its own, before JAX is used: virtual devices and the compile cache.
 
-    The CPU becomes as many devices as it has cores, so that `over_devices` may spread images over
-    them: that is faster than all cores on every product. Compiled programs are kept in
+    The CPU becomes as many devices as it has cores, so that images may be spread over them
+    (`devices_for`): that is faster than all cores on every product. Compiled programs are kept in
     `~/.cache/crisalad-jax` (or under XDG_CACHE_HOME), where that can be written. What the
     environment says of either (JAX_NUM_CPU_DEVICES, XLA_FLAGS, JAX_COMPILATION_CACHE_DIR) holds.
     """
@@ -154,30 +155,54 @@ def set_up() -> None:
     warnings.filterwarnings("ignore", "Error writing .* onednn-fusion")  # see `jit`
 
 
-def _mesh(count: int) -> Mesh:
-    """As many local devices as share `count` images alike."""
-    devices = jax.local_devices()
-    most = max(n for n in range(1, len(devices) + 1) if count % n == 0)
-    return Mesh(np.array(devices[:most]), ("image",))
+class Devices(NamedTuple):
+    """What a batch of images is spread over; see `devices_for`."""
+
+    mesh: Mesh
+
+    def spread(self, rows: np.ndarray) -> jax.Array:
+        """A batch on the devices, each having as many rows of it.
+
+        Of several processes each gives the rows of its own devices, the first process the first.
+        """
+        sharding = NamedSharding(self.mesh, PartitionSpec("image"))
+        return jax.make_array_from_process_local_data(sharding, rows)
+
+    def share(self, tree: _Tree) -> _Tree:
+        """Arrays on all the devices alike; every process gives the same.
+
+        The virtual devices of a CPU share one copy: that of a numpy array must stay as it is.
+        """
+        here = Mesh(np.array(self.mesh.local_devices), ("image",))
+
+        def put(leaf: Any) -> jax.Array:
+            host = np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
+            alike = NamedSharding(here, PartitionSpec())
+            array = jax.device_put(host, alike, may_alias=True)
+            if here == self.mesh:
+                return array
+            everywhere = NamedSharding(self.mesh, PartitionSpec())
+            parts = [shard.data for shard in array.addressable_shards]
+            return jax.make_array_from_single_device_arrays(array.shape, everywhere, parts)
+
+        return jax.tree.map(put, tree)
 
 
-def over_devices(images: np.ndarray) -> jax.Array:
-    """A batch of images on the devices, each having as many (or on one, where it cannot be)."""
-    return jax.device_put(images, NamedSharding(_mesh(len(images)), PartitionSpec("image")))
+def devices_for(count: int, *, processes: bool = False) -> Devices:
+    """As many devices as share `count` images alike: of this process, or of all, each as many.
 
-
-def on_every_device(tree: _Tree, count: int) -> _Tree:
-    """Arrays that programs on batches of `count` images read: on all the devices of such a batch.
-
-    The virtual devices of a CPU share one copy: that of a numpy array must stay as it is.
+    Raises:
+        InputError: the processes cannot share them.
     """
-    sharding = NamedSharding(_mesh(count), PartitionSpec())
-
-    def put(leaf: Any) -> jax.Array:
-        host = np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
-        return jax.device_put(host, sharding, may_alias=True)
-
-    return jax.tree.map(put, tree)
+    groups = [jax.local_devices()]
+    if processes:
+        groups = [jax.local_devices(process_index=i) for i in range(jax.process_count())]
+    if count % len(groups):
+        raise InputError(f"processes: found {len(groups)}, expected a divisor of {count} images")
+    each = count // len(groups)
+    fewest = min(map(len, groups))
+    most = max(n for n in range(1, fewest + 1) if each % n == 0)
+    return Devices(Mesh(np.array([group[:most] for group in groups]).ravel(), ("image",)))
 
 
 def on_one_device(tree: _Tree) -> _Tree:

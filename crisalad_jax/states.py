@@ -31,18 +31,26 @@ class StateStore:
         Raises:
             InputError: the folder cannot be made or read.
         """
+        folder = pathlib.Path(folder).absolute()
+        # Of several processes one alone has a store; orbax would wait for the others.
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=jax.process_index(), active_processes={jax.process_index()}
+        )
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
+            create=False,
             enable_async_checkpointing=True,
             cleanup_tmp_directories=True,
+            multiprocessing_options=alone,
         )
         try:
+            folder.mkdir(parents=True, exist_ok=True)
             self._manager = ocp.CheckpointManager(
-                pathlib.Path(folder).absolute(),
+                folder,
                 options=options,
                 item_handlers={
-                    "state": ocp.StandardCheckpointHandler(),
-                    "record": ocp.JsonCheckpointHandler(),
+                    "state": ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+                    "record": ocp.JsonCheckpointHandler(multiprocessing_options=alone),
                 },
             )
         except OSError as error:

@@ -3,7 +3,7 @@
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 from crisalad_jax.errors import Stopped
@@ -19,10 +19,14 @@ class Stop:
         self._number: int | None = None
         self._at_once = False
 
-    def check(self) -> None:
-        """Raise `Stopped` if a signal has come."""
-        if self._number is not None:
-            raise Stopped(self._number)
+    def check(self, agree: Callable[[int], int] = int) -> None:
+        """Raise `Stopped` if a signal has come.
+
+        `agree` is given its number, or 0, and says whose it is for all: another process's, too.
+        """
+        number = agree(self._number or 0)
+        if number:
+            raise Stopped(number)
 
     @contextlib.contextmanager
     def at_once(self) -> Iterator[None]:

@@ -98,10 +98,9 @@ def by_torch(both: Sides, compiled: bool) -> Contender:
 
 
 def by_us(both: Sides, spread: bool) -> Contender:
-    count = len(both.images) if spread else 1
-    params = platform.on_every_device(both.ours, count)
-    images = platform.over_devices(both.images) if spread else jax.device_put(both.images)
-    devices = len(images.sharding.device_set)
+    devices = platform.devices_for(len(both.images) if spread else 1)
+    params, images = devices.share(both.ours), devices.spread(both.images)
+    count = devices.mesh.size
 
     def call() -> jax.Array:
         return jax.block_until_ready(describe(params, images, both.config))
@@ -111,9 +110,9 @@ def by_us(both: Sides, spread: bool) -> Contender:
 
     def memory() -> int:
         analysis = compiled().memory_analysis()
-        return devices * (analysis.temp_size_in_bytes + analysis.output_size_in_bytes)
+        return count * (analysis.temp_size_in_bytes + analysis.output_size_in_bytes)
 
-    return Contender(OURS[spread], call, memory, lambda: compiled().as_text(), devices)
+    return Contender(OURS[spread], call, memory, lambda: compiled().as_text(), count)
 
 
 def seconds(call: Callable[[], Any]) -> float:

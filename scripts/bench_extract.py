@@ -64,12 +64,12 @@ AGAINST = {TORCH: TORCH, "ours": TORCH, LOADER: LOADER, "our loader alone": LOAD
 _T = TypeVar("_T")
 
 
-def photograph(number: int) -> bytes:
-    """A JPEG of the city as a camera would leave it."""
+def photograph(number: int, size: tuple[int, int] = SIZE) -> bytes:
+    """A JPEG of the city as a camera would leave it, at (height, width)."""
     view = synthetic.View(
         season=synthetic.SEASONS[number % 4], occluders=number, noise=5.0, seed=number
     )
-    picture = synthetic.render(number, view, SIZE)
+    picture = synthetic.render(number, view, size)
     quality = (cv2.IMWRITE_JPEG_QUALITY, 92)
     return cv2.imencode(".jpg", picture[..., ::-1], quality)[1].tobytes()
 

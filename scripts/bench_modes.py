@@ -82,8 +82,8 @@ def in_type(config: ModelConfig, dtype: str) -> ModelConfig:
 
 
 def described(params: Crisalad, config: ModelConfig, images: np.ndarray) -> Callable[[], Any]:
-    everywhere = platform.on_every_device(params, len(images))
-    spread = platform.over_devices(images)
+    devices = platform.devices_for(len(images))
+    everywhere, spread = devices.share(params), devices.spread(images)
     return lambda: jax.block_until_ready(describe(everywhere, spread, config))
 
 

@@ -87,12 +87,11 @@ def torch_step(both: Sides, config: TrainConfig, compiled: bool) -> Contender:
 
 def our_step(both: Sides, config: TrainConfig, spread: bool) -> Contender:
     step = StepConfig(both.config, config.loss, config.optimiser, STEPS)
-    count = len(both.images) if spread else 1
-    state, frozen = platform.on_every_device(init_state(both.ours, config.trains, step), count)
-    size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+    devices = platform.devices_for(len(both.images) if spread else 1)
+    state, frozen = devices.share(init_state(both.ours, config.trains, step))
+    count, size = devices.mesh.size, sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     state = jax.tree.map(jnp.copy, state)
-    images = platform.over_devices(both.images) if spread else jax.device_put(both.images)
-    devices = len(images.sharding.device_set)
+    images = devices.spread(both.images)
     rest = (frozen, images, labels(both), np.ones(len(both.images), bool), jax.random.key(0))
 
     def call() -> float:
@@ -104,9 +103,9 @@ def our_step(both: Sides, config: TrainConfig, spread: bool) -> Contender:
         return train_step.lower(state, *rest, step).compile()  # pyright: ignore
 
     def memory() -> int:
-        return devices * compiled().memory_analysis().temp_size_in_bytes + (devices - 1) * size
+        return count * compiled().memory_analysis().temp_size_in_bytes + (count - 1) * size
 
-    return Contender(OURS[spread], call, memory, lambda: compiled().as_text(), devices)
+    return Contender(OURS[spread], call, memory, lambda: compiled().as_text(), count)
 
 
 def check(both: Sides, config: TrainConfig, tolerance: float) -> None:

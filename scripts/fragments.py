@@ -29,7 +29,7 @@ class Study(NamedTuple):
     table: Table
     values: Any
     """The same unrounded, for JSON."""
-    figure: Figure
+    figure: Figure | None = None
 
 
 def number(value: float) -> str:
@@ -45,18 +45,19 @@ def markdown(table: Table) -> str:
 
 
 def files_of(name: str, out: pathlib.Path) -> list[pathlib.Path]:
-    """What a study is saved in: its table, its numbers, its picture."""
+    """What a study is saved in: its table, its numbers, its picture if it has one."""
     return [out / f"{name}{suffix}" for suffix in (".md", ".json", ".png")]
 
 
 def save(name: str, study: Study, out: pathlib.Path) -> None:
-    """Write NAME.md, NAME.json and NAME.png."""
+    """Write NAME.md, NAME.json and, with a figure, NAME.png."""
     text, numbers, picture = files_of(name, out)
     with atomic_path(text) as temporary:
         temporary.write_text(markdown(study.table), encoding="utf-8")
     write_json(numbers, study.values)
-    with atomic_path(picture) as temporary:
-        study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
+    if study.figure is not None:
+        with atomic_path(picture) as temporary:
+            study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
 
 
 def splice(page: pathlib.Path, name: str, table: Table) -> None:

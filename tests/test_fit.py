@@ -42,9 +42,10 @@ def places(shared: pathlib.Path) -> Places:
 
 
 def metrics_of(out: pathlib.Path) -> list[dict]:
-    """All that a run logs, except for its speed."""
+    """All that a run logs, except for its times."""
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-    return [{k: v for k, v in line.items() if k != "images_per_second"} for line in lines]
+    times = "images_per_second", "waited_for_images"
+    return [{k: v for k, v in line.items() if k not in times} for line in lines]
 
 
 def assert_same_params(found: Crisalad, expected: Crisalad) -> None:

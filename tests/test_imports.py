@@ -14,7 +14,7 @@ SOURCE = pathlib.Path(__file__).parents[1] / PACKAGE
 # A module imports from layers above its own line only; a package, from itself as well.
 LAYERS = (
     ("errors", "cores"),
-    ("config", "pytree", "files", "progress", "platform"),
+    ("config", "pytree", "files", "progress", "platform", "processes"),
     ("sinkhorn", "losses", "serial", "data", "metrics", "stops"),
     ("nn",),
     ("model",),

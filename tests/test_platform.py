@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax import platform
-from crisalad_jax.metrics import read_metrics
 
 
 def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment: str) -> str:
@@ -155,8 +154,8 @@ count = len(jax.local_devices())
 params = random_params(MODEL)
 images = np.random.default_rng(0).integers(0, 256, (6, *MODEL.image_size, 3), dtype=np.uint8)
 expected = tokenise(params, jnp.asarray(images), MODEL)
-spread = platform.over_devices(images)
-everywhere = platform.on_every_device(params, 6)
+devices = platform.devices_for(6)
+spread, everywhere = devices.spread(images), devices.share(params)
 found = tokenise(everywhere, spread, MODEL)
 # Unit vectors of 8 numbers, rounded at 1e-7 some hundred times on the way.
 for ours, theirs in zip(found, expected):
@@ -175,54 +174,6 @@ def test_images_are_spread_and_parameters_shared(
     path = os.pathsep.join([str(pathlib.Path(__file__).parent), os.getcwd()])
     told = {"JAX_NUM_CPU_DEVICES": str(devices), "PYTHONPATH": path}
     assert in_a_program(SPREAD, tmp_path, **told) == f"{devices} {used} {used} 1\n"
-
-
-TRAIN = """
-import dataclasses, pathlib, sys, jax
-from crisalad_jax import platform
-platform.set_up()
-from conftest import MODEL, RECIPE, random_params
-from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.places import read_places
-from crisalad_jax import fit as module
-shared, out = map(pathlib.Path, sys.argv[1:3])
-recipe = dataclasses.replace(RECIPE, patience=None, trains=sys.argv[3])
-used, step = set(), module.train_step
-def train_step(state, frozen, images, *rest):
-    used.update(len(x.sharding.device_set) for x in (state.step, jax.numpy.asarray(images)))
-    return step(state, frozen, images, *rest)
-module.train_step = train_step
-places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
-trained = module.fit(recipe, places, out, validation=town, initial=random_params(MODEL), quiet=True)
-print(*used, len(trained.params.backbone.blocks.ls1.sharding.device_set))
-"""
-
-
-def train_in_a_program(devices: int, trains: str, shared: pathlib.Path, out: pathlib.Path) -> str:
-    path = os.pathsep.join([str(pathlib.Path(__file__).parent), os.getcwd()])
-    told = {"JAX_NUM_CPU_DEVICES": str(devices), "PYTHONPATH": path}
-    return in_a_program(TRAIN, out.parent, str(shared), str(out), trains, **told)
-
-
-def test_a_run_on_three_devices_is_that_on_one(
-    shared: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    """And what it comes back with is on one."""
-    runs = [tmp_path / "one", tmp_path / "three"]
-    assert train_in_a_program(1, "adapters+head", shared, runs[0]) == "1 1\n"
-    assert train_in_a_program(3, "adapters+head", shared, runs[1]) == "3 1\n"
-    expected, found = (read_metrics(run / "metrics.jsonl") for run in runs)
-    assert len(found) == len(expected)
-    for ours, theirs in zip(found, expected, strict=True):
-        assert ours.keys() == theirs.keys()
-        for name in ours.keys() & {"loss", "b_acc", "gradient_norm", "R@1", "R@5"}:
-            # Sums in another order, 1e-7 each, and six steps of Adam, whose first ones divide a
-            # gradient by itself.
-            assert ours[name] == pytest.approx(theirs[name], rel=1e-4), (name, ours["step"])
-
-
-def test_where_all_trains_one_device_does(shared: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    assert train_in_a_program(3, "all", shared, tmp_path / "run") == "1 1\n"
 
 
 SET_UP = """

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int64, UInt8
 
 from crisalad_jax.config import AugmentConfig, LightAugmentConfig, RandAugmentConfig
 
@@ -20,7 +20,8 @@ MAGNITUDE_BINS = 31
 
 # ITU-R BT.601 luma; Pillow's convert("L") has it in 16-bit fixed point.
 _LUMA = np.array([0.299, 0.587, 0.114])
-_PILLOW_LUMA = np.array([19595, 38470, 7471], np.uint32)
+# The last column rounds. All sums of these are multiples of 2**-16 below 2**8: exact in float32.
+_PILLOW_LUMA = np.array([[19595, 38470, 7471, 0x8000]]) / 2**16
 _LEVELS = np.arange(256)
 
 
@@ -113,12 +114,12 @@ def _affine(image: Image, a: float, b: float, c: float, d: float, e: float, f: f
         image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
     x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    warped[_outside(a * x + b * y + c, width) | _outside(d * x + e * y + f, height)] = 0
-    return warped
+    inside = _inside(a * x + (b * y + c), width) & _inside(d * x + (e * y + f), height)
+    return cv2.copyTo(warped, inside.astype(np.uint8))  # leaves 0 where it does not copy
 
 
-def _outside(position: np.ndarray, side: int) -> Bool[np.ndarray, "..."]:
-    return (position < 0) | (position >= side)
+def _inside(position: np.ndarray, side: int) -> Bool[np.ndarray, "..."]:
+    return (position >= 0) & (position < side)
 
 
 def _shear_x(image: Image, slope: float) -> Image:
@@ -130,11 +131,21 @@ def _shear_y(image: Image, slope: float) -> Image:
 
 
 def _translate_x(image: Image, pixels: float) -> Image:
-    return _affine(image, 1.0, 0.0, -float(int(pixels)), 0.0, 1.0, 0.0)
+    moved, by = np.zeros_like(image), int(pixels)
+    if by < 0:
+        moved[:, :by] = image[:, -by:]
+    else:
+        moved[:, by:] = image[:, : image.shape[1] - by]
+    return moved
 
 
 def _translate_y(image: Image, pixels: float) -> Image:
-    return _affine(image, 1.0, 0.0, 0.0, 0.0, 1.0, -float(int(pixels)))
+    moved, by = np.zeros_like(image), int(pixels)
+    if by < 0:
+        moved[:by] = image[-by:]
+    else:
+        moved[by:] = image[: len(image) - by]
+    return moved
 
 
 def _rotate(image: Image, degrees: float) -> Image:
@@ -151,7 +162,7 @@ def _brightness(image: Image, change: float) -> Image:
 
 
 def _color(image: Image, change: float) -> Image:
-    return _blend(_grey(image)[..., None], image, 1 + change)
+    return _blend(cv2.cvtColor(_grey(image), cv2.COLOR_GRAY2RGB), image, 1 + change)
 
 
 def _contrast(image: Image, change: float) -> Image:
@@ -189,13 +200,13 @@ def _autocontrast(image: Image, _: float) -> Image:
 
 
 def _equalize(image: Image, _: float) -> Image:
-    tables = [_equalizing_table(image[..., channel]) for channel in range(3)]
+    levels = [cv2.calcHist([image], [channel], None, [256], [0, 256]) for channel in range(3)]
+    tables = [_equalizing_table(counts.ravel().astype(np.int64)) for counts in levels]
     return cv2.LUT(image, np.stack(tables, axis=-1)[None])
 
 
-def _equalizing_table(channel: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "256"]:
-    counts = np.bincount(channel.ravel(), minlength=256)
-    step = (channel.size - counts[counts > 0][-1]) // 255
+def _equalizing_table(counts: Int64[np.ndarray, "256"]) -> UInt8[np.ndarray, "256"]:
+    step = (counts.sum() - counts[counts > 0][-1]) // 255
     if step == 0:
         return _LEVELS.astype(np.uint8)
     below = np.cumsum(counts) - counts
@@ -203,16 +214,17 @@ def _equalizing_table(channel: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "2
 
 
 def _grey(image: Image) -> UInt8[np.ndarray, "h w"]:
-    return ((image @ _PILLOW_LUMA + 0x8000) >> 16).astype(np.uint8)
+    return cv2.transform(image.astype(np.float32), _PILLOW_LUMA).astype(np.uint8)
 
 
 def _blend(
     start: np.ndarray | np.uint8, end: np.ndarray, factor: float
 ) -> UInt8[np.ndarray, "..."]:
     """From `start` at factor 0 to `end` at 1 and beyond, in float32 and cut off, as Pillow does."""
-    origin = np.float32(start)
-    blended = origin + np.float32(factor) * (end.astype(np.float32) - origin)
-    return np.clip(blended, 0, 255).astype(np.uint8)
+    blended = np.subtract(end, start, dtype=np.float32)
+    blended *= np.float32(factor)
+    blended += start
+    return np.clip(blended, 0, 255, out=blended).astype(np.uint8)
 
 
 class Operation(NamedTuple):

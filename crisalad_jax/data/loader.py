@@ -2,8 +2,9 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, NamedTuple, TypeVar
 
 import cv2
 import grain
@@ -23,6 +24,7 @@ THREADS = min(usable_cores(), 16)
 """OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
 
 _Image = UInt8[np.ndarray, "h w 3"]
+_Item = TypeVar("_Item")
 
 
 class ImageBatch(NamedTuple):
@@ -83,19 +85,22 @@ def training_batches(
     seed: int,
     epoch: int,
     start_step: int = 0,
+    part: tuple[int, int] = (0, 1),
     on_bad_image: OnBadImage = "stop",
     threads: int = THREADS,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Batches of one epoch, places_per_batch x images_per_place images each, place after place.
 
-    The same (seed, epoch, step) gives the same bits, whatever `threads` and `start_step`. Images
+    The same (seed, epoch, step) gives the same bits, whatever `threads`, `start_step` and `part`.
+    Images
     are resized to `image_size` (height, width), then augmented. An image that cannot be read stops
     the epoch or, under "skip", leaves a slot that is not valid.
 
     Args:
         places: what to draw from; see `epoch_batches` for the order.
         start_step: the first batch to give, to go on with an epoch that was interrupted.
+        part: (i, n) gives the i-th of n equal parts of every batch, for the i-th of n processes.
         threads: how many decode ahead; 0 decodes in the caller's thread.
         cache: keeps decoded images from epoch to epoch.
 
@@ -114,7 +119,11 @@ def training_batches(
     if not 0 <= start_step <= len(chosen):
         raise InputError(f"start_step: found {start_step}, expected 0 to {len(chosen)}")
     batch_size = places_per_batch * images_per_place
+    number, parts = part
+    if not 0 <= number < parts or batch_size % parts:
+        raise InputError(f"part: found {part}, expected the i-th of n, which divides {batch_size}")
     indices = chosen.reshape(-1)
+    slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
     read = _read if cache is None else cache.read
 
     def load(position: int) -> _Image:
@@ -134,9 +143,9 @@ def training_batches(
         load,
         labels=places.image_place[indices],
         indices=indices,
+        positions=slots[start_step:, number].reshape(-1),
         image_size=image_size,
-        batch_size=batch_size,
-        first=start_step * batch_size,
+        batch_size=batch_size // parts,
         on_bad_image=on_bad_image,
         threads=threads,
     )
@@ -168,12 +177,22 @@ def image_batches(
         lambda position: read(paths[position], image_size),
         labels=indices,
         indices=indices,
+        positions=indices,
         image_size=image_size,
         batch_size=batch_size,
-        first=0,
         on_bad_image=on_bad_image,
         threads=threads,
     )
+
+
+def one_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
+    """The same items, each made in a thread while the one before it is in use."""
+    stream = iter(items)
+    with ThreadPoolExecutor(1) as thread:
+        ahead = thread.submit(next, stream, None)
+        while (item := ahead.result()) is not None:
+            ahead = thread.submit(next, stream, None)
+            yield item
 
 
 def _batches(
@@ -181,13 +200,16 @@ def _batches(
     *,
     labels: np.ndarray,
     indices: np.ndarray,
+    positions: np.ndarray,
     image_size: tuple[int, int],
     batch_size: int,
-    first: int,
     on_bad_image: OnBadImage,
     threads: int,
 ) -> Iterator[ImageBatch]:
-    """Check the arguments now, rather than when the first batch is asked for; then iterate."""
+    """Check the arguments now, rather than when the first batch is asked for; then iterate.
+
+    Each batch holds what `load` makes of the next `batch_size` of `positions`.
+    """
     if on_bad_image not in ("skip", "stop"):
         raise InputError(f"on_bad_image: found {on_bad_image!r}, expected one of skip, stop")
     if threads < 0:
@@ -197,30 +219,29 @@ def _batches(
             f"image_size: found {image_size}, expected a height and width of at least 1"
         )
 
-    def load_or_skip(position: int) -> tuple[_Image | None]:
+    def load_or_skip(number: int) -> tuple[_Image | None]:
         # In a tuple, because grain drops an element that is None.
         try:
-            return (load(position),)
+            return (load(int(positions[number])),)
         except InputError:
             if on_bad_image == "stop":
                 raise
             return (None,)
 
     def batches() -> Iterator[ImageBatch]:
-        dataset = grain.MapDataset.range(first, len(indices)).map(load_or_skip)
+        dataset = grain.MapDataset.range(len(positions)).map(load_or_skip)
         # An element is an image, not a batch, so that the threads share the batch in hand.
         options = grain.ReadOptions(
             num_threads=threads, prefetch_buffer_size=BATCHES_AHEAD * batch_size if threads else 0
         )
         stream = iter(dataset.to_iter_dataset(options))
         try:
-            for start in range(first, len(indices), batch_size):
-                part = slice(start, min(start + batch_size, len(indices)))
+            for start in range(0, len(positions), batch_size):
+                part = positions[start : start + batch_size]
                 batch = _empty_batch(batch_size, image_size)
-                filled = part.stop - part.start
-                batch.labels[:filled] = labels[part]
-                batch.indices[:filled] = indices[part]
-                for slot in range(filled):
+                batch.labels[: len(part)] = labels[part]
+                batch.indices[: len(part)] = indices[part]
+                for slot in range(len(part)):
                     (image,) = next(stream)
                     if image is not None:
                         batch.images[slot] = image

@@ -3,11 +3,13 @@
 import cv2
 import numpy as np
 import pytest
-from PIL import Image, ImageEnhance, ImageOps
+from PIL import Image
 
 from crisalad_jax.config import LightAugmentConfig, RandAugmentConfig
 from crisalad_jax.data import augment as module
 from crisalad_jax.data.augment import OPERATIONS, augment, light_augment, rand_augment
+from parity.reference.augment import OPERATIONS as PILLOWS
+from parity.reference.augment import strengths as torchvisions
 
 
 def picture(height=224, width=224, seed=0):
@@ -19,34 +21,8 @@ def picture(height=224, width=224, seed=0):
     return np.clip(smooth + noise, 5, 235).astype(np.uint8)
 
 
-def shear(image, x, y):
-    matrix = (1, x, 0, y, 1, 0)
-    return image.transform(image.size, Image.Transform.AFFINE, matrix, Image.Resampling.BILINEAR)
-
-
-def translate(image, x, y):
-    matrix = (1, 0, -x, 0, 1, -y)
-    return image.transform(image.size, Image.Transform.AFFINE, matrix, Image.Resampling.BILINEAR)
-
-
-GEOMETRIC = {
-    "ShearX": lambda image, s: shear(image, s, 0),
-    "ShearY": lambda image, s: shear(image, 0, s),
-    "TranslateX": lambda image, s: translate(image, int(s), 0),
-    "TranslateY": lambda image, s: translate(image, 0, int(s)),
-    "Rotate": lambda image, s: image.rotate(s, Image.Resampling.BILINEAR),
-}
-PHOTOMETRIC = {
-    "Identity": lambda image, s: image,
-    "Brightness": lambda image, s: ImageEnhance.Brightness(image).enhance(1 + s),
-    "Color": lambda image, s: ImageEnhance.Color(image).enhance(1 + s),
-    "Contrast": lambda image, s: ImageEnhance.Contrast(image).enhance(1 + s),
-    "Sharpness": lambda image, s: ImageEnhance.Sharpness(image).enhance(1 + s),
-    "Posterize": lambda image, s: ImageOps.posterize(image, int(s)),
-    "Solarize": lambda image, s: ImageOps.solarize(image, s),
-    "AutoContrast": lambda image, s: ImageOps.autocontrast(image),
-    "Equalize": lambda image, s: ImageOps.equalize(image),
-}
+GEOMETRIC = ("ShearX", "ShearY", "TranslateX", "TranslateY", "Rotate")
+PHOTOMETRIC = tuple(name for name in PILLOWS if name not in GEOMETRIC)
 
 
 def strengths(name, shape):
@@ -58,7 +34,7 @@ def strengths(name, shape):
 
 
 def test_the_operations_are_torchvisions_fourteen():
-    assert set(OPERATIONS) == set(GEOMETRIC) | set(PHOTOMETRIC)
+    assert list(OPERATIONS) == list(PILLOWS)
     assert len(OPERATIONS) == 14
 
 
@@ -89,6 +65,11 @@ def test_strengths_at_every_magnitude():
         found = [OPERATIONS[name].strength(m / 30, 100, 200) for m in bins]
         # Only the order of float64 operations differs.
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    for magnitude in bins:
+        for name, (expected, signed) in torchvisions(int(magnitude), 200, 100).items():
+            found = OPERATIONS[name]
+            assert found.strength(magnitude / 30, 100, 200) == pytest.approx(expected)
+            assert found.signed == signed
 
 
 @pytest.mark.parametrize("shape", [(224, 224), (70, 126), (2, 3), (1, 1)])
@@ -96,7 +77,7 @@ def test_strengths_at_every_magnitude():
 def test_photometric_operations_are_pillows_bit_for_bit(name, shape):
     image = picture(*shape)
     for strength in strengths(name, shape):
-        expected = PHOTOMETRIC[name](Image.fromarray(image), strength)
+        expected = PILLOWS[name](Image.fromarray(image), strength)
         np.testing.assert_array_equal(OPERATIONS[name].apply(image, strength), expected)
 
 
@@ -106,7 +87,7 @@ def test_photometric_operations_on_one_level_and_on_full_range(name, level):
     image = np.full((20, 30, 3), level, np.uint8)
     image[:, :, 1] = np.random.default_rng(1).integers(0, 256, (20, 30))
     for strength in strengths(name, (20, 30)):
-        expected = PHOTOMETRIC[name](Image.fromarray(image), strength)
+        expected = PILLOWS[name](Image.fromarray(image), strength)
         np.testing.assert_array_equal(OPERATIONS[name].apply(image, strength), expected)
 
 
@@ -116,7 +97,7 @@ def test_geometric_operations_are_pillows(name, shape):
     image = picture(*shape)
     for strength in strengths(name, shape):
         warped = OPERATIONS[name].apply(image, strength)
-        expected = np.asarray(GEOMETRIC[name](Image.fromarray(image), strength))
+        expected = np.asarray(PILLOWS[name](Image.fromarray(image), strength))
         # Pillow cuts off fractions where OpenCV rounds: at most a level, half of one on average.
         # A point within rounding of the rim may be black in one only: at most 4 pixels allowed.
         difference = np.abs(warped.astype(int) - expected).max(axis=-1)

@@ -1,0 +1,197 @@
+"""Training batches from JPEG files, beside torch's DataLoader with Pillow; no model.
+
+    python scripts/bench_loader.py [--out docs/performance] [--page docs/performance.md]
+        [--images 1600] [--batch 192] [--rounds 5]
+
+Both read the same files in the same order, as batches of 224 x 224, each image augmented by
+RandAugment (3 operations at 15 of 31). Ours is what training does (`training_batches`: OpenCV and
+threads); the batches are of 8-bit pixels, which the compiled step normalises. The other side is
+how the public VPR code does it: a Dataset whose transforms are Pillow's decoding, Resize,
+RandAugment, ToTensor, Normalize, and a DataLoader with a worker for each core. (RandAugment is the
+reference of the tests: torchvision's operations on Pillow images.)
+
+The photographs are drawn (the synthetic city, sensor noise, JPEG of quality 92) at three sizes:
+GSV-Cities' 400 x 300, MSLS' 640 x 480, and a telephone's 1600 x 1200; some distinct ones, again and
+again. They have just been written, so no disk is measured. The contenders take turns, an epoch
+each; the start of workers, by forking, is part of it. Processor time is that of all threads and
+workers, for each image: the speed "per core" of a loader that keeps all cores busy.
+"""
+
+import argparse
+import os
+import pathlib
+import random
+import statistics
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from bench_extract import photograph
+from fragments import Study, Table, bars, count, flags, leave, read
+from PIL import Image
+from racing import PAUSE, Timed, measured, ratio, times
+
+# After racing, which says how many devices there are.
+import torch  # isort: skip
+
+from crisalad_jax.config import RandAugmentConfig
+from crisalad_jax.cores import usable_cores
+from crisalad_jax.data.loader import training_batches
+from crisalad_jax.data.places import COLUMNS, Places, epoch_batches, read_places
+from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN
+from parity.reference.augment import rand_augment
+
+SIZES = ((300, 400), (480, 640), (1200, 1600))
+DISTINCT = 40
+IMAGES_PER_PLACE = 4
+INPUT = (224, 224)
+AUGMENT = RandAugmentConfig()
+TORCH, OURS = "DataLoader, Pillow", "ours"
+
+
+def write_tree(root: pathlib.Path, images: int, size: tuple[int, int]) -> None:
+    """One city in the layout of GSV-Cities."""
+    photographs = [photograph(number, size) for number in range(DISTINCT)]
+    folder, rows = root / "Images" / "City", []
+    folder.mkdir(parents=True)
+    for number in range(images):
+        place, view = divmod(number, IMAGES_PER_PLACE)
+        rows.append(f"{place},2020,1,{view},City,1.5,2.5,pano")
+        name = f"City_{place:07d}_2020_01_{view:03d}_1.5_2.5_pano.jpg"
+        (folder / name).write_bytes(photographs[number % DISTINCT])
+    (root / "Dataframes").mkdir()
+    lines = [",".join(COLUMNS), *rows, ""]
+    (root / "Dataframes" / "City.csv").write_text("\n".join(lines), encoding="utf-8")
+
+
+class Photographs(torch.utils.data.Dataset[tuple[torch.Tensor, int]]):
+    """(3, height, width) and the place."""
+
+    def __init__(self, places: Places) -> None:
+        self.places = places
+        self.mean, self.deviation = (
+            torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_DEVIATION)
+        )
+
+    def __len__(self) -> int:
+        return len(self.places.files)
+
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, int]:
+        image = Image.open(self.places.path(index)).convert("RGB")
+        image = image.resize(INPUT[::-1], Image.Resampling.BILINEAR)
+        generator = random.Random(index)
+        image = rand_augment(image, AUGMENT.operations, AUGMENT.magnitude, generator)
+        # As torchvision's ToTensor.
+        pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous()
+        values = pixels.to(torch.float32).div(255)
+        return (values - self.mean) / self.deviation, int(self.places.image_place[index])
+
+
+def epoch_of(places: Places, batch: int) -> dict[str, Any]:
+    return {
+        "places_per_batch": batch // IMAGES_PER_PLACE,
+        "images_per_place": IMAGES_PER_PLACE,
+        "order": "within-city",
+        "seed": 0,
+        "epoch": 0,
+    }
+
+
+def by_torch(places: Places, batch: int) -> Callable[[], int]:
+    def load() -> int:
+        chosen = epoch_batches(places, **epoch_of(places, batch))
+        loader = torch.utils.data.DataLoader(
+            Photographs(places),
+            batch_sampler=chosen.reshape(len(chosen), -1).tolist(),
+            num_workers=usable_cores(),
+            multiprocessing_context="fork",
+        )
+        return sum(len(images) for images, _ in loader)
+
+    return load
+
+
+def by_us(places: Places, batch: int) -> Callable[[], int]:
+    def load() -> int:
+        batches = training_batches(
+            places, image_size=INPUT, augment=AUGMENT, **epoch_of(places, batch)
+        )
+        return sum(int(one.valid.sum()) for one in batches)
+
+    return load
+
+
+def compare(size: tuple[int, int], arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    with tempfile.TemporaryDirectory(prefix="loader-") as temporary:
+        root = pathlib.Path(temporary)
+        write_tree(root, arguments.images, size)
+        places = read_places(root)
+        contenders = {
+            TORCH: by_torch(places, arguments.batch),
+            OURS: by_us(places, arguments.batch),
+        }
+        taken = {name: ([], []) for name in contenders}
+        for _ in range(arguments.rounds):
+            for name, load in contenders.items():
+                time.sleep(PAUSE)
+                used, started = sum(os.times()[:4]), time.perf_counter()
+                images = load()
+                taken[name][0].append(1e3 * (time.perf_counter() - started) / images)
+                taken[name][1].append(1e3 * (sum(os.times()[:4]) - used) / images)
+    wall, busy = ({name: Timed(found[i]) for name, found in taken.items()} for i in (0, 1))
+    return [
+        {
+            "size": f"{size[1]} x {size[0]}",
+            "contender": name,
+            "ms": wall[name].rounds,
+            "processor ms": busy[name].rounds,
+            "faster": ratio(wall[TORCH], wall[name]),
+            "less processor time": ratio(busy[TORCH], busy[name]),
+            "cores busy": statistics.median(
+                b / w / usable_cores()
+                for b, w in zip(busy[name].rounds, wall[name].rounds, strict=True)
+            ),
+        }
+        for name in contenders
+    ]
+
+
+def main() -> None:
+    parser = flags(__doc__ or "", "docs/performance")
+    parser.add_argument("--images", type=count, default=1600)
+    parser.add_argument("--batch", type=count, default=192)
+    parser.add_argument("--rounds", type=count, default=5)
+    arguments = read(parser, "bench_loader")
+    if arguments.batch % IMAGES_PER_PLACE or arguments.images < arguments.batch:
+        parser.error(
+            f"found {arguments.images} images in batches of {arguments.batch}, expected a multiple "
+            f"of {IMAGES_PER_PLACE}, and one batch at least"
+        )
+    # The workers that are forked do not use JAX.
+    warnings.filterwarnings("ignore", r"os\.fork\(\) was called")
+    values = [value for size in SIZES for value in compare(size, arguments)]
+    rows = [
+        (
+            value["size"],
+            value["contender"],
+            times(value["faster"]),
+            times(value["less processor time"]),
+            f"{100 * value['cores busy']:.0f} %",
+        )
+        for value in values
+    ]
+    caption = (
+        f"Training batches of {arguments.batch} images with RandAugment from JPEGs of three sizes, "
+        f"no model; {measured(arguments.rounds)} of an epoch of {arguments.images} images. Times "
+        "faster, and images for the same processor time, than a DataLoader with Pillow."
+    )
+    header = ("files", "contender", "times faster", "per core", "cores busy")
+    figure = bars(values, lambda value: value["size"], "faster", "times the DataLoader's speed")
+    leave("bench_loader", Study(Table(header, rows, caption, 2), values, figure), arguments)
+
+
+if __name__ == "__main__":
+    main()

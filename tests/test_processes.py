@@ -1,0 +1,212 @@
+"""The same run on 1, 2, 4 and 8 devices, and in two processes that meet on this machine."""
+
+import dataclasses
+import os
+import pathlib
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from crisalad_jax import processes
+from crisalad_jax.checkpoint import load_weights
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import write_json
+from crisalad_jax.metrics import read_metrics
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.serial import to_plain
+from tests.conftest import RECIPE
+
+ROOT = pathlib.Path(__file__).parents[1]
+# Eight images a step, two steps an epoch: ten steps.
+CONFIG = dataclasses.replace(
+    RECIPE, trains="adapters+head", places_per_batch=4, epochs=5, patience=None
+)
+DEVICES = """
+import dataclasses, pathlib, sys
+from unittest import mock
+import jax
+from crisalad_jax import fit as module, platform
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.places import read_places
+from tests.test_processes import CONFIG
+
+shared, out = map(pathlib.Path, sys.argv[1:])
+places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
+devices, step, seen = jax.devices(), module.train_step, set()
+
+def train_step(state, frozen, images, *rest):
+    seen.add(len(images.sharding.device_set))
+    return step(state, frozen, images, *rest)
+
+def run(name, config, count, validation=None):
+    with (
+        mock.patch.object(jax, "local_devices", lambda **_: devices[:count]),
+        mock.patch.object(module, "train_step", train_step),
+    ):
+        trained = module.fit(config, places, out / name, validation=validation, quiet=True).params
+    print(name, *seen, len(trained.backbone.blocks.ls1.sharding.device_set))
+    seen.clear()
+
+for count in (1, 2, 4, 8):
+    # A validation owes nothing to the devices of the steps: that of the processes is compared.
+    run(str(count), CONFIG, count, town if count == 1 else None)
+run("all", dataclasses.replace(CONFIG, trains="all", epochs=1), 8)
+"""
+
+
+@pytest.fixture(scope="module")
+def by_devices(shared: pathlib.Path, tmp_path_factory) -> pathlib.Path:
+    """A run on each number of devices, in folders named by it; what comes back is on one.
+
+    Where all trains a CPU's devices do not share it: see `spreads_images`.
+    """
+    out = tmp_path_factory.mktemp("devices")
+    done = subprocess.run(
+        [sys.executable, "-c", DEVICES, str(shared), str(out)],
+        cwd=ROOT,
+        env={**os.environ, "JAX_NUM_CPU_DEVICES": "8"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "1 1 1\n2 2 1\n4 4 1\n8 8 1\nall 1 1\n"
+    return out
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("localhost", 0))
+        return listener.getsockname()[1]
+
+
+def start(shared: pathlib.Path, out: pathlib.Path, *more: str) -> list[subprocess.Popen[str]]:
+    """The command line, in two processes; `more` flags are for the second."""
+    config = out.with_suffix(".json")
+    write_json(config, to_plain(CONFIG))
+    meet = f"localhost:{free_port()}"
+    return [
+        subprocess.Popen(
+            [
+                *(sys.executable, "-m", "crisalad_jax", "train", "--config", str(config)),
+                *("--data", str(shared / "city"), "--val", str(shared / "town")),
+                *("--out", str(out), "--coordinator", meet),
+                *("--processes", "2", "--process", str(index), "--quiet"),
+                *(more if index == 1 else ()),
+            ],
+            cwd=ROOT,
+            # What is said of virtual devices does not count here: see `processes.join`.
+            env={**os.environ, "JAX_NUM_CPU_DEVICES": "2"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(2)
+    ]
+
+
+def ends(programs: list[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+    """Exit codes, and all that was printed."""
+    return [
+        (program.returncode, out + errors)
+        for program, (out, errors) in [(p, p.communicate(timeout=300)) for p in programs]
+    ]
+
+
+STEP = ("step", "epoch", "loss", "b_acc", "gradient_norm", "learning_rate", "skipped_images")
+RECALLS = ("step", "epoch", "R@1", "R@5", "R@10", "R@20")
+
+
+def logged(out: pathlib.Path, names: tuple[str, ...]) -> list[list[float]]:
+    lines = read_metrics(out / "metrics.jsonl")
+    return [[line[name] for name in names] for line in lines if names[-1] in line]
+
+
+# Their gradient is 0 but for rounding, of which Adam makes steps of full length: the transport's
+# potentials take up what is added to a cluster's scores, a softmax what is added to its keys.
+FREE = ("aggregator.score.fc2.bias", "aggregator.dust_bin")
+KEYS = re.compile(r"encoder\.layers\.\d\.attn\.qkv\.bias")
+
+
+def trained(out: pathlib.Path) -> dict[str, np.ndarray]:
+    """Arrays of the last weights whose steps their gradients decide."""
+    found = {}
+    for name, leaf in named_leaves(load_weights(out / "last.safetensors")[0]).items():
+        array = np.asarray(leaf)
+        if KEYS.fullmatch(name):
+            queries, _, values = np.split(array, 3)
+            found |= {f"{name}, queries": queries, f"{name}, values": values}
+        elif name not in FREE:
+            found[name] = array
+    return found
+
+
+def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
+    """Ten steps' losses and the parameters after them, each within 1e-5 of its own size.
+
+    Sums are taken in another order: the largest error seen is 3e-6, of `adapter.up`, whose weights
+    began at 0.
+    """
+    np.testing.assert_allclose(logged(found, STEP), logged(expected, STEP), rtol=1e-5)
+    assert len(logged(found, STEP)) == 10
+    ours, theirs = trained(found), trained(expected)
+    assert ours.keys() == theirs.keys()
+    for name, array in ours.items():
+        error = np.linalg.norm(array - theirs[name])
+        assert error <= 1e-5 * np.linalg.norm(theirs[name]), name
+
+
+@pytest.mark.parametrize("count", [2, 4, 8])
+def test_devices_do_not_change_a_run(by_devices: pathlib.Path, count: int):
+    assert_same_run(by_devices / str(count), by_devices / "1")
+
+
+def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
+    out = tmp_path / "run"
+    codes = ends(start(shared, out))
+    assert [code for code, _ in codes] == [0, 0], codes
+    assert_same_run(out, by_devices / "1")
+    assert logged(out, RECALLS) == logged(by_devices / "1", RECALLS)
+    assert len(logged(out, RECALLS)) == 5
+
+
+@pytest.mark.parametrize(
+    ("more", "what"), [(("--cities", "Aston"), "places"), (("--epochs", "9"), "configuration")]
+)
+@pytest.mark.slow
+def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
+    out = tmp_path / "run"
+    for code, words in ends(start(shared, out, *more)):
+        assert code == 2, words
+        assert f"processes: found other {what} in process 1 than in 0, expected the same" in words
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path):
+    out = tmp_path / "run"
+    programs = start(shared, out)
+    log = out / "metrics.jsonl"
+    while not (log.exists() and log.read_bytes().count(b"\n") > 2):
+        assert programs[0].poll() is None, ends(programs)
+        time.sleep(0.05)
+    programs[1].send_signal(signal.SIGTERM)
+    for code, words in ends(programs):
+        assert code == 128 + signal.SIGTERM, words
+        assert "the same command goes on" in words
+    assert len(logged(out, STEP)) < 10
+    assert [code for code, _ in ends(start(shared, out))] == [0, 0]
+    assert_same_run(out, by_devices / "1")
+
+
+@pytest.mark.parametrize(
+    "given", [("auto", 2, None), ("host:1", None, 0), ("host:1", 2, 2), ("host:1", 2, -1)]
+)
+def test_processes_that_make_no_sense_are_refused(given):
+    with pytest.raises(InputError, match=r"^processes: found .* expected"):
+        processes.join(*given)
