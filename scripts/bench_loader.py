@@ -4,9 +4,9 @@
         [--images 1600] [--batch 192] [--rounds 5]
 
 Both read the same files in the same order, as batches of 224 x 224, each image augmented by
-RandAugment (3 operations at 15 of 31). Ours is what training does (`training_batches`: OpenCV and
-threads); the batches are of 8-bit pixels, which the compiled step normalises. The other side is
-how the public VPR code does it: a Dataset whose transforms are Pillow's decoding, Resize,
+RandAugment (3 operations at magnitude 9 of 31). Ours is what training does (`training_batches`:
+OpenCV and threads); the batches are of 8-bit pixels, which the compiled step normalises. The other
+side is how the public VPR code does it: a Dataset whose transforms are Pillow's decoding, Resize,
 RandAugment, ToTensor, Normalize, and a DataLoader with a worker for each core. (RandAugment is the
 reference of the tests: torchvision's operations on Pillow images.)
 

@@ -4,6 +4,7 @@ RandAugment: Cubuk et al., CVPR Workshops 2020; its strengths are torchvision's,
 Pillow's.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -113,9 +114,16 @@ def _affine(image: Image, a: float, b: float, c: float, d: float, e: float, f: f
     warped = cv2.warpAffine(
         image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
+    return cv2.copyTo(warped, _shown(height, width, a, b, c, d, e, f))  # 0 where it does not copy
+
+
+@functools.lru_cache(maxsize=64)
+def _shown(height: int, width: int, *matrix: float) -> UInt8[np.ndarray, "height width"]:
+    """1 where `_affine` shows a point of the image; of one strength there are few."""
+    a, b, c, d, e, f = matrix
     x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
     inside = _inside(a * x + (b * y + c), width) & _inside(d * x + (e * y + f), height)
-    return cv2.copyTo(warped, inside.astype(np.uint8))  # leaves 0 where it does not copy
+    return inside.astype(np.uint8)
 
 
 def _inside(position: np.ndarray, side: int) -> Bool[np.ndarray, "..."]:

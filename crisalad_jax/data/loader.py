@@ -49,19 +49,23 @@ class ImageCache:
     def __init__(self, budget_bytes: int = 2**30) -> None:
         """Start empty, with room for `budget_bytes` of pixels."""
         self._room = budget_bytes
-        self._images: dict[tuple[str, tuple[int, int]], _Image] = {}
+        self._images: dict[tuple[str, tuple[int, int], bool], _Image] = {}
         self._lock = threading.Lock()
 
-    def read(self, path: str | os.PathLike[str], image_size: tuple[int, int]) -> _Image:
+    def read(
+        self, path: str | os.PathLike[str], image_size: tuple[int, int], *, quickly: bool = False
+    ) -> _Image:
         """Read an image at (height, width), from memory if it is there; the array is read-only.
+
+        What is read `quickly` may have been decoded at a smaller size; see `read_image`.
 
         Raises:
             InputError: the image cannot be read.
         """
-        key = (os.fspath(path), image_size)
+        key = (os.fspath(path), image_size, quickly)
         image = self._images.get(key)
         if image is None:
-            image = _read(path, image_size)
+            image = _read(path, image_size, quickly=quickly)
             image.setflags(write=False)
             with self._lock:
                 if key not in self._images and image.nbytes <= self._room:
@@ -70,8 +74,10 @@ class ImageCache:
         return image
 
 
-def _read(path: str | os.PathLike[str], image_size: tuple[int, int]) -> _Image:
-    return resize_image(read_image(path), image_size)
+def _read(
+    path: str | os.PathLike[str], image_size: tuple[int, int], *, quickly: bool = False
+) -> _Image:
+    return resize_image(read_image(path, enough=image_size if quickly else None), image_size)
 
 
 def training_batches(
@@ -94,7 +100,8 @@ def training_batches(
 
     The same (seed, epoch, step) gives the same bits, whatever `threads`, `start_step` and `part`.
     Images
-    are resized to `image_size` (height, width), then augmented. An image that cannot be read stops
+    are resized to `image_size` (height, width), large ones from a JPEG's smaller scale (see
+    `read_image`), then augmented. An image that cannot be read stops
     the epoch or, under "skip", leaves a slot that is not valid.
 
     Args:
@@ -127,7 +134,7 @@ def training_batches(
     read = _read if cache is None else cache.read
 
     def load(position: int) -> _Image:
-        image = read(places.path(indices[position]), image_size)
+        image = read(places.path(indices[position]), image_size, quickly=True)
         if augment is None:
             return image
         step, slot = divmod(position, batch_size)

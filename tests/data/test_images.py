@@ -100,6 +100,36 @@ def test_cmyk_jpeg(tmp_path, adobe):
     assert largest_difference(read_bytes(tmp_path, data), pillow_rgb(data)) <= 2
 
 
+@pytest.mark.parametrize(
+    ("enough", "factor"),
+    [((51, 51), 1), ((50, 50), 2), ((20, 50), 2), ((25, 25), 4), ((12, 12), 8), ((1, 1), 8)],
+)
+@pytest.mark.parametrize("turned", [False, True], ids=("upright", "turned"))
+def test_a_large_jpeg_is_decoded_at_less_than_its_size(tmp_path, enough, factor, turned):
+    """Of 200 x 240 twice what is enough is left at least; Pillow's draft mode does the same."""
+    exif = Image.Exif()
+    exif[0x0112] = 6 if turned else 1
+    data = encode(Image.fromarray(smooth_picture(200, 240)), "JPEG", quality=95, exif=exif)
+    path = tmp_path / "picture.jpg"
+    path.write_bytes(data)
+    image = Image.open(io.BytesIO(data))
+    image.draft("RGB", (240 // factor, 200 // factor))
+    expected = np.asarray(ImageOps.exif_transpose(image))
+    found = read_image(path, enough=enough)
+    assert min(found.shape[:2]) == 200 // factor
+    # Two versions of one decoder, as above.
+    assert largest_difference(found, expected) <= 2
+    whole, resized = (resize_image(one, enough).astype(float) for one in (read_image(path), found))
+    # A level of 256 from rounding twice, on a picture that is smooth.
+    assert np.sqrt(np.mean((whole - resized) ** 2)) < 1
+
+
+def test_only_a_jpeg_is_decoded_at_less_than_its_size(tmp_path):
+    path = tmp_path / "picture.png"
+    path.write_bytes(encode(Image.fromarray(smooth_picture(200, 240)), "PNG"))
+    np.testing.assert_array_equal(read_image(path, enough=(10, 10)), read_image(path))
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("file_format", ["JPEG", "PNG", "TIFF", "WEBP"])
 def test_exif_orientation(tmp_path, file_format, orientation):

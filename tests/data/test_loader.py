@@ -243,7 +243,7 @@ def test_an_abandoned_iterator_stops_reading(places, monkeypatch):
     reads = []
     go_on = threading.Event()
 
-    def slow_read(path):
+    def slow_read(path, *, enough):
         reads.append(path)
         if len(reads) > 2:
             assert go_on.wait(timeout=30)
