@@ -44,8 +44,8 @@ def read_image(
     """Read an image file as 8-bit RGB, upright.
 
     For a size (height, width) that is `enough`, a JPEG is decoded at a half, a quarter or an eighth
-    of its own while that is twice as large at least: in less time, and once resized some 1 in 256
-    levels (root mean square) from the picture of all its pixels.
+    of its own while that is twice as large at least: in less time, and once resized one or two
+    levels of 256 (root mean square) from the picture of all its pixels.
 
     - The EXIF orientation is applied.
     - 16 bits become 8 by dropping the low byte (v >> 8), as OpenCV does.

@@ -7,6 +7,7 @@ Layout: `Dataframes/{city}.csv` with one row per image, and
 import csv
 import dataclasses
 import math
+import operator
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
@@ -127,23 +128,26 @@ def _read_city(
     """Places of one city in ascending order of their id, with the images of each."""
     # The inner dict is an ordered set.
     places: dict[int, dict[str, None]] = {}
+    name = table.stem
     for line, row in _read_rows(table):
-        fields = dict(zip(COLUMNS, row, strict=True))
-        place, year, month, north = (
-            _integer(table, line, name, fields[name]) for name in COLUMNS[:4]
-        )
-        for name in ("lat", "lon"):
-            _check_number(table, line, name, fields[name])
-        city_id = fields["city_id"]
+        _, _, _, _, city_id, latitude, longitude, panorama = row
+        try:
+            place, year, month, north = map(int, row[:4])
+            right = min(place, year, month, north) >= 0
+            right &= math.isfinite(float(latitude)) and math.isfinite(float(longitude))
+        except ValueError:
+            right = False
+        if not right:
+            raise _not_a_number(table, line, row)
         stem = (
             f"{city_id}_{place % IDS_PER_CITY:07d}_{year:04d}_{month:02d}_{north:03d}"
-            f"_{fields['lat']}_{fields['lon']}_{fields['panoid']}"
+            f"_{latitude}_{longitude}_{panorama}"
         )
-        image = _find_image(root, (city_id, table.stem), stem, listings)
+        image = _find_image(root, (city_id, name), stem, listings)
         if image is None:
             raise InputError(
                 f"{table}: line {line}: found no file Images/{city_id}/{stem}.jpg "
-                f"(nor .JPG, nor under Images/{table.stem}/), expected every row to have its image"
+                f"(nor .JPG, nor under Images/{name}/), expected every row to have its image"
             )
         places.setdefault(place, {})[image] = None
     ids = {place % IDS_PER_CITY: place for place in places}
@@ -156,7 +160,7 @@ def _read_city(
     return [(place, list(places[place])) for place in sorted(places)]
 
 
-def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, list[str]]]:
+def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, tuple[str, ...]]]:
     """Line number and the fields in the order of COLUMNS, of every row that is not blank."""
     try:
         # utf-8-sig: a spreadsheet's byte order mark would spoil the first column's name.
@@ -169,7 +173,7 @@ def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, list[str]]]:
                     f"{table}: found columns {', '.join(header) or 'none'}; "
                     f"missing {', '.join(missing)}"
                 )
-            wanted = [header.index(name) for name in COLUMNS]
+            wanted = operator.itemgetter(*(header.index(name) for name in COLUMNS))
             for row in reader:
                 if not row:
                     continue
@@ -178,30 +182,25 @@ def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, list[str]]]:
                         f"{table}: line {reader.line_num}: found {len(row)} fields, "
                         f"expected {len(header)}"
                     )
-                yield reader.line_num, [row[i] for i in wanted]
+                yield reader.line_num, wanted(row)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{table}: cannot be read as UTF-8 CSV: {error}") from error
 
 
-def _integer(table: pathlib.Path, line: int, name: str, text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if value < 0:
-        raise InputError(
-            f"{table}: line {line}: {name}: found {text!r}, expected a whole number from 0"
-        )
-    return value
-
-
-def _check_number(table: pathlib.Path, line: int, name: str, text: str) -> None:
-    try:
-        finite = math.isfinite(float(text))
-    except ValueError:
-        finite = False
-    if not finite:
-        raise InputError(f"{table}: line {line}: {name}: found {text!r}, expected a number")
+def _not_a_number(table: pathlib.Path, line: int, row: Sequence[str]) -> InputError:
+    """Which field of a row is none."""
+    for name, text in zip(COLUMNS, row, strict=True):
+        whole = name in COLUMNS[:4]
+        if not whole and name not in ("lat", "lon"):
+            continue
+        try:
+            right = int(text) >= 0 if whole else math.isfinite(float(text))
+        except ValueError:
+            right = False
+        if not right:
+            break
+    wanted = "a whole number from 0" if whole else "a number"
+    return InputError(f"{table}: line {line}: {name}: found {text!r}, expected {wanted}")
 
 
 def _find_image(
