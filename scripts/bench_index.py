@@ -1,6 +1,6 @@
 """Training data of the size of GSV-Cities: how long its index takes, in what memory; then an epoch.
 
-    python scripts/bench_index.py [--out docs/performance] [--page docs/performance.md]
+    python scripts/bench_index.py [--out docs/training] [--page docs/training.md]
         [--tree FOLDER] [--cities 23] [--places 2000] [--images 560000] [--size 64]
 
 Writes a tree in the layout of GSV-Cities: so many cities of so many places, each place a small JPEG
@@ -162,7 +162,7 @@ def _megabytes(size: float) -> str:
 
 
 def main() -> None:
-    parser = flags(__doc__ or "", "docs/performance")
+    parser = flags(__doc__ or "", "docs/training")
     parser.add_argument("--tree", type=pathlib.Path, help="where it stays")
     parser.add_argument("--cities", type=count, default=23)
     parser.add_argument("--places", type=count, default=2000, help="of each city")

@@ -1,6 +1,6 @@
 """Training batches from JPEG files, beside torch's DataLoader with Pillow; no model.
 
-    python scripts/bench_loader.py [--out docs/performance] [--page docs/performance.md]
+    python scripts/bench_loader.py [--out docs/training] [--page docs/training.md]
         [--images 1600] [--batch 192] [--rounds 5]
 
 Both read the same files in the same order, as batches of 224 x 224, each image augmented by
@@ -25,7 +25,7 @@ import statistics
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,7 @@ import torch  # isort: skip
 
 from crisalad_jax.config import RandAugmentConfig
 from crisalad_jax.cores import usable_cores
-from crisalad_jax.data.loader import training_batches
+from crisalad_jax.data.loader import ImageBatch, training_batches
 from crisalad_jax.data.places import COLUMNS, Places, epoch_batches, read_places
 from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN
 from parity.reference.augment import rand_augment
@@ -81,7 +81,7 @@ class Photographs(torch.utils.data.Dataset[tuple[torch.Tensor, int]]):
 
     def __getitem__(self, index: int) -> tuple[torch.Tensor, int]:
         image = Image.open(self.places.path(index)).convert("RGB")
-        image = image.resize(INPUT[::-1], Image.Resampling.BILINEAR)
+        image = image.resize((INPUT[1], INPUT[0]), Image.Resampling.BILINEAR)
         generator = random.Random(index)
         image = rand_augment(image, AUGMENT.operations, AUGMENT.magnitude, generator)
         # As torchvision's ToTensor.
@@ -90,7 +90,7 @@ class Photographs(torch.utils.data.Dataset[tuple[torch.Tensor, int]]):
         return (values - self.mean) / self.deviation, int(self.places.image_place[index])
 
 
-def epoch_of(places: Places, batch: int) -> dict[str, Any]:
+def epoch_of(batch: int) -> dict[str, Any]:
     return {
         "places_per_batch": batch // IMAGES_PER_PLACE,
         "images_per_place": IMAGES_PER_PLACE,
@@ -102,7 +102,7 @@ def epoch_of(places: Places, batch: int) -> dict[str, Any]:
 
 def by_torch(places: Places, batch: int) -> Callable[[], int]:
     def load() -> int:
-        chosen = epoch_batches(places, **epoch_of(places, batch))
+        chosen = epoch_batches(places, **epoch_of(batch))
         loader = torch.utils.data.DataLoader(
             Photographs(places),
             batch_sampler=chosen.reshape(len(chosen), -1).tolist(),
@@ -114,14 +114,12 @@ def by_torch(places: Places, batch: int) -> Callable[[], int]:
     return load
 
 
-def by_us(places: Places, batch: int) -> Callable[[], int]:
-    def load() -> int:
-        batches = training_batches(
-            places, image_size=INPUT, augment=AUGMENT, **epoch_of(places, batch)
-        )
-        return sum(int(one.valid.sum()) for one in batches)
+def our_batches(places: Places, batch: int) -> Iterator[ImageBatch]:
+    return training_batches(places, image_size=INPUT, augment=AUGMENT, **epoch_of(batch))
 
-    return load
+
+def by_us(places: Places, batch: int) -> Callable[[], int]:
+    return lambda: sum(int(one.valid.sum()) for one in our_batches(places, batch))
 
 
 def compare(size: tuple[int, int], arguments: argparse.Namespace) -> list[dict[str, Any]]:
@@ -160,7 +158,7 @@ def compare(size: tuple[int, int], arguments: argparse.Namespace) -> list[dict[s
 
 
 def main() -> None:
-    parser = flags(__doc__ or "", "docs/performance")
+    parser = flags(__doc__ or "", "docs/training")
     parser.add_argument("--images", type=count, default=1600)
     parser.add_argument("--batch", type=count, default=192)
     parser.add_argument("--rounds", type=count, default=5)

@@ -1,6 +1,6 @@
 """Memory of a training step of the paper's size, by the compiler's analysis; and one step taken.
 
-    python scripts/bench_memory.py [--out docs/performance] [--page docs/performance.md]
+    python scripts/bench_memory.py [--out docs/training] [--page docs/training.md]
         [--preset b14] [--images 192] [--micro-batches 24] [--take]
 
 The paper's recipe (adapters and head train, the rest is frozen), 48 places x 4 images, compiled for
@@ -103,7 +103,7 @@ def table(values: dict[str, Any], arguments: argparse.Namespace) -> Table:
 
 
 def main() -> None:
-    parser = flags(__doc__ or "", "docs/performance")
+    parser = flags(__doc__ or "", "docs/training")
     parser.add_argument("--preset", choices=PRESETS, default="b14")
     parser.add_argument("--images", type=count, default=192)
     parser.add_argument("--micro-batches", type=count, nargs="+", default=[24])

@@ -2,16 +2,21 @@
 
 import concurrent.futures
 import itertools
+import pathlib
 import sys
 from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.config import recipe
+from crisalad_jax.config import RandAugmentConfig, recipe
 from crisalad_jax.costs import part_costs
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.places import read_places
+from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +149,36 @@ def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
     }
 
 
+def test_a_tree_of_the_size_of_gsv_cities_is_one(scripts: Any, tmp_path: pathlib.Path) -> None:
+    scripts("bench_index").write_tree(tmp_path, cities=2, places=3, images=26, size=16)
+    places = read_places(tmp_path)
+    assert places.cities == ("City00", "City01")
+    assert places.image_counts.tolist() == [5, 5, 4, 4, 4, 4]
+    first = read_image(places.path(0))
+    assert first.shape == (16, 16, 3)
+    # The same place from another year, and another place; JPEG of quality 95 loses a few levels.
+    assert np.abs(read_image(places.path(1)).astype(int) - first).mean() < 5
+    assert np.abs(read_image(places.path(5)).astype(int) - first).mean() > 20
+
+
+def test_both_loaders_give_the_same_images(
+    scripts: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nothing is drawn: Pillow and OpenCV differ by a level or two of 256."""
+    bench = scripts("bench_loader")
+    monkeypatch.setattr(bench, "AUGMENT", RandAugmentConfig(operations=0))
+    bench.write_tree(tmp_path, 8, (60, 80))
+    places = read_places(tmp_path)
+    dataset = bench.Photographs(places)
+    (ours,) = bench.our_batches(places, 8)
+    mean, deviation = (np.array(x).reshape(3, 1, 1) for x in (IMAGENET_MEAN, IMAGENET_DEVIATION))
+    for image, label, index in zip(ours.images, ours.labels, ours.indices, strict=True):
+        values, place = dataset[int(index)]
+        assert place == label == index // 4
+        pixels = 255 * (values.numpy() * deviation + mean)
+        np.testing.assert_allclose(pixels.transpose(1, 2, 0), image, atol=3)
+
+
 @pytest.mark.parametrize(
     ("name", "flags", "words"),
     [
@@ -156,6 +191,9 @@ def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
         ("bench_profile", "--out pyproject.toml", "expected a folder that can be written to"),
         ("bench_start", "--page README.md", "README.md: found no <!-- bench_start -->"),
         ("bench_modes", "--page CONTRIBUTING.md", "found no <!-- bench_products -->"),
+        ("bench_index", "--images 10", "found 10 images of 46000 places, expected at least 48"),
+        ("bench_loader", "--batch 6", "found 1600 images in batches of 6, expected a multiple of"),
+        ("bench_memory", "--images 190", "found 190 images, expected a multiple of 4"),
         ("bench_sinkhorn", "--calls -1", "argument --calls: found '-1'"),
     ],
 )
