@@ -1,13 +1,15 @@
 """The training loop: epochs, validation, early stop, and the files of a run (paper section 4.2)."""
 
+import contextlib
 import copy
 import dataclasses
+import functools
 import json
 import math
 import pathlib
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -82,6 +84,8 @@ class _Record:
     """Of all parameters before the first step."""
     places_checksum: int
     """Of the names of all training images and of how they make places."""
+    validation_checksum: int
+    """Of what the validation is; 0 where there is none."""
     validated: int = 0
     """The step of the last validation."""
     best: list[list[Any]] = dataclasses.field(default_factory=list)
@@ -125,17 +129,16 @@ def fit(
             state before that step is saved); or a file cannot be written.
         Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
-    run = _Run(config, places, out, initial, validation)
     try:
-        _train(run, on_bad_image, quiet)
-        run.save()
+        run = _Run(config, places, out, initial, validation)
+        with contextlib.closing(run):
+            _train(run, on_bad_image, quiet)
+            processes.agreed(run.save)
     except OSError as error:
         raise InputError(
             f"{out}: cannot write: {error.strerror or error}; the same command goes on from the "
             "last state that was saved"
         ) from error
-    finally:
-        run.close()
     record = run.record
     best = record.best[0][0] if record.best else None
     return FitResult(run.params(), run.step, best, record.stopped_early, record.skipped_images)
@@ -149,9 +152,9 @@ def _train(run: "_Run", on_bad_image: OnBadImage, quiet: bool) -> None:
             while not run.is_done():
                 if run.validation_is_due():
                     bar.say(run.validate(stop))
-                    run.save()
+                    processes.agreed(run.save)
                 for batch in processes.together(run.rest_of_epoch(on_bad_image)):
-                    bar.advance(1, note=run.take_step(batch))
+                    bar.advance(1, note=processes.agreed(functools.partial(run.take_step, batch)))
                     stop.check(processes.largest)
         except Stopped as stopped:
             run.save()
@@ -170,7 +173,14 @@ class _Run:
         initial: Crisalad | None,
         validation: Benchmark | None,
     ) -> None:
-        # What does not fit raises before claim_run writes the first file.
+        # What does not fit raises before claim_run writes the first file, in all processes.
+        checksums = {
+            "configuration": zlib.crc32(json.dumps(to_plain(config)).encode()),
+            "places": _checksum([_text(places.files), places.place_start]),
+            "validation": 0 if validation is None else _checksum_of(validation),
+        }
+        for what, number in checksums.items():
+            processes.check_same(what, number)
         self.steps_per_epoch = len(
             epoch_batches(
                 places,
@@ -197,14 +207,10 @@ class _Run:
         self._frozen_there = self._devices.share(narrow(self._frozen, config.model))
         self.record = _Record(
             weights_checksum=_checksum(jax.tree.leaves(params)),
-            places_checksum=_checksum(
-                [np.frombuffer("\n".join(places.files).encode(), np.uint8), places.place_start]
-            ),
+            places_checksum=checksums["places"],
+            validation_checksum=checksums["validation"],
         )
-        for what in ("weights", "places"):
-            processes.check_same(what, getattr(self.record, f"{what}_checksum"))
-        settings = json.dumps(to_plain(config)).encode()
-        processes.check_same("configuration", zlib.crc32(settings))
+        processes.check_same("weights", self.record.weights_checksum)
         self._files: _Files | None = None
         state = self._open_files(state)
         # A copy of its own on each device: a step takes over the buffers of its state.
@@ -219,23 +225,31 @@ class _Run:
 
         def find() -> tuple[int, dict[str, Any]]:
             nonlocal state
-            self._files = files = _Files(self.out, self.config)
-            saved = files.states.load(state)
+            files = _Files(self.out, self.config)
             step, record = 0, dataclasses.asdict(self.record)
-            if saved is not None:
-                for what in ("weights", "places"):
-                    if saved.record[f"{what}_checksum"] != record[f"{what}_checksum"]:
-                        raise InputError(
-                            f"{self.out}: the run started from other {what} than are given now; "
-                            "expected the same, or another folder"
-                        )
-                step, state, record = saved
-            files.go_on(step, _Record(**record), is_saved=saved is not None)
+            try:
+                saved = files.states.load(state)
+                if saved is not None:
+                    self._check_start(saved.record)
+                    step, state, record = saved
+                files.go_on(step, _Record(**record), is_saved=saved is not None)
+            except BaseException:
+                files.states.close()
+                raise
+            self._files = files
             return step, record
 
         self.step, record = processes.led(find)
         self.record = _Record(**record)
         return processes.handed_out(state)
+
+    def _check_start(self, saved: Mapping[str, Any]) -> None:
+        for what in ("weights", "places", "validation"):
+            if saved[f"{what}_checksum"] != getattr(self.record, f"{what}_checksum"):
+                raise InputError(
+                    f"{self.out}: the run started from other {what} than are given now; "
+                    "expected the same, or another folder"
+                )
 
     def is_done(self) -> bool:
         """Whether nothing is left, validations included."""
@@ -285,8 +299,6 @@ class _Run:
     def take_step(self, batch: _Batch) -> str:
         """Train on a batch, log it, and say in a few words how it went."""
         came = time.monotonic()
-        if time.monotonic() - self._saved_at > SAVE_SECONDS:
-            self.save()
         self.state, device_metrics = train_step(
             self.state,
             self._frozen_there,
@@ -324,6 +336,8 @@ class _Run:
                     "skipped_images": skipped,
                 }
             )
+        if now - self._saved_at > SAVE_SECONDS:
+            self.save()
         note = f"loss {metrics['loss']:.3f}  b_acc {metrics['b_acc']:.2f}  {rate:.0f} images/s"
         if self.record.best:
             note += f"  best R@5 {100 * self.record.best[0][0]:.1f}"
@@ -401,6 +415,9 @@ class _Files:
 
     def __init__(self, out: pathlib.Path, config: TrainConfig) -> None:
         claim_run(out, config)
+        for folder in (out, out / "best"):
+            for path in filter(pathlib.Path.is_file, folder.glob(".*")):
+                path.unlink()  # what a killed write left
         self._out, self._config = out, config
         self.states = StateStore(out / "state")
         self._saved: tuple[int, _Record] | None = None
@@ -433,8 +450,10 @@ class _Files:
 
     def close(self) -> None:
         """Wait for what is being written."""
-        self.states.close()
-        self.log.close()
+        try:
+            self.states.close()
+        finally:
+            self.log.close()
 
     def _best_path(self, step: int) -> pathlib.Path:
         return self._out / "best" / f"step-{step:08}.safetensors"
@@ -456,7 +475,16 @@ def _devices(config: TrainConfig) -> Devices:
     """Those of the images of a step, or where these are not spread one of each process."""
     spread = spreads_images(config.trains)
     images = config.places_per_batch * config.images_per_place
+    if images % jax.process_count():
+        raise InputError(
+            f"processes: found {jax.process_count()}, expected a divisor of {images} images"
+        )
     return devices_for(images if spread else jax.process_count(), processes=True)
+
+
+def _is_kept(path: pathlib.Path) -> bool:
+    """Whether it is no temporary file of `atomic_path`."""
+    return not path.name.startswith(".")
 
 
 def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
@@ -473,10 +501,20 @@ def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
                 f"{out}: holds a run of another configuration: {'; '.join(wrong)}; give the same "
                 "to go on with it, or another folder"
             )
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    elif out.exists() and (not out.is_dir() or any(map(_is_kept, out.iterdir()))):
         raise InputError(f"{out}: found files but no run, expected a run or a new or empty folder")
     else:
         write_json(path, to_plain(config))
+
+
+def _text(names: Iterable[Any]) -> np.ndarray:
+    return np.frombuffer("\n".join(map(str, names)).encode(), np.uint8)
+
+
+def _checksum_of(benchmark: Benchmark) -> int:
+    """Of its name, which tells its rule, and of its images' names, wherever they lie."""
+    names = (path.name for path in (*benchmark.database, *benchmark.queries))
+    return _checksum([_text((benchmark.name, *names))])
 
 
 def _words(metrics: Mapping[str, float]) -> str:

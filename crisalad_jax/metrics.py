@@ -2,10 +2,16 @@
 
 import json
 import pathlib
+import time
 from collections.abc import Mapping
 from typing import Any
 
-import tensorboardX
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import (  # made by protobuf when it is imported
+    Event,  # pyright: ignore[reportAttributeAccessIssue]
+    SessionLog,  # pyright: ignore[reportAttributeAccessIssue]
+)
+from tensorboardX.summary import scalar
 
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import atomic_path
@@ -31,9 +37,14 @@ class MetricsLog:
                 if record["step"] <= (keep_up_to if "loss" in record else validated)
             ]
             temporary.write_text("".join(lines), encoding="utf-8")
-        self._events = tensorboardX.SummaryWriter(
-            str(folder / "tensorboard"), purge_step=keep_up_to + 1 if kept else None
-        )
+        (folder / "tensorboard").mkdir(exist_ok=True)
+        # Without the thread of tensorboardX' SummaryWriter, in which a full disk goes unnoticed
+        # until nothing more can be written.
+        self._events = EventsWriter(str(folder / "tensorboard" / "events"))
+        if kept:
+            # TensorBoard forgets what it has read of later steps.
+            begin = SessionLog(status=SessionLog.START)
+            self._add(keep_up_to + 1, session_log=begin)
 
     def write(self, values: Mapping[str, float], *, of: str = "") -> None:
         """Append a line; `of` names a validation set, whose numbers TensorBoard shows apart.
@@ -45,11 +56,15 @@ class MetricsLog:
         for name, value in values.items():
             if name not in ("step", "epoch"):
                 tag = f"{of}/{name.replace('@', '')}" if of else name
-                self._events.add_scalar(tag, value, int(values["step"]))
+                self._add(int(values["step"]), summary=scalar(tag, value))
+        self._events.flush()
 
     def close(self) -> None:
-        """Write out what TensorBoard's writer still holds."""
+        """Close TensorBoard's file."""
         self._events.close()
+
+    def _add(self, step: int, **what: Any) -> None:
+        self._events.write_event(Event(step=step, wall_time=time.time(), **what))
 
 
 def _line(values: Mapping[str, float]) -> str:

@@ -4,6 +4,7 @@ All run the same program. Process 0 leads: it alone reads and writes the folder 
 """
 
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -37,14 +38,24 @@ def join(coordinator: str, count: int | None, index: int | None) -> None:
         if (count, index) != (None, None):
             raise InputError("processes: found auto and a number, expected auto alone")
         given: dict[str, Any] = {}
-    elif count is None or index is None or not 0 <= index < count:
+    elif (
+        count is None
+        or index is None
+        or not 0 <= index < count
+        or not re.fullmatch(r".+:\d+", coordinator)
+    ):
         raise InputError(
-            f"processes: found process {index} of {count}, expected --coordinator HOST:PORT "
-            "--processes COUNT --process INDEX, with an index from 0 and below the count"
+            f"processes: found process {index} of {count} with {coordinator}, expected "
+            "--coordinator HOST:PORT --processes COUNT --process INDEX, with an index from 0 and "
+            "below the count"
         )
     else:
         given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
+        # Or a scheduler that JAX knows would be asked which devices this process has.
+        given["cluster_detection_method"] = "deactivate"
     jax.config.update("jax_num_cpu_devices", 1)
+    # JAX's own handler of SIGTERM would keep it from this program.
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(**given)
     except (ValueError, RuntimeError) as error:
@@ -128,23 +139,26 @@ def _gathered(number: int) -> list[int]:
 
 
 def together(items: Iterable[_T]) -> Iterator[_T]:
-    """The items, until those of one process fail: then all end, as nobody is to wait for it.
+    """The items, each `agreed`."""
+    stream = iter(items)
+    while (item := agreed(lambda: next(stream, None))) is not None:
+        yield item
+
+
+def agreed(work: Callable[[], _T]) -> _T:
+    """What `work` returns, where it fails in no process: as nobody is to wait for one that has.
 
     Raises:
-        InputError: another process failed. In that one, its own error.
+        InputError: it failed in another process. In that one, its own error.
     """
-    stream = iter(items)
-    while True:
-        error, item = None, None
-        try:
-            item = next(stream, None)
-        except Exception as raised:
-            error = raised
-        failed = largest(error is not None)
-        if error is not None:
-            raise error
-        if failed:
-            raise InputError("processes: another one failed; see what it says")
-        if item is None:
-            return
-        yield item
+    error, value = None, None
+    try:
+        value = work()
+    except Exception as raised:
+        error = raised
+    failed = largest(error is not None)
+    if error is not None:
+        raise error
+    if failed:
+        raise InputError("processes: another one failed; see what it says")
+    return value  # pyright: ignore[reportReturnType]

@@ -1,7 +1,10 @@
 """The states that a run resumes from (orbax)."""
 
+import contextlib
 import os
 import pathlib
+import shutil
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +15,8 @@ from jaxtyping import PyTree
 
 from crisalad_jax.errors import InputError
 from crisalad_jax.pytree import named_leaves
+
+_DROPPED = "dropped"
 
 
 class Saved(NamedTuple):
@@ -32,6 +37,7 @@ class StateStore:
             InputError: the folder cannot be made or read.
         """
         folder = pathlib.Path(folder).absolute()
+        self._folder, self._dropped = folder, folder / _DROPPED
         # Of several processes one alone has a store; orbax would wait for the others.
         alone = ocp.options.MultiprocessingOptions(
             primary_host=jax.process_index(), active_processes={jax.process_index()}
@@ -39,6 +45,7 @@ class StateStore:
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
             create=False,
+            todelete_subdir=_DROPPED,
             enable_async_checkpointing=True,
             cleanup_tmp_directories=True,
             multiprocessing_options=alone,
@@ -55,20 +62,26 @@ class StateStore:
             )
         except OSError as error:
             raise InputError(f"{folder}: cannot keep states here: {error.strerror}") from error
+        self._clear()
 
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
         """Write the arrays of `state` and the JSON values of `record`, in place of that step's.
 
         Copies are made before it returns, what is written is written while other work goes on.
+
+        Raises:
+            InputError: this one, or one before, cannot be written.
         """
-        if step in self._manager.all_steps():
+        with self._written():
             self._manager.wait_until_finished()
-            self._manager.delete(step)
-        # Copies: the next step takes over the buffers of this one's state.
-        arrays = ocp.args.StandardSave(jax.tree.map(np.array, _stored(state)))
-        self._manager.save(
-            step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonSave(record))
-        )
+            self._clear()
+            if step in self._manager.all_steps():
+                self._manager.delete(step)
+            # Copies: the next step takes over the buffers of this one's state.
+            arrays = ocp.args.StandardSave(jax.tree.map(np.array, _stored(state)))
+            self._manager.save(
+                step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonSave(record))
+            )
 
     def load(self, template: PyTree) -> Saved | None:
         """The last state, in the structure of `template`; None if there is none.
@@ -112,12 +125,27 @@ class StateStore:
         )
 
     def wait(self) -> None:
-        """Return when all that was saved is on the disk."""
-        self._manager.wait_until_finished()
+        """Return when all that was saved is on the disk; raises as `save`."""
+        with self._written():
+            self._manager.wait_until_finished()
 
     def close(self) -> None:
-        """Wait for what is being written."""
-        self._manager.close()
+        """Wait for what is being written; raises as `save`."""
+        with self._written():
+            self._manager.close()
+        self._clear()
+
+    @contextlib.contextmanager
+    def _written(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:  # the latter from tensorstore
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(f"{self._folder}: cannot write this state: {reason}") from error
+
+    def _clear(self) -> None:
+        # What is dropped is renamed first: a kill while it is removed leaves no half of a state.
+        shutil.rmtree(self._dropped, ignore_errors=True)
 
 
 def _stored(state: PyTree) -> dict[str, Any]:

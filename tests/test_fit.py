@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tensorboardX.proto import event_pb2
 
 import crisalad_jax.fit
 from crisalad_jax.checkpoint import load_weights
@@ -116,6 +117,26 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
         **{f"R@{k}": recall for k, recall in result.recalls.items()},
         **{name: float(value) for name, value in watched._asdict().items()},
     }
+
+
+def test_tensorboard_has_the_same_numbers(run: pathlib.Path, benchmark: Benchmark):
+    """Records: 8 bytes of length, 4 of its checksum, an event, 4 of its checksum."""
+    (path,) = (run / "tensorboard").iterdir()
+    data, position, found = path.read_bytes(), 0, {}
+    while position < len(data):
+        length = int.from_bytes(data[position : position + 8], "little")
+        event = event_pb2.Event.FromString(data[position + 12 : position + 12 + length])
+        position += length + 16
+        for value in event.summary.value:
+            found[event.step, value.tag] = value.simple_value
+    expected = {}
+    for line in read_metrics(run / "metrics.jsonl"):
+        before = "" if "loss" in line else f"{benchmark.name}/"
+        for name, value in line.items():
+            if name not in ("step", "epoch"):
+                # TensorBoard's values are float32.
+                expected[line["step"], before + name.replace("@", "")] = np.float32(value)
+    assert found == expected
 
 
 def test_training_changes_every_parameter_and_leaves_the_initial_ones_to_the_caller(

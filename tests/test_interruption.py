@@ -108,7 +108,7 @@ def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tm
     out, killed = tmp_path / "run", 0
     while killed < kills:
         program = start(out)
-        wait_for_lines(program, out, 1)
+        wait_for_lines(program, out, lines_in(out) + 1)
         # A step and its save take some hundredths of a second, a start some seconds.
         time.sleep(generator.uniform(0, 0.5))
         if program.poll() is None:
