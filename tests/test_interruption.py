@@ -102,7 +102,7 @@ def assert_same_end(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert (found / name).read_bytes() == (expected / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
 def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tmp_path, kills):
     generator = random.Random(kills)
     out, killed = tmp_path / "run", 0
@@ -124,9 +124,8 @@ def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tm
     assert_same_end(out, whole)
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.slow
 def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_path, number):
     out = tmp_path / "run"
     # Without these saves, what is resumed from was saved because of the signal.
