@@ -1,6 +1,7 @@
 """The command line: parse, make a configuration, call the library.
 
-Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 1 anything else.
+Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 143 told to end
+(SIGTERM) and its work saved, 1 anything else.
 """
 
 import contextlib
@@ -95,7 +96,7 @@ class Train:
     """Stop at an unreadable image, or skip it (masked out of attention and loss, and counted)."""
     coordinator: str | None = None
     """In several processes, of one host or many, which each run this command: HOST:PORT of process
-    0, or auto under Slurm, Open MPI or Kubernetes. Process 0 alone writes into --out."""
+    0, or auto under Slurm, Open MPI or Kubernetes, with a process for each GPU. Process 0 alone writes into --out."""
     processes: int | None = None
     """How many processes there are, with --coordinator HOST:PORT."""
     process: int | None = None

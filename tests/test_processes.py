@@ -4,6 +4,7 @@ import dataclasses
 import os
 import pathlib
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -185,6 +186,19 @@ def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
         assert code == 2, words
         assert f"processes: found other {what} in process 1 than in 0, expected the same" in words
     assert not out.exists()
+
+
+@pytest.mark.slow
+def test_an_image_that_one_process_cannot_read_ends_both(shared, tmp_path):
+    town = shutil.copytree(shared, tmp_path / "shared")
+    broken = sorted((town / "city").rglob("*.jpg"))[:3]  # all of a place
+    for path in broken:
+        path.write_bytes(b"no picture")
+    found = ends(start(town, tmp_path / "run"))
+    assert [code for code, _ in found] == [2, 2], found
+    words = sorted(words.splitlines()[-1] for _, words in found)
+    assert words[0] == "crisalad: processes: another one failed; see what it says"
+    assert any(words[1].startswith(f"crisalad: {path}: found 10 bytes") for path in broken)
 
 
 @pytest.mark.slow
