@@ -96,7 +96,8 @@ class Train:
     """Stop at an unreadable image, or skip it (masked out of attention and loss, and counted)."""
     coordinator: str | None = None
     """In several processes, of one host or many, which each run this command: HOST:PORT of process
-    0, or auto under Slurm, Open MPI or Kubernetes, with a process for each GPU. Process 0 alone writes into --out."""
+    0, or auto under Slurm, Open MPI or Kubernetes, with a process for each GPU. Process 0 alone
+    writes into --out."""
     processes: int | None = None
     """How many processes there are, with --coordinator HOST:PORT."""
     process: int | None = None
