@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import torch
-from fragments import Study, Table, bars, check_places, count, flags, leave
+from fragments import Study, Table, bars, count, flags, leave, read_some
 from racing import measured, megabytes, race, ratio, times, torch_memory, wait
 
 from crisalad_jax.config import SinkhornConfig
@@ -376,7 +376,6 @@ BENCHES = {"bench_fixed": fixed, "bench_converged": converged}
 
 def main() -> None:
     parser = flags("Time the transport; see the top.", "docs/sinkhorn")
-    parser.add_argument("benches", nargs="*", metavar="BENCH", help=f"of {', '.join(BENCHES)}")
     parser.add_argument("--images", type=count, default=32)
     parser.add_argument("--clusters", type=count, default=64)
     parser.add_argument("--patches", type=count, nargs="+", default=[256, 529])
@@ -386,11 +385,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=count, default=5)
     parser.add_argument("--calls", type=count, default=20)
     parser.add_argument("--batches", type=count, default=8, help="to count failures in")
-    arguments = parser.parse_args()
-    if unknown := set(arguments.benches) - set(BENCHES):
-        parser.error(f"found {', '.join(sorted(unknown))}, expected of {', '.join(BENCHES)}")
-    check_places(parser, arguments, arguments.benches or BENCHES)
-    for name in arguments.benches or BENCHES:
+    arguments = read_some(parser, BENCHES)
+    for name in arguments.studies:
         leave(name, BENCHES[name](arguments), arguments)
 
 

@@ -2,7 +2,7 @@
 
 import argparse
 import pathlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
@@ -100,11 +100,23 @@ def count(text: str) -> int:
 def read(parser: argparse.ArgumentParser, *names: str) -> argparse.Namespace:
     """The arguments of `flags`, once it is known that the studies of these names have a place."""
     arguments = parser.parse_args()
-    check_places(parser, arguments, names)
+    _check_places(parser, arguments, names)
     return arguments
 
 
-def check_places(
+def read_some(parser: argparse.ArgumentParser, names: Collection[str]) -> argparse.Namespace:
+    """As `read`, of those of these studies that are asked for, or of all: its `studies`."""
+    words = ", ".join(names)
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {words}")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.studies) - set(names):
+        parser.error(f"found {', '.join(sorted(unknown))}, expected of {words}")
+    arguments.studies = arguments.studies or list(names)
+    _check_places(parser, arguments, arguments.studies)
+    return arguments
+
+
+def _check_places(
     parser: argparse.ArgumentParser, arguments: argparse.Namespace, names: Iterable[str]
 ) -> None:
     """End the program in one line if a study cannot be left where the arguments say, before it."""

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fragments import COLOURS, Study, Table, check_places, count, flags, leave, number, panels
+from fragments import COLOURS, Study, Table, count, flags, leave, number, panels, read_some
 
 from crisalad_jax.config import SinkhornConfig
 from crisalad_jax.sinkhorn import (
@@ -427,14 +427,10 @@ STUDIES: dict[str, Callable[[Size], Study]] = {
 
 def main() -> None:
     parser = flags("Study the transport; see the top.", "docs/sinkhorn")
-    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {', '.join(STUDIES)}")
     parser.add_argument("--images", type=count, default=Size().images)
-    arguments = parser.parse_args()
-    if unknown := set(arguments.studies) - set(STUDIES):
-        parser.error(f"found {', '.join(sorted(unknown))}, expected of {', '.join(STUDIES)}")
-    check_places(parser, arguments, arguments.studies or STUDIES)
+    arguments = read_some(parser, STUDIES)
     size = Size(images=arguments.images)
-    for name in arguments.studies or STUDIES:
+    for name in arguments.studies:
         started = time.monotonic()
         with jax.enable_x64(True):
             study = STUDIES[name](size)
