@@ -113,9 +113,8 @@ def _constant_input(feed_forward: Any) -> Any:
 
 
 def _all_positives(mine: Any) -> Any:
-    def wrong(similarities: Any, labels: Any, *, epsilon: float) -> Any:
-        same = (labels[:, None] == labels) & ~jnp.eye(len(labels), dtype=bool)
-        return mine(similarities, labels, epsilon=epsilon)._replace(positives=same)
+    def wrong(similarities: Any, pairs: Any, *, epsilon: float) -> Any:
+        return mine(similarities, pairs, epsilon=epsilon)._replace(positives=pairs.positives)
 
     return wrong
 

@@ -318,7 +318,7 @@ def test_miner_and_loss_are_the_librarys(base: float) -> None:
     distance = DotProductSimilarity(normalize_embeddings=False)
     miner = MultiSimilarityMiner(config.epsilon, distance=distance)
     # Any: a type checker takes them for int, after the library's defaults.
-    constants: Any = (config.alpha, config.beta, config.base)
+    constants: Any = dataclasses.astuple(config.multi_similarity)
     loss_of = MultiSimilarityLoss(*constants, distance=distance)
     nonzero = 0
     for seed in range(30):

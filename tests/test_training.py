@@ -209,22 +209,18 @@ def test_several_steps_of_the_optimiser_equal_torch() -> None:
     config = OptimiserConfig(
         learning_rate=0.1, final_fraction=0.2, weight_decay=0.05, b2=0.9, clip_norm=1.0
     )
-    generator = np.random.default_rng(0)
-    start = generator.standard_normal(7).astype(np.float32)
-    gradients = generator.standard_normal((5, 7)).astype(np.float32)
-    optimiser = make_optimiser(config, steps=5)
-    ours, state = jnp.asarray(start), optimiser.init(jnp.asarray(start))
+    start, *gradients = np.random.default_rng(0).standard_normal((6, 7))
     tensor = torch.tensor(start, requires_grad=True)
     theirs = torch.optim.AdamW([tensor], lr=0.1, betas=(0.9, 0.9), weight_decay=0.05)
     linear = torch.optim.lr_scheduler.LinearLR(theirs, 1.0, 0.2, total_iters=5)
     for gradient in gradients:
-        updates, state = optimiser.update(jnp.asarray(gradient), state, ours)
-        ours = ours + updates
         tensor.grad = torch.tensor(gradient)
         torch.nn.utils.clip_grad_norm_([tensor], 1.0)
         theirs.step()
         linear.step()
-    np.testing.assert_allclose(ours, tensor.detach().numpy(), atol=2e-6)
+    ours = optimised(config, start, gradients)
+    # Torch clips to 1e-6 less: a 1e-7 of these gradients, of which Adam's eps of 1e-8 lets little by.
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.1])
@@ -233,23 +229,38 @@ def test_adam_with_steps_down_equals_torch(decay: float) -> None:
     config = OptimiserConfig(
         kind="adam", learning_rate=0.1, schedule="step", drop_epochs=3, weight_decay=decay
     )
-    generator = np.random.default_rng(0)
-    start = generator.standard_normal(7).astype(np.float32)
-    gradients = generator.standard_normal((9, 7)).astype(np.float32)
-    optimiser = make_optimiser(config, steps=9, steps_per_epoch=2)
-    ours, state = jnp.asarray(start), optimiser.init(jnp.asarray(start))
+    start, *gradients = np.random.default_rng(0).standard_normal((10, 7))
     tensor = torch.tensor(start, requires_grad=True)
     theirs = torch.optim.Adam([tensor], lr=0.1, weight_decay=decay)
     down = torch.optim.lr_scheduler.StepLR(theirs, step_size=3, gamma=0.5)
     for step, gradient in enumerate(gradients):
-        updates, state = optimiser.update(jnp.asarray(gradient), state, ours)
-        ours = ours + updates
         tensor.grad = torch.tensor(gradient)
         theirs.step()
         if step % 2 == 1:
             down.step()
-    # Nine steps of 0.1, rounded to 1e-7 of numbers of order 1 each, and optax's bias corrections.
-    np.testing.assert_allclose(ours, tensor.detach().numpy(), atol=2e-6)
+    ours = optimised(config, start, gradients, steps_per_epoch=2)
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
+
+
+def optimised(
+    config: OptimiserConfig,
+    start: np.ndarray,
+    gradients: list[np.ndarray],
+    *,
+    steps_per_epoch: int = 1,
+) -> np.ndarray:
+    """The array after a step for each gradient, in float64.
+
+    In float32 Adam's 1 - b2 = 0.001 is right to 6e-5 only, which would hide a small mistake.
+    """
+    with jax.enable_x64(True):
+        optimiser = make_optimiser(config, steps=len(gradients), steps_per_epoch=steps_per_epoch)
+        array = jnp.asarray(start)
+        state = optimiser.init(array)
+        for gradient in gradients:
+            updates, state = optimiser.update(jnp.asarray(gradient), state, array)
+            array = array + updates
+        return np.asarray(array)
 
 
 def test_a_linear_decay_may_end_before_the_run() -> None:
@@ -440,7 +451,7 @@ def test_frozen_weights_in_half_the_memory_change_no_bit() -> None:
         results.append((state, metrics))
     kinds = {name: leaf.dtype for name, leaf in named_leaves(frozen).items()}
     assert kinds["backbone.blocks.1.mlp.fc1.weight"] == jnp.bfloat16
-    assert {k for n, k in kinds.items() if "fc1.weight" not in n and "norm" in n} == {jnp.float32}
+    assert {kind for name, kind in kinds.items() if "norm" in name} == {jnp.dtype("float32")}
     assert_equal(*results)
 
 
