@@ -22,9 +22,9 @@ from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.config import ModelConfig, TrainConfig, choose, recipe
 from crisalad_jax.convert import convert, read_backbone
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
-from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import list_images
-from crisalad_jax.data.places import read_places
+from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.descriptors import config_of, targets, writer_for
 from crisalad_jax.errors import InputError, Stopped
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate, group, read_tokens
@@ -102,6 +102,12 @@ class Train:
     """How many processes there are, with --coordinator HOST:PORT."""
     process: int | None = None
     """Which of them this is, from 0."""
+    split_state: bool = False
+    """Keep what trains and its moments in parts, one a device, not whole on each: for --trains all
+    of a large model."""
+    workers: int = 0
+    """Processes that read the training images; 0 reads them by threads, which is as fast on few
+    cores, and keeps decoded images of small sets in memory."""
     quiet: bool = False
     """No progress bars."""
 
@@ -120,16 +126,14 @@ def _train(arguments: Train) -> None:
     if arguments.image_size is not None:
         model = dataclasses.replace(config.model, image_size=arguments.image_size)
         config = dataclasses.replace(config, model=model)
-    initial = _start(arguments, config)
     _console.quiet = not processes.leads()
+    initial, places, validation = processes.agreed(lambda: _read(arguments, config))
     if initial is None and config.trains != "all":
         _console.print(
             "Note: no --weights or --backbone, so the frozen part of the model "
             f"({config.trains} trains) is random. --trains all trains everything.",
             soft_wrap=True,
         )
-    places = read_places(arguments.data, cities=config.cities, min_images=config.min_images)
-    validation = None if arguments.val is None else open_benchmark(arguments.val)
     _console.print(
         f"{arguments.data}: {len(places.place_id)} places, {len(places.files)} images"
         + ("" if validation is None else f"; validation on {validation.name}"),
@@ -142,6 +146,8 @@ def _train(arguments: Train) -> None:
         validation=validation,
         initial=initial,
         on_bad_image=arguments.on_bad_image,
+        workers=arguments.workers,
+        split_state=arguments.split_state,
         quiet=arguments.quiet,
     )
     if not processes.leads():
@@ -158,8 +164,16 @@ def _train(arguments: Train) -> None:
     _console.print(f"{arguments.out}: {words}; curves in {picture}", soft_wrap=True)
 
 
+def _read(
+    arguments: Train, config: TrainConfig
+) -> tuple[Crisalad | None, Places, Benchmark | None]:
+    """What training starts from (None is random parameters), what it learns, what it is asked."""
+    initial = _start(arguments, config)
+    places = read_places(arguments.data, cities=config.cities, min_images=config.min_images)
+    return initial, places, None if arguments.val is None else open_benchmark(arguments.val)
+
+
 def _start(arguments: Train, config: TrainConfig) -> Crisalad | None:
-    """What training starts from; None is random parameters."""
     if arguments.weights is not None:
         if arguments.backbone is not None:
             raise InputError("--backbone: found beside --weights, expected only one of the two")

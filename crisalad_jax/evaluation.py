@@ -78,7 +78,8 @@ def read_tokens(
     with progress_bar(label, len(paths), "images", quiet=quiet) as bar:
 
         def collect(tokens: Tokens, valid: Bool[np.ndarray, " image"], used: int) -> None:
-            parts.append(tuple(leaf[:used] for leaf in (*jax.device_get(tokens), valid)))
+            found = *jax.device_get((tokens.global_token, tokens.local)), valid
+            parts.append(tuple(leaf[:used] for leaf in found))
             bar.advance(used)
 
         ahead = None

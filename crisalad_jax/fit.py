@@ -9,7 +9,7 @@ import math
 import pathlib
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -33,13 +33,15 @@ from crisalad_jax.errors import InputError, Stopped
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.files import write_json
 from crisalad_jax.metrics import MetricsLog
-from crisalad_jax.model import Crisalad, init_crisalad, watch_transport
-from crisalad_jax.platform import Devices, devices_for, on_one_device
+from crisalad_jax.model import Crisalad, init_crisalad, tokenise
+from crisalad_jax.nn.tokens import TransportStatistics
+from crisalad_jax.platform import Devices, devices_for
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.states import StateStore
 from crisalad_jax.stops import Stop, put_off_signals
 from crisalad_jax.training import (
+    Metrics,
     StepConfig,
     TrainState,
     init_state,
@@ -61,6 +63,9 @@ class _Batch(NamedTuple):
     images: jax.Array
     labels: jax.Array
     valid: jax.Array
+
+
+_Batches = Generator[_Batch, None, None]
 
 
 class FitResult(NamedTuple):
@@ -103,6 +108,8 @@ def fit(
     validation: Benchmark | None = None,
     initial: Crisalad | None = None,
     on_bad_image: OnBadImage = "stop",
+    workers: int = 0,
+    split_state: bool = False,
     quiet: bool = False,
 ) -> FitResult:
     """Train, or go on with the run that `out` holds, and leave its files there.
@@ -121,6 +128,8 @@ def fit(
         validation: evaluated every `config.validate_every` epochs, for early stopping.
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
+        workers: processes that read the training images; 0 reads them by threads of this one.
+        split_state: keep what trains and its moments in parts, one a device, not whole on each.
         quiet: no progress bar.
 
     Raises:
@@ -130,9 +139,9 @@ def fit(
         Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
     try:
-        run = _Run(config, places, out, initial, validation)
+        run = _Run(config, places, out, initial, validation, split_state=split_state)
         with contextlib.closing(run):
-            _train(run, on_bad_image, quiet)
+            _train(run, functools.partial(run.rest_of_epoch, on_bad_image, workers), quiet)
             processes.agreed(run.save)
     except OSError as error:
         raise InputError(
@@ -144,7 +153,7 @@ def fit(
     return FitResult(run.params(), run.step, best, record.stopped_early, record.skipped_images)
 
 
-def _train(run: "_Run", on_bad_image: OnBadImage, quiet: bool) -> None:
+def _train(run: "_Run", rest_of_epoch: Callable[[], _Batches], quiet: bool) -> None:
     silent = quiet or not processes.leads()
     bar = progress_bar("training", run.steps, "steps", quiet=silent, done=run.step)
     with put_off_signals() as stop, bar as bar:
@@ -153,9 +162,13 @@ def _train(run: "_Run", on_bad_image: OnBadImage, quiet: bool) -> None:
                 if run.validation_is_due():
                     bar.say(run.validate(stop))
                     processes.agreed(run.save)
-                for batch in processes.together(run.rest_of_epoch(on_bad_image)):
-                    bar.advance(1, note=processes.agreed(functools.partial(run.take_step, batch)))
-                    stop.check(processes.largest)
+                with contextlib.closing(rest_of_epoch()) as batches:
+                    for batch in processes.together(batches):
+                        note = processes.agreed(functools.partial(run.take_step, batch))
+                        bar.advance(1, note=note)
+                        if processes.largest(run.save_is_due()):
+                            processes.agreed(run.save)
+                        stop.check(processes.largest)
         except Stopped as stopped:
             run.save()
             where = f"after step {run.step}; the same command goes on"
@@ -172,6 +185,8 @@ class _Run:
         out: pathlib.Path,
         initial: Crisalad | None,
         validation: Benchmark | None,
+        *,
+        split_state: bool = False,
     ) -> None:
         # What does not fit raises before claim_run writes the first file, in all processes.
         checksums = {
@@ -196,9 +211,14 @@ class _Run:
         self._devices = _devices(config)
         self.steps = self.steps_per_epoch * config.epochs
         self._cache = ImageCache()
-        lengths = self.steps, self.steps_per_epoch
         self._compiled = StepConfig(
-            config.model, config.loss, config.optimiser, *lengths, config.micro_batch
+            config.model,
+            config.loss,
+            config.optimiser,
+            self.steps,
+            self.steps_per_epoch,
+            config.micro_batch,
+            self._devices.mesh if split_state else None,
         )
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         params = init_crisalad(init_key, config.model) if initial is None else initial
@@ -214,7 +234,8 @@ class _Run:
         self._files: _Files | None = None
         state = self._open_files(state)
         # A copy of its own on each device: a step takes over the buffers of its state.
-        self.state: TrainState = _copied(self._devices.share(state))
+        place = self._devices.split if split_state else self._devices.share
+        self.state: TrainState = _copied(place(state))
         self._saved_at = self._stepped_at = time.monotonic()
 
     def _open_files(self, state: TrainState) -> TrainState:
@@ -263,13 +284,13 @@ class _Run:
         new = step == 0 and self.step > self.record.validated
         return self._validation is not None and new and asked
 
-    def rest_of_epoch(self, on_bad_image: OnBadImage) -> Iterator[_Batch]:
+    def rest_of_epoch(self, on_bad_image: OnBadImage, workers: int) -> _Batches:
         """The batches from the next step on to the end of its epoch; none if training is over.
 
         Each is put on the devices while they are at the one before.
         """
         if self.is_done():
-            return iter(())
+            return
         config = self.config
         epoch, start_step = divmod(self.step, self.steps_per_epoch)
         batches = training_batches(
@@ -284,17 +305,20 @@ class _Run:
             start_step=start_step,
             part=(jax.process_index(), jax.process_count()),
             on_bad_image=on_bad_image,
+            workers=workers,
             cache=self._cache,
         )
-        return one_ahead(
+        yield from one_ahead(
             _Batch(*map(self._devices.spread, (batch.images, batch.labels, batch.valid)))
             for batch in batches
         )
 
     def params(self) -> Crisalad:
-        """The whole model as it is now, in float32."""
-        frozen = jax.tree.map(jnp.asarray, self._frozen)
-        return merge_params(on_one_device(self.state.trainable), frozen)
+        """The whole model as it is now, in float32; all processes call it."""
+        return self._merged(self._devices.whole(self.state.trainable))
+
+    def _merged(self, trainable: PyTree) -> Crisalad:
+        return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen))
 
     def take_step(self, batch: _Batch) -> str:
         """Train on a batch, log it, and say in a few words how it went."""
@@ -306,7 +330,7 @@ class _Run:
             self._step_key,
             self._compiled,
         )
-        metrics = {name: float(value) for name, value in device_metrics._asdict().items()}
+        metrics = _numbers(device_metrics)
         size = len(batch.images)
         skipped = size - int(metrics.pop("images"))
         if skipped == size:
@@ -336,8 +360,6 @@ class _Run:
                     "skipped_images": skipped,
                 }
             )
-        if now - self._saved_at > SAVE_SECONDS:
-            self.save()
         note = f"loss {metrics['loss']:.3f}  b_acc {metrics['b_acc']:.2f}  {rate:.0f} images/s"
         if self.record.best:
             note += f"  best R@5 {100 * self.record.best[0][0]:.1f}"
@@ -349,18 +371,21 @@ class _Run:
         The process that leads does it, and the others wait.
         """
 
+        trainable = self._devices.whole(self.state.trainable)
+
         def validated() -> tuple[str, dict[str, Any]]:
-            return self._validate(stop), dataclasses.asdict(self.record)
+            words = self._validate(self._merged(trainable), stop)
+            return words, dataclasses.asdict(self.record)
 
         words, record = processes.led(validated)
         self.record = _Record(**record)
         self._stepped_at = time.monotonic()
         return words
 
-    def _validate(self, stop: Stop) -> str:
+    def _validate(self, params: Crisalad, stop: Stop) -> str:
         assert self._validation is not None
         assert self._files is not None
-        params, record, benchmark = self.params(), self.record, self._validation
+        record, benchmark = self.record, self._validation
         with stop.at_once():
             (result,) = evaluate(
                 params,
@@ -387,7 +412,7 @@ class _Run:
         return f"epoch {epoch}, step {self.step}: {words}"
 
     def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:
-        """Statistics of the transport on the first queries, always the same ones."""
+        """Statistics of the transport on the first queries, always the same, without dropout."""
         model = self.config.model
         if model.aggregator != "salad":
             return {}
@@ -395,13 +420,20 @@ class _Run:
         batches = image_batches(
             paths, image_size=model.image_size, batch_size=len(paths), cache=self._cache
         )
-        statistics = watch_transport(params, next(iter(batches)).images, model)
-        return {name: float(value) for name, value in statistics._asdict().items()}
+        transport = tokenise(params, next(iter(batches)).images, model).transport
+        assert transport is not None
+        return _numbers(jax.tree.map(jnp.mean, transport))
+
+    def save_is_due(self) -> bool:
+        """Whether the last saved state is old, by the clock of the process that writes them."""
+        return self._files is not None and time.monotonic() - self._saved_at > SAVE_SECONDS
 
     def save(self) -> None:
         """Write the weights and the resumable state, the latter while training goes on."""
+        state = self._devices.whole(self.state)
         if self._files is not None:
-            self._files.save(self.step, self.record, self.state, self.params)
+            params = functools.partial(self._merged, state.trainable)
+            self._files.save(self.step, self.record, state, params)
         self._saved_at = time.monotonic()
 
     def close(self) -> None:
@@ -444,7 +476,7 @@ class _Files:
         record = copy.deepcopy(record)
         if self._saved != (step, record):
             save_weights(self._out / "last.safetensors", params(), self._config.model)
-            self.states.save(step, on_one_device(state), dataclasses.asdict(record))
+            self.states.save(step, state, dataclasses.asdict(record))
             self._drop_old_best(record)
             self._saved = step, record
 
@@ -515,6 +547,17 @@ def _checksum_of(benchmark: Benchmark) -> int:
     """Of its name, which tells its rule, and of its images' names, wherever they lie."""
     names = (path.name for path in (*benchmark.database, *benchmark.queries))
     return _checksum([_text((benchmark.name, *names))])
+
+
+def _numbers(metrics: Metrics | TransportStatistics) -> dict[str, float]:
+    """By name, those of the transport among the others."""
+    numbers: dict[str, float] = {}
+    for name, value in metrics._asdict().items():
+        if isinstance(value, TransportStatistics):
+            numbers |= _numbers(value)
+        elif value is not None:
+            numbers[name] = float(value)
+    return numbers
 
 
 def _words(metrics: Mapping[str, float]) -> str:

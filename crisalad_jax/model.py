@@ -16,7 +16,6 @@ from crisalad_jax.nn.aggregators import Aggregator, aggregate, init_aggregator, 
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.layers import Keys, split_key
 from crisalad_jax.nn.pixels import normalise
-from crisalad_jax.nn.salad import Salad, TransportStatistics, transport_statistics
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.nn.vit import Features, ViT, grid_of, init_vit, vit
 from crisalad_jax.pytree import params
@@ -131,19 +130,6 @@ def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features
         images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
     pixels = images.astype(config.compute_dtype)
     return vit(params.backbone, pixels, config.backbone, keeps=config.keeps)
-
-
-@functools.partial(platform.jit, static_argnames="config")
-def watch_transport(params: Crisalad, images: Images, config: ModelConfig) -> TransportStatistics:
-    """Statistics of SALAD's transport on a batch of images, without dropout.
-
-    Raises:
-        InputError: as `describe`, or the aggregator is not SALAD.
-    """
-    if not isinstance(params.aggregator, Salad):
-        raise InputError(f"aggregator: found {config.aggregator!r}, expected 'salad'")
-    patches = _features(params, images, config).patches
-    return transport_statistics(params.aggregator, patches, config.salad)
 
 
 @functools.partial(platform.jit, static_argnames="config")

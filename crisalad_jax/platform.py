@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import math
 import os
 import pathlib
 import warnings
@@ -37,6 +38,8 @@ _LIBRARIES: dict[str, dict[str, bool | str]] = {
 _LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 _SMALL = 2**23
 """So many numbers in all parameters: `tiny` has an eighth of that, `s14` three times as many."""
+SPLIT_FROM = 2**14
+"""Arrays of fewer numbers are never split over devices: to gather them would take longer."""
 _Tree = TypeVar("_Tree")
 
 
@@ -186,6 +189,39 @@ class Devices(NamedTuple):
             return jax.make_array_from_single_device_arrays(array.shape, everywhere, parts)
 
         return jax.tree.map(put, tree)
+
+    def split(self, tree: _Tree) -> _Tree:
+        """Arrays in parts, one a device, by `split_on`; every process gives the same, whole."""
+
+        def put(leaf: Any) -> jax.Array:
+            host = np.array(leaf)
+            return jax.make_array_from_callback(
+                host.shape, split_on(self.mesh, host.shape), host.__getitem__
+            )
+
+        return jax.tree.map(put, tree)
+
+    def whole(self, tree: _Tree) -> _Tree:
+        """Arrays that are shared or split, each whole on a device of this process.
+
+        Of several processes all call it, if any array is split.
+        """
+        if all(leaf.is_fully_replicated for leaf in jax.tree.leaves(tree)):
+            return on_one_device(tree)
+        alike = NamedSharding(self.mesh, PartitionSpec())
+        return on_one_device(jax.jit(lambda tree: tree, out_shardings=alike)(tree))
+
+
+def split_on(mesh: Mesh, shape: tuple[int, ...]) -> NamedSharding:
+    """How an array is split over devices: along its longest axis of those that they divide.
+
+    Small ones, and those without such an axis, are whole on every device.
+    """
+    lengths = [size if size % mesh.size == 0 else 0 for size in shape]
+    if math.prod(shape) < SPLIT_FROM or not any(lengths):
+        return NamedSharding(mesh, PartitionSpec())
+    longest = lengths.index(max(lengths))
+    return NamedSharding(mesh, PartitionSpec(*[None] * longest, mesh.axis_names[0]))
 
 
 def devices_for(count: int, *, processes: bool = False) -> Devices:

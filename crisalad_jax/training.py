@@ -9,14 +9,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from crisalad_jax import platform
 from crisalad_jax.config import LossConfig, ModelConfig, OptimiserConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.losses import metric_loss
-from crisalad_jax.model import Crisalad, among, describe
+from crisalad_jax.model import Crisalad, among, relate, tokenise
+from crisalad_jax.nn.layers import split_key
+from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.nn.vit import Block
+from crisalad_jax.platform import split_on
 from crisalad_jax.pytree import named_leaves
 
 ADAPTERS_AND_HEAD, ALL = "adapters+head", "all"
@@ -45,6 +49,8 @@ class Metrics(NamedTuple):
     """Of this step."""
     images: Int[Array, ""]
     """How many were valid."""
+    transport: TransportStatistics | None
+    """Means of the valid images', with dropout; None where the aggregator has no transport."""
 
 
 def spreads_images(trains: str) -> bool:
@@ -179,6 +185,11 @@ class StepConfig:
     """What a learning rate that falls every few epochs counts by."""
     micro_batch: int | None = None
     """See `model.tokenise`."""
+    split_over: Mesh | None = None
+    """Devices that keep the state in parts, as `platform.split_on` says; None: each has it whole.
+
+    The gradient is taken of whole parameters, the optimiser's step of parts (the first stage of
+    ZeRO, Rajbhandari et al. 2020)."""
 
     @property
     def schedule(self) -> optax.Schedule:
@@ -233,26 +244,38 @@ def train_step(
     step's number, so that a resumed run repeats an uninterrupted one. Where loss or gradient is not
     finite, or no image valid, the state is returned as it was, and the metrics tell.
     """
-    step_key = jax.random.fold_in(key, state.step)
+    tokens_key, encoder_key = split_key(jax.random.fold_in(key, state.step), 2)
 
-    def loss_of(trainable: PyTree) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def loss_of(trainable: PyTree) -> tuple[Float[Array, ""], tuple[Any, ...]]:
         params = eqx.combine(trainable, frozen)
-        descriptors = describe(
-            params,
-            images,
-            config.model,
-            mask=among(valid),
-            key=step_key,
-            micro_batch=config.micro_batch,
+        # The halves of `describe`, for what the tokens tell.
+        tokens = tokenise(
+            params, images, config.model, key=tokens_key, micro_batch=config.micro_batch
         )
-        return metric_loss(descriptors, labels, config.loss, valid=valid)
+        descriptors = relate(params, tokens, config.model, mask=among(valid), key=encoder_key)
+        loss, b_acc = metric_loss(descriptors, labels, config.loss, valid=valid)
+        return loss, (b_acc, tokens.transport)
 
-    (loss, b_acc), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
+    def placed(tree: PyTree, *, whole: bool = False) -> PyTree:
+        mesh = config.split_over
+        if mesh is None:
+            return tree
+
+        def place(leaf: Array) -> Array:
+            where = NamedSharding(mesh, PartitionSpec()) if whole else split_on(mesh, leaf.shape)
+            return jax.lax.with_sharding_constraint(leaf, where)
+
+        return jax.tree.map(place, tree)
+
+    (loss, (b_acc, transport)), gradient = jax.value_and_grad(loss_of, has_aux=True)(
+        placed(state.trainable, whole=True)
+    )
+    transport = jax.tree.map(lambda each: jnp.where(valid, each, 0).sum() / valid.sum(), transport)
     norm = optax.tree.norm(gradient)
     optimiser = config.make_optimiser()
-    updates, new_optimiser = optimiser.update(gradient, state.optimiser, state.trainable)
+    updates, new_optimiser = optimiser.update(placed(gradient), state.optimiser, state.trainable)
     new = TrainState(state.step + 1, optax.apply_updates(state.trainable, updates), new_optimiser)
     usable = jnp.isfinite(loss) & jnp.isfinite(norm) & valid.any()
     kept = jax.tree.map(lambda after, before: jnp.where(usable, after, before), new, state)
     rate = jnp.asarray(config.schedule(state.step))
-    return kept, Metrics(loss, b_acc, norm, rate, valid.sum())
+    return placed(kept), Metrics(loss, b_acc, norm, rate, valid.sum(), transport)

@@ -18,4 +18,5 @@ python scripts/bench_profile.py "${page[@]}"
 page=(--page docs/training.md)
 python scripts/bench_index.py "${page[@]}"
 python scripts/bench_loader.py "${page[@]}"
+python scripts/bench_overlap.py "${page[@]}"
 python scripts/bench_memory.py "${page[@]}" --take

@@ -42,21 +42,26 @@ places, town = read_places(shared / "city", min_images=2), open_benchmark(shared
 devices, step, seen = jax.devices(), module.train_step, set()
 
 def train_step(state, frozen, images, *rest):
-    seen.add(len(images.sharding.device_set))
-    return step(state, frozen, images, *rest)
+    state, metrics = step(state, frozen, images, *rest)
+    parts = [leaf for leaf in jax.tree.leaves(state) if not leaf.is_fully_replicated]
+    seen.add((len(images.sharding.device_set), len(parts) > 50))
+    return state, metrics
 
-def run(name, config, count, validation=None):
+def run(name, config, count, **options):
     with (
         mock.patch.object(jax, "local_devices", lambda **_: devices[:count]),
         mock.patch.object(module, "train_step", train_step),
     ):
-        trained = module.fit(config, places, out / name, validation=validation, quiet=True).params
-    print(name, *seen, len(trained.backbone.blocks.ls1.sharding.device_set))
+        trained = module.fit(config, places, out / name, quiet=True, **options).params
+    ((spread, split),) = seen
+    print(name, spread, split, len(trained.backbone.blocks.ls1.sharding.device_set))
     seen.clear()
 
 for count in (1, 2, 4, 8):
     # A validation owes nothing to the devices of the steps: that of the processes is compared.
-    run(str(count), CONFIG, count, town if count == 1 else None)
+    run(str(count), CONFIG, count, validation=town if count == 1 else None)
+platform.SPLIT_FROM = 64  # numbers: this model has no larger arrays
+run("split", CONFIG, 8, split_state=True)
 run("all", dataclasses.replace(CONFIG, trains="all", epochs=1), 8)
 """
 
@@ -76,7 +81,10 @@ def by_devices(shared: pathlib.Path, tmp_path_factory) -> pathlib.Path:
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == "1 1 1\n2 2 1\n4 4 1\n8 8 1\nall 1 1\n"
+    assert done.stdout.splitlines() == [
+        *("1 1 False 1", "2 2 False 1", "4 4 False 1", "8 8 False 1"),
+        *("split 8 True 1", "all 1 False 1"),
+    ]
     return out
 
 
@@ -86,7 +94,17 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def start(shared: pathlib.Path, out: pathlib.Path, *more: str) -> list[subprocess.Popen[str]]:
+COMMAND_LINE = """
+import sys
+from crisalad_jax import cli, platform
+platform.SPLIT_FROM = 64
+sys.exit(cli.main())
+"""
+
+
+def start(
+    shared: pathlib.Path, out: pathlib.Path, *more: str, both: tuple[str, ...] = ()
+) -> list[subprocess.Popen[str]]:
     """The command line, in two processes; `more` flags are for the second."""
     config = out.with_suffix(".json")
     write_json(config, to_plain(CONFIG))
@@ -94,10 +112,10 @@ def start(shared: pathlib.Path, out: pathlib.Path, *more: str) -> list[subproces
     return [
         subprocess.Popen(
             [
-                *(sys.executable, "-m", "crisalad_jax", "train", "--config", str(config)),
+                *(sys.executable, "-c", COMMAND_LINE, "train", "--config", str(config)),
                 *("--data", str(shared / "city"), "--val", str(shared / "town")),
                 *("--out", str(out), "--coordinator", meet),
-                *("--processes", "2", "--process", str(index), "--quiet"),
+                *("--processes", "2", "--process", str(index), "--quiet", *both),
                 *(more if index == 1 else ()),
             ],
             cwd=ROOT,
@@ -162,9 +180,9 @@ def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert error <= 1e-5 * np.linalg.norm(theirs[name]), name
 
 
-@pytest.mark.parametrize("count", [2, 4, 8])
-def test_devices_do_not_change_a_run(by_devices: pathlib.Path, count: int):
-    assert_same_run(by_devices / str(count), by_devices / "1")
+@pytest.mark.parametrize("name", ["2", "4", "8", "split"])
+def test_devices_do_not_change_a_run(by_devices: pathlib.Path, name: str):
+    assert_same_run(by_devices / name, by_devices / "1")
 
 
 def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
@@ -189,6 +207,14 @@ def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
 
 
 @pytest.mark.slow
+def test_data_that_one_process_lacks_ends_both(shared, tmp_path):
+    found = ends(start(shared, tmp_path / "run", "--data", str(tmp_path / "none")))
+    assert [code for code, _ in found] == [2, 2], found
+    assert "crisalad: processes: another one failed; see what it says" in found[0][1]
+    assert f"crisalad: {tmp_path / 'none'}" in found[1][1]
+
+
+@pytest.mark.slow
 def test_an_image_that_one_process_cannot_read_ends_both(shared, tmp_path):
     town = shutil.copytree(shared, tmp_path / "shared")
     broken = sorted((town / "city").rglob("*.jpg"))[:3]  # all of a place
@@ -202,9 +228,10 @@ def test_an_image_that_one_process_cannot_read_ends_both(shared, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path):
+@pytest.mark.parametrize("both", [(), ("--split-state", "--workers", "1")], ids=str)
+def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path, both):
     out = tmp_path / "run"
-    programs = start(shared, out)
+    programs = start(shared, out, both=both)
     log = out / "metrics.jsonl"
     while not (log.exists() and log.read_bytes().count(b"\n") > 2):
         assert programs[0].poll() is None, ends(programs)
@@ -214,7 +241,7 @@ def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp
         assert code == 128 + signal.SIGTERM, words
         assert "the same command goes on" in words
     assert len(logged(out, STEP)) < 10
-    assert [code for code, _ in ends(start(shared, out))] == [0, 0]
+    assert [code for code, _ in ends(start(shared, out, both=both))] == [0, 0]
     assert_same_run(out, by_devices / "1")
 
 

@@ -18,7 +18,7 @@ from crisalad_jax.config import (
 )
 from crisalad_jax.errors import InputError
 from crisalad_jax.losses import metric_loss
-from crisalad_jax.model import Crisalad, describe, init_crisalad
+from crisalad_jax.model import Crisalad, describe, init_crisalad, tokenise
 from crisalad_jax.nn.layers import dropout
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.training import (
@@ -428,6 +428,20 @@ def test_each_image_draws_its_own_dropout(params) -> None:
     assert 0 < float((together == 0).mean()) < 1
     for one, key in zip(together, keys, strict=True):
         np.testing.assert_array_equal(one, dropout(x[0], 0.5, key=key))
+
+
+@pytest.mark.parametrize("micro_batch", [None, 2])
+def test_a_step_tells_of_the_transport_of_valid_images(params, micro_batch) -> None:
+    config = dataclasses.replace(STEP, micro_batch=micro_batch)
+    state, frozen = init_state(fresh(params), "all", config)
+    valid = np.array([1, 1, 1, 0, 1, 0], bool)
+    _, metrics = train_step(state, frozen, pictures(6), LABELS, valid, jax.random.key(0), config)
+    expected = tokenise(params, pictures(6)[valid], MODEL).transport
+    assert expected is not None
+    for name, each in expected._asdict().items():
+        # Means of four numbers of order 1, computed in batches of another size.
+        np.testing.assert_allclose(getattr(metrics.transport, name), each.mean(), rtol=1e-5)
+    assert 0 < float(metrics.transport.dustbin_share) < 1
 
 
 def test_a_micro_batch_divides_the_batch(params) -> None:

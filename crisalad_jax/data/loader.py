@@ -1,14 +1,18 @@
-"""Batches of decoded images: read ahead by threads (grain), in an order no thread decides."""
+"""Batches of decoded images, read ahead by threads or processes (grain) in a fixed order."""
 
+import contextlib
+import multiprocessing
 import os
+import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Literal, NamedTuple, TypeVar
 
 import cv2
 import grain
 import numpy as np
+from absl import flags
 from jaxtyping import Bool, Int32, Int64, UInt8
 
 from crisalad_jax.config import AugmentConfig, LightAugmentConfig
@@ -94,21 +98,24 @@ def training_batches(
     part: tuple[int, int] = (0, 1),
     on_bad_image: OnBadImage = "stop",
     threads: int = THREADS,
+    workers: int = 0,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Batches of one epoch, places_per_batch x images_per_place images each, place after place.
 
-    The same (seed, epoch, step) gives the same bits, whatever `threads`, `start_step` and `part`.
-    Images
-    are resized to `image_size` (height, width), large ones from a JPEG's smaller scale (see
-    `read_image`), then augmented. An image that cannot be read stops
-    the epoch or, under "skip", leaves a slot that is not valid.
+    The same (seed, epoch, step) gives the same bits, whatever `threads`, `workers`, `start_step`
+    and `part`. Images are resized to `image_size` (height, width), large ones from a JPEG's smaller
+    scale (see `read_image`), then augmented. An image that cannot be read stops the epoch or, under
+    "skip", leaves a slot that is not valid.
 
     Args:
         places: what to draw from; see `epoch_batches` for the order.
         start_step: the first batch to give, to go on with an epoch that was interrupted.
         part: (i, n) gives the i-th of n equal parts of every batch, for the i-th of n processes.
         threads: how many decode ahead; 0 decodes in the caller's thread.
+        workers: so many processes decode ahead instead, and keep nothing in `cache`. They start
+            anew for each epoch, in some seconds; a program that asks for them is imported by each
+            (`if __name__ == "__main__"`).
         cache: keeps decoded images from epoch to epoch.
 
     Raises:
@@ -131,7 +138,7 @@ def training_batches(
         raise InputError(f"part: found {part}, expected the i-th of n, which divides {batch_size}")
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
-    read = _read if cache is None else cache.read
+    read = _read if cache is None or workers else cache.read
 
     def load(position: int) -> _Image:
         image = read(places.path(indices[position]), image_size, quickly=True)
@@ -155,6 +162,7 @@ def training_batches(
         batch_size=batch_size // parts,
         on_bad_image=on_bad_image,
         threads=threads,
+        workers=workers,
     )
 
 
@@ -192,10 +200,9 @@ def image_batches(
     )
 
 
-def one_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
+def one_ahead(stream: Generator[_Item, None, None]) -> Generator[_Item, None, None]:
     """The same items, each made in a thread while the one before it is in use."""
-    stream = iter(items)
-    with ThreadPoolExecutor(1) as thread:
+    with contextlib.closing(stream), ThreadPoolExecutor(1) as thread:
         ahead = thread.submit(next, stream, None)
         while (item := ahead.result()) is not None:
             ahead = thread.submit(next, stream, None)
@@ -212,6 +219,7 @@ def _batches(
     batch_size: int,
     on_bad_image: OnBadImage,
     threads: int,
+    workers: int = 0,
 ) -> Iterator[ImageBatch]:
     """Check the arguments now, rather than when the first batch is asked for; then iterate.
 
@@ -219,29 +227,25 @@ def _batches(
     """
     if on_bad_image not in ("skip", "stop"):
         raise InputError(f"on_bad_image: found {on_bad_image!r}, expected one of skip, stop")
-    if threads < 0:
-        raise InputError(f"threads: found {threads}, expected at least 0")
+    for name, count in (("threads", threads), ("workers", workers)):
+        if count < 0:
+            raise InputError(f"{name}: found {count}, expected at least 0")
     if min(image_size) < 1:
         raise InputError(
             f"image_size: found {image_size}, expected a height and width of at least 1"
         )
 
-    def load_or_skip(number: int) -> tuple[_Image | None]:
-        # In a tuple, because grain drops an element that is None.
+    def load_or_tell(number: int) -> tuple[_Image | None, str]:
+        # What grain says of an exception in a process of its own names no file.
         try:
-            return (load(int(positions[number])),)
-        except InputError:
-            if on_bad_image == "stop":
-                raise
-            return (None,)
+            return load(int(positions[number])), ""
+        except InputError as error:
+            return None, str(error)
 
     def batches() -> Iterator[ImageBatch]:
-        dataset = grain.MapDataset.range(len(positions)).map(load_or_skip)
+        dataset = grain.MapDataset.range(len(positions)).map(load_or_tell)
         # An element is an image, not a batch, so that the threads share the batch in hand.
-        options = grain.ReadOptions(
-            num_threads=threads, prefetch_buffer_size=BATCHES_AHEAD * batch_size if threads else 0
-        )
-        stream = iter(dataset.to_iter_dataset(options))
+        stream = iter(_ahead(dataset, BATCHES_AHEAD * batch_size, threads, workers))
         try:
             for start in range(0, len(positions), batch_size):
                 part = positions[start : start + batch_size]
@@ -249,16 +253,48 @@ def _batches(
                 batch.labels[: len(part)] = labels[part]
                 batch.indices[: len(part)] = indices[part]
                 for slot in range(len(part)):
-                    (image,) = next(stream)
+                    image, problem = next(stream)
                     if image is not None:
                         batch.images[slot] = image
                         batch.valid[slot] = True
+                    elif on_bad_image == "stop":
+                        raise InputError(problem)
                 yield batch
         finally:
             # Cancels what is queued, so that an abandoned epoch does not go on decoding.
             stream.close()
 
     return batches()
+
+
+def _ahead(dataset: grain.MapDataset, images: int, threads: int, workers: int) -> grain.IterDataset:
+    """Elements made so many images ahead, in order."""
+    if not workers:
+        return dataset.to_iter_dataset(
+            grain.ReadOptions(num_threads=threads, prefetch_buffer_size=images if threads else 0)
+        )
+    if not flags.FLAGS.is_parsed():
+        flags.FLAGS.mark_as_parsed()  # grain's own, which it hands to its processes
+    alone = dataset.to_iter_dataset(grain.ReadOptions(num_threads=0, prefetch_buffer_size=0))
+    return alone.mp_prefetch(
+        grain.MultiprocessingOptions(workers, per_worker_buffer_size=-(-images // workers)),
+        worker_init_fn=_begin_work,
+    )
+
+
+def _begin_work(_index: int, _count: int) -> None:
+    """In a process that reads images: end with the one that it reads for, and not before."""
+    cv2.setNumThreads(1)
+    for number in (signal.SIGINT, signal.SIGTERM):  # which a terminal, or a scheduler, sends to all
+        signal.signal(number, signal.SIG_IGN)
+    reader_for = multiprocessing.parent_process()
+    assert reader_for is not None
+
+    def end_with_it() -> None:
+        reader_for.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_it, daemon=True).start()
 
 
 def _empty_batch(batch_size: int, image_size: tuple[int, int]) -> ImageBatch:

@@ -1,7 +1,5 @@
 """SALAD: optimal-transport aggregation of patch features (Izquierdo and Civera, CVPR 2024)."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -17,7 +15,7 @@ from crisalad_jax.nn.layers import (
     split_key,
     widen,
 )
-from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.tokens import Tokens, TransportStatistics
 from crisalad_jax.nn.vit import Features
 from crisalad_jax.pytree import params
 from crisalad_jax.sinkhorn import SinkhornResult, assign
@@ -97,6 +95,8 @@ def transport(
 def salad(params: Salad, features: Features, config: SaladConfig, *, key: Keys | None) -> Tokens:
     """Global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
 
+    Beside them is how the transport went, without a gradient.
+
     Of one image, or of a batch at once, which the transport does faster than `vmap` could: its
     choice of domain is one for all. `key` draws the dropout of the cluster and score networks, one
     for all or one an image; None means inference.
@@ -107,36 +107,21 @@ def salad(params: Salad, features: Features, config: SaladConfig, *, key: Keys |
     cluster_key, score_key = split_key(key, 2)
     global_token = _two_layer(params.token_features, features.class_token, 0.0, None)
     local = _two_layer(params.cluster_features, features.patches, config.dropout, cluster_key)
-    log_plan = transport(params, features.patches, config, key=score_key).log_plan
-    plan = jnp.exp(log_plan[..., : config.clusters])
+    result = transport(params, features.patches, config, key=score_key)
+    plan = jnp.exp(result.log_plan[..., : config.clusters])
     clusters = jnp.einsum("...nm,...nd->...md", plan, local.astype(plan.dtype))
-    return Tokens(l2_normalise(widen(global_token)), l2_normalise(clusters))
+    statistics = jax.lax.stop_gradient(_statistics(result, config.clusters))
+    return Tokens(l2_normalise(widen(global_token)), l2_normalise(clusters), statistics)
 
 
-class TransportStatistics(NamedTuple):
-    """How the transport of a batch went, for a log."""
-
-    column_error: Float[Array, ""]
-    """Largest relative error of a cluster's mass, the images' mean."""
-    dustbin_share: Float[Array, ""]
-    """Share of all mass that went to the dustbin."""
-    patches_per_cluster: Float[Array, ""]
-    """Effective number of patches in a cluster: the exponential of its mass's entropy, the mean."""
-
-
-def transport_statistics(
-    params: Salad, patches: Float[Array, "image patch dim"], config: SaladConfig
-) -> TransportStatistics:
-    """Statistics of the transport of a batch of images, without dropout."""
-    result = transport(params, patches, config, key=None)
-    log_plan = result.log_plan
-    mass = jnp.exp(log_plan)
-    clusters = jax.nn.log_softmax(log_plan[..., : config.clusters], axis=-2)
-    entropy = -(jnp.exp(clusters) * clusters).sum(axis=-2)
+def _statistics(result: SinkhornResult, clusters: int) -> TransportStatistics:
+    mass = jnp.exp(result.log_plan)
+    shares = jax.nn.log_softmax(result.log_plan[..., :clusters], axis=-2)
+    entropy = -(jnp.exp(shares) * shares).sum(axis=-2)
     return TransportStatistics(
-        result.column_error.mean(),
-        mass[..., config.clusters :].sum() / mass.sum(),
-        jnp.exp(entropy).mean(),
+        result.column_error,
+        mass[..., clusters:].sum(axis=(-2, -1)) / mass.sum(axis=(-2, -1)),
+        jnp.exp(entropy).mean(axis=-1),
     )
 
 

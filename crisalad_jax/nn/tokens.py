@@ -6,11 +6,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+class TransportStatistics(NamedTuple):
+    """How SALAD's transport went, for a log."""
+
+    column_error: Float[Array, "*batch"]
+    """Largest relative error of a cluster's mass."""
+    dustbin_share: Float[Array, "*batch"]
+    """Share of all mass that went to the dustbin."""
+    patches_per_cluster: Float[Array, "*batch"]
+    """Effective number of patches in a cluster: the exponential of its mass's entropy, the mean."""
+
+
 class Tokens(NamedTuple):
     """One global token an image, and local ones: SALAD's clusters', or a pyramid's regions'."""
 
     global_token: Float[Array, "*batch global_dim"]
     local: Float[Array, "*batch token dim"]
+    transport: TransportStatistics | None = None
+    """An image's; None where there is no transport, or other images have been looked at since."""
 
 
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "token dim"]:

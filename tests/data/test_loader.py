@@ -5,6 +5,7 @@ import gc
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -106,6 +107,67 @@ def test_threads_restarts_and_caches_do_not_change_a_bit(places, augment):
     cache = ImageCache()
     for _ in range(2):
         assert_same(train(places, augment=augment, cache=cache), whole)
+
+
+def test_processes_read_the_same_and_name_what_they_cannot(places):
+    options = {"augment": RandAugmentConfig(), "start_step": 1}
+    whole = train(places, **options)
+    assert_same(train(places, workers=2, cache=ImageCache(), **options), whole)
+    path = places.path(int(whole[1].indices[2]))
+    path.write_bytes(b"no image")
+    with pytest.raises(InputError, match=f"^{path}: found 8 bytes"):
+        train(places, workers=1, **options)
+
+
+SLOW_READER = """
+import sys, time
+import numpy as np
+from crisalad_jax.data import loader
+from crisalad_jax.data.places import read_places
+
+def read(path, image_size, *, quickly):
+    time.sleep(1)
+    return np.zeros((*image_size, 3), np.uint8)
+
+if __name__ == "__main__":
+    loader._read = read
+    batches = loader.training_batches(
+        read_places(sys.argv[1], min_images=3), image_size=(28, 28), places_per_batch=2,
+        images_per_place=3, order="within-city", augment=None, seed=1, epoch=1, workers=2
+    )
+    next(batches)
+    print("reading", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_processes_that_read_end_with_the_one_they_read_for(places, tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(SLOW_READER)
+    process = subprocess.Popen(
+        [sys.executable, str(program), str(places.root)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "reading\n"
+    tasks = Path(f"/proc/{process.pid}/task").iterdir()
+    children = [child for task in tasks for child in (task / "children").read_text().split()]
+    assert len(children) >= 2  # and one that cleans up after all
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 60
+    while any(map(is_running, children)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(is_running, children))
+
+
+def is_running(process: str) -> bool:
+    """No zombie either, where nobody waits for those whose parent was killed."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
+    except FileNotFoundError:
+        return False
 
 
 def test_augmentation_draws_from_seed_epoch_step_and_slot(places):
@@ -288,6 +350,7 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
         ({"start_step": -1}, "start_step: found -1"),
         ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
         ({"threads": -1}, "threads: found -1"),
+        ({"workers": -1}, "workers: found -1"),
         ({"image_size": (0, 14)}, "image_size"),
         ({"images_per_place": 4}, "place 0 of A has 3 images"),
     ],
