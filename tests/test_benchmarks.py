@@ -192,7 +192,7 @@ def test_both_loaders_give_the_same_images(
         ("bench_start", "--page README.md", "README.md: found no <!-- bench_start -->"),
         ("bench_modes", "--page CONTRIBUTING.md", "found no <!-- bench_products -->"),
         ("bench_index", "--images 10", "found 10 images of 46000 places, expected at least 48"),
-        ("bench_loader", "--batch 6", "found 1600 images in batches of 6, expected a multiple of"),
+        ("bench_loader", "--batch 6", "found 960 images in batches of 6, expected a multiple of"),
         ("bench_memory", "--images 190", "found 190 images, expected a multiple of 4"),
         ("bench_overlap", "--steps 4", "found 4 steps of 48 images, expected more than 4 steps"),
         ("bench_sinkhorn", "--calls -1", "argument --calls: found '-1'"),

@@ -3,18 +3,17 @@
 JPEG markers are from ITU-T T.81 annex B, PNG chunks from the W3C PNG specification, section 5.
 """
 
-import contextlib
 import functools
 import os
 import pathlib
 import re
-import threading
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.errors import InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -76,7 +75,7 @@ def read_image(
             f"{path}: found an image cut short after {len(data)} bytes, expected a whole one"
         )
     try:
-        with _quiet_opencv():
+        with QUIET:
             flags = cv2.IMREAD_COLOR_RGB | _reduction(data, enough)
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
@@ -128,30 +127,6 @@ def _png_is_whole(data: bytes) -> bool:
         if kind == b"IEND":
             return True
     return False
-
-
-class _Quiet:
-    """How many threads decode, and the log level to restore after the last of them."""
-
-    lock = threading.Lock()
-    users = 0
-    level = 0
-
-
-@contextlib.contextmanager
-def _quiet_opencv() -> Iterator[None]:
-    """Silence OpenCV's log, which is one per process: our error says what the user needs."""
-    with _Quiet.lock:
-        if _Quiet.users == 0:
-            _Quiet.level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        _Quiet.users += 1
-    try:
-        yield
-    finally:
-        with _Quiet.lock:
-            _Quiet.users -= 1
-            if _Quiet.users == 0:
-                cv2.utils.logging.setLogLevel(_Quiet.level)
 
 
 def resize_image(

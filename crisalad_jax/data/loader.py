@@ -19,6 +19,7 @@ from crisalad_jax.config import AugmentConfig, LightAugmentConfig
 from crisalad_jax.cores import usable_cores
 from crisalad_jax.data.augment import augment as augment_image
 from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.errors import InputError
 
@@ -246,7 +247,8 @@ def _batches(
         dataset = grain.MapDataset.range(len(positions)).map(load_or_tell)
         # An element is an image, not a batch, so that the threads share the batch in hand.
         stream = iter(_ahead(dataset, BATCHES_AHEAD * batch_size, threads, workers))
-        try:
+        # Closing cancels what is queued, so that an abandoned epoch does not go on decoding.
+        with ONE_THREAD, contextlib.closing(stream):
             for start in range(0, len(positions), batch_size):
                 part = positions[start : start + batch_size]
                 batch = _empty_batch(batch_size, image_size)
@@ -260,9 +262,6 @@ def _batches(
                     elif on_bad_image == "stop":
                         raise InputError(problem)
                 yield batch
-        finally:
-            # Cancels what is queued, so that an abandoned epoch does not go on decoding.
-            stream.close()
 
     return batches()
 

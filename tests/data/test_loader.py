@@ -109,6 +109,24 @@ def test_threads_restarts_and_caches_do_not_change_a_bit(places, augment):
         assert_same(train(places, augment=augment, cache=cache), whole)
 
 
+def test_opencv_has_one_thread_while_batches_are_read(places):
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        first, second = (
+            image_batches([places.path(0)] * 4, image_size=SIZE, batch_size=2) for _ in range(2)
+        )
+        next(first)
+        next(second)
+        assert cv2.getNumThreads() == 1
+        first.close()
+        assert cv2.getNumThreads() == 1
+        assert len(list(second)) == 1
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)
+
+
 def test_processes_read_the_same_and_name_what_they_cannot(places):
     options = {"augment": RandAugmentConfig(), "start_step": 1}
     whole = train(places, **options)

@@ -1,0 +1,43 @@
+"""Settings of OpenCV, of which a process has one each, changed while somebody asks for it."""
+
+import threading
+from collections.abc import Callable
+
+import cv2
+
+
+class _Setting:
+    """A context that changes a setting; any number of threads may be in it."""
+
+    def __init__(self, change: Callable[[], int], restore: Callable[[int], object]) -> None:
+        """`change` returns what it was before, which `restore` is given by the last to leave."""
+        self._change, self._restore = change, restore
+        self._lock = threading.Lock()
+        self._users = self._before = 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._users == 0:
+                self._before = self._change()
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._restore(self._before)
+
+
+def _one_thread() -> int:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    return before
+
+
+QUIET = _Setting(
+    lambda: cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT),
+    cv2.utils.logging.setLogLevel,
+)
+"""No log on stderr: our errors say what the user needs."""
+ONE_THREAD = _Setting(_one_thread, cv2.setNumThreads)
+"""No threads of its own, where images are already spread over all cores."""
