@@ -305,6 +305,7 @@ def test_padding_that_counts_misses(monkeypatch: Patch) -> None:
     assert {"losses", "parameters at the end"} <= missed("training CriSALAD's adapters and head")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fresh_programs")
 def test_a_learning_rate_that_does_not_decay_misses(monkeypatch: Patch) -> None:
     monkeypatch.setattr(optax, "linear_schedule", lambda peak, *_: lambda _: peak)

@@ -6,5 +6,5 @@ source scripts/environment.sh "[dev]"
 ruff check .
 ruff format --check .
 pyright
-# Two workers: much of the time is compiling, which one core does.
-exec python -m pytest -n 2 --dist loadfile -m "not slow" "$@"
+# Two workers: much of the time is compiling, which one core does. In the order of conftest.py.
+exec python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" "$@"

@@ -176,6 +176,14 @@ def random_params(config: ModelConfig) -> Crisalad:
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
+LONGEST = ("test_training.py", "test_processes.py", "test_interruption.py")
+"""Files that take minutes; run last, one of them would leave the other worker without work."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture(scope="session")
 def params() -> Crisalad:
     """The parameters in weights.safetensors."""

@@ -91,9 +91,9 @@ def test_there_and_back_are_the_same_bytes(tmp_path: pathlib.Path, name: str) ->
     ("name", "width"),
     [
         ("dinov2_vits14_reg4", 384),
-        ("dinov2_vitb14", 768),
         ("dino_salad", 8448),
-        ("CricaVPR", 10752),
+        pytest.param("CricaVPR", 10752, marks=pytest.mark.slow),
+        pytest.param("dinov2_vitb14", 768, marks=pytest.mark.slow),
         pytest.param("dinov2_vitb14_reg4", 768, marks=pytest.mark.slow),
         pytest.param("dinov2_vitl14", 1024, marks=pytest.mark.slow),
         pytest.param("dinov2_vitl14_reg4", 1024, marks=pytest.mark.slow),

@@ -96,7 +96,7 @@ def test_value_gradient_and_pairs_equal_the_library(base: float, epsilon: float)
     )
     nonzero = 0
     for seed in range(40):
-        x, labels = random_batch(seed)
+        x, labels = random_batch(seed, images=(2, 7, 16, 23)[seed % 4])
         loss, gradient, (a1, p, a2, n) = theirs(x, labels, config)
         pairs = mine(jnp.asarray(x @ x.T), all_pairs(jnp.asarray(labels)), epsilon=epsilon)
         for mask, (anchors, others) in zip(pairs, ((a1, p), (a2, n)), strict=True):

@@ -166,7 +166,10 @@ print(count, len(spread.sharding.device_set), len(found.local.sharding.device_se
 """
 
 
-@pytest.mark.parametrize(("devices", "used"), [(1, 1), (3, 3), (4, 3)])
+@pytest.mark.parametrize(
+    ("devices", "used"),
+    [(4, 3), *(pytest.param(n, n, marks=pytest.mark.slow) for n in (1, 3))],
+)
 def test_images_are_spread_and_parameters_shared(
     devices: int, used: int, tmp_path: pathlib.Path
 ) -> None:

@@ -28,6 +28,8 @@ ROOT = pathlib.Path(__file__).parents[1]
 CONFIG = dataclasses.replace(
     RECIPE, trains="adapters+head", places_per_batch=4, epochs=5, patience=None
 )
+# Most of the time is XLA's, which need not optimise what takes ten steps of a tiny model.
+QUICKLY_COMPILED = {**os.environ, "XLA_FLAGS": "--xla_backend_optimization_level=0"}
 DEVICES = """
 import dataclasses, pathlib, sys
 from unittest import mock
@@ -76,7 +78,7 @@ def by_devices(shared: pathlib.Path, tmp_path_factory) -> pathlib.Path:
     done = subprocess.run(
         [sys.executable, "-c", DEVICES, str(shared), str(out)],
         cwd=ROOT,
-        env={**os.environ, "JAX_NUM_CPU_DEVICES": "8"},
+        env={**QUICKLY_COMPILED, "JAX_NUM_CPU_DEVICES": "8"},
         capture_output=True,
         text=True,
     )
@@ -120,7 +122,7 @@ def start(
             ],
             cwd=ROOT,
             # What is said of virtual devices does not count here: see `processes.join`.
-            env={**os.environ, "JAX_NUM_CPU_DEVICES": "2"},
+            env={**QUICKLY_COMPILED, "JAX_NUM_CPU_DEVICES": "2"},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -132,6 +132,7 @@ def iterations_to(tolerance: float, scores: np.ndarray, limit: int) -> int:
     return limit + 1
 
 
+@pytest.mark.slow
 def test_plain_iterations_are_counted_right_and_others_converge(study: ModuleType) -> None:
     limit = 300
     values = run(study, "acceleration", limit=limit).values
@@ -155,6 +156,7 @@ def test_plain_iterations_are_counted_right_and_others_converge(study: ModuleTyp
             assert lines[name]["largest error of those that met it"] < 1.001 * tolerance
 
 
+@pytest.mark.slow
 def test_rounded_scores_are_as_far_off_as_numpy_says(study: ModuleType) -> None:
     values = run(study, "precision").values
     for kind, std in CASES:

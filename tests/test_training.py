@@ -122,7 +122,9 @@ def test_unknown_parts_raise(params, trains: str, message: str) -> None:
         split_params(params, trains)
 
 
-@pytest.mark.parametrize("trains", ["adapters+head", "last-1-blocks+head", "all"])
+@pytest.mark.parametrize(
+    "trains", ["adapters+head", "last-1-blocks+head", pytest.param("all", marks=pytest.mark.slow)]
+)
 def test_a_step_changes_what_trains_and_nothing_else(params, trains: str) -> None:
     state, frozen = init_state(fresh(params), trains, STEP)
     trainable_names = named_leaves(state.trainable).keys()
@@ -399,7 +401,13 @@ def whole_batch():
 
 @pytest.mark.parametrize(
     ("micro_batch", "keeps"),
-    [(None, "blocks"), (None, "everything"), (1, "products"), (2, "blocks"), (3, "products")],
+    [
+        (2, "blocks"),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in ((None, "blocks"), (None, "everything"), (1, "products"), (3, "products"))
+        ),
+    ],
 )
 def test_micro_batches_and_what_is_kept_change_no_gradient(
     whole_batch, micro_batch: int | None, keeps: str
@@ -430,7 +438,7 @@ def test_each_image_draws_its_own_dropout(params) -> None:
         np.testing.assert_array_equal(one, dropout(x[0], 0.5, key=key))
 
 
-@pytest.mark.parametrize("micro_batch", [None, 2])
+@pytest.mark.parametrize("micro_batch", [pytest.param(None, marks=pytest.mark.slow), 2])
 def test_a_step_tells_of_the_transport_of_valid_images(params, micro_batch) -> None:
     config = dataclasses.replace(STEP, micro_batch=micro_batch)
     state, frozen = init_state(fresh(params), "all", config)
@@ -451,6 +459,7 @@ def test_a_micro_batch_divides_the_batch(params) -> None:
         describe(params, pictures(6), MODEL, micro_batch=4)
 
 
+@pytest.mark.slow
 def test_frozen_weights_in_half_the_memory_change_no_bit() -> None:
     """In bfloat16 they are multiplied in that type anyway."""
     model = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
@@ -501,7 +510,7 @@ VARIANTS: list[dict] = [
 ]
 
 
-QUICK = ({"dustbin": "token"}, {"dustbin": "mass"}, CONVERGED)
+QUICK = ({"dustbin": "mass"}, CONVERGED)
 
 
 @pytest.mark.parametrize(
