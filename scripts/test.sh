@@ -6,5 +6,7 @@ source scripts/environment.sh "[dev]"
 ruff check .
 ruff format --check .
 pyright
+# Most of the time is XLA's, which need not optimise programs that run for milliseconds.
+export XLA_FLAGS="--xla_backend_optimization_level=0 ${XLA_FLAGS:-}"
 # Two workers: much of the time is compiling, which one core does. In the order of conftest.py.
 exec python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" "$@"

@@ -52,11 +52,7 @@ except Stopped as stopped:
 def start(shared: pathlib.Path, tmp_path_factory):
     """Start the program on a run's folder; compiled programs are kept between the starts."""
     cache = tmp_path_factory.mktemp("cache")
-    environment = {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": str(cache),
-        "XLA_FLAGS": "--xla_backend_optimization_level=0",  # compiled sooner, and as exact
-    }
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
 
     def go(out: pathlib.Path, *statements: str) -> subprocess.Popen[str]:
         command = [

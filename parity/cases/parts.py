@@ -121,7 +121,8 @@ def _our_aggregate(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str
         features = Features(class_token, patches)
         return aggregate(params.aggregator, features, GRID, config, key=None)
 
-    return jax.vmap(one)(x["class_token"], x["patches"])._asdict()
+    tokens = jax.vmap(one)(x["class_token"], x["patches"])
+    return {"global_token": tokens.global_token, "local": tokens.local}
 
 
 def _their_aggregate(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[str, Tensor]:

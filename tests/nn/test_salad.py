@@ -1,6 +1,7 @@
 """SALAD's parts beside its golden file: dropout, dustbins, statistics, and too few patches."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ def test_tokens_are_unit_vectors_and_do_not_depend_on_the_order_of_patches() -> 
     whole = features(10)
     tokens = salad(params, whole, CONFIG, key=None)
     shuffled = salad(params, Features(whole.class_token, whole.patches[::-1]), CONFIG, key=None)
-    for ours, other in zip(tokens, shuffled, strict=True):
+    for ours, other in zip(tokens[:2], shuffled[:2], strict=True):
         # float32 rounding of lengths and of sums taken in another order.
         np.testing.assert_allclose(jnp.linalg.norm(ours, axis=-1), 1, atol=1e-6)
         np.testing.assert_allclose(ours, other, atol=1e-6)
@@ -89,10 +90,13 @@ def test_a_batch_is_its_images_under_every_dustbin(dustbin: str) -> None:
     one_by_one = [
         salad(params, Features(*(x[i] for x in batch)), config, key=None) for i in range(5)
     ]
-    for ours, mapped, *singles in zip(together, by_vmap, *one_by_one, strict=True):
-        # float32 rounding of unit vectors by other kernels.
-        np.testing.assert_allclose(ours, mapped, atol=1e-6)
-        np.testing.assert_allclose(ours, jnp.stack(singles), atol=1e-6)
+    by_hand = jax.tree.map(lambda *singles: jnp.stack(singles), *one_by_one)
+    for others in (by_vmap, by_hand):
+        # float32 rounding of unit vectors by other kernels, and of statistics of order 10.
+        jax.tree.map(
+            functools.partial(np.testing.assert_allclose, atol=1e-6), together[:2], others[:2]
+        )
+        jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), together, others)
 
 
 @pytest.mark.parametrize(
