@@ -91,7 +91,7 @@ def test_there_and_back_are_the_same_bytes(tmp_path: pathlib.Path, name: str) ->
     ("name", "width"),
     [
         ("dinov2_vits14_reg4", 384),
-        ("dino_salad", 8448),
+        pytest.param("dino_salad", 8448, marks=pytest.mark.slow),
         pytest.param("CricaVPR", 10752, marks=pytest.mark.slow),
         pytest.param("dinov2_vitb14", 768, marks=pytest.mark.slow),
         pytest.param("dinov2_vitb14_reg4", 768, marks=pytest.mark.slow),

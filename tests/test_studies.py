@@ -81,6 +81,7 @@ def test_scores_have_their_scale_and_rank(study: ModuleType) -> None:
     assert np.linalg.matrix_rank(scores[0]) == 5
 
 
+@pytest.mark.slow
 def test_errors_and_masses_are_those_of_the_scaling_form(study: ModuleType) -> None:
     errors, masses = run(study, "error").values, run(study, "mass").values
     for (kind, std), mass in zip(CASES, masses, strict=True):
@@ -100,6 +101,7 @@ def test_errors_and_masses_are_those_of_the_scaling_form(study: ModuleType) -> N
         )
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_central_differences(study: ModuleType) -> None:
     values = run(study, "gradient", images=1).values
     weights = np.random.default_rng(1).standard_normal((1, PATCHES, CLUSTERS))[0]
@@ -181,6 +183,7 @@ def test_a_rounded_step_that_rounds_nothing_is_the_step(study: ModuleType) -> No
     np.testing.assert_allclose(found, expected, atol=1e-5)  # float32 at numbers of order 20
 
 
+@pytest.mark.slow
 def test_only_the_published_dustbin_is_dead(study: ModuleType) -> None:
     values = run(study, "dustbin", images=1).values
     for v in values:

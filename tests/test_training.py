@@ -438,10 +438,10 @@ def test_each_image_draws_its_own_dropout(params) -> None:
         np.testing.assert_array_equal(one, dropout(x[0], 0.5, key=key))
 
 
-@pytest.mark.parametrize("micro_batch", [pytest.param(None, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("micro_batch", [None, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_step_tells_of_the_transport_of_valid_images(params, micro_batch) -> None:
     config = dataclasses.replace(STEP, micro_batch=micro_batch)
-    state, frozen = init_state(fresh(params), "all", config)
+    state, frozen = init_state(fresh(params), "adapters+head", config)
     valid = np.array([1, 1, 1, 0, 1, 0], bool)
     _, metrics = train_step(state, frozen, pictures(6), LABELS, valid, jax.random.key(0), config)
     expected = tokenise(params, pictures(6)[valid], MODEL).transport
