@@ -122,12 +122,8 @@ def _train(arguments: Train) -> None:
         processes.join(arguments.coordinator, arguments.processes, arguments.process)
     elif (arguments.processes, arguments.process) != (None, None):
         raise InputError("--processes, --process: found no --coordinator, expected it beside them")
-    config = arguments.settings
-    if arguments.image_size is not None:
-        model = dataclasses.replace(config.model, image_size=arguments.image_size)
-        config = dataclasses.replace(config, model=model)
     _console.quiet = not processes.leads()
-    initial, places, validation = processes.agreed(lambda: _read(arguments, config))
+    config, initial, places, validation = processes.agreed(lambda: _read(arguments))
     if initial is None and config.trains != "all":
         _console.print(
             "Note: no --weights or --backbone, so the frozen part of the model "
@@ -165,12 +161,17 @@ def _train(arguments: Train) -> None:
 
 
 def _read(
-    arguments: Train, config: TrainConfig
-) -> tuple[Crisalad | None, Places, Benchmark | None]:
-    """What training starts from (None is random parameters), what it learns, what it is asked."""
+    arguments: Train,
+) -> tuple[TrainConfig, Crisalad | None, Places, Benchmark | None]:
+    """How to train, from what (None is random parameters), on what, and what it is asked."""
+    config = arguments.settings
+    if arguments.image_size is not None:
+        model = dataclasses.replace(config.model, image_size=arguments.image_size)
+        config = dataclasses.replace(config, model=model)
     initial = _start(arguments, config)
     places = read_places(arguments.data, cities=config.cities, min_images=config.min_images)
-    return initial, places, None if arguments.val is None else open_benchmark(arguments.val)
+    validation = None if arguments.val is None else open_benchmark(arguments.val)
+    return config, initial, places, validation
 
 
 def _start(arguments: Train, config: TrainConfig) -> Crisalad | None:

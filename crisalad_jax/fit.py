@@ -36,7 +36,7 @@ from crisalad_jax.metrics import MetricsLog
 from crisalad_jax.model import Crisalad, init_crisalad, tokenise
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.platform import Devices, devices_for
-from crisalad_jax.progress import progress_bar
+from crisalad_jax.progress import Bar, progress_bar
 from crisalad_jax.serial import differences, read_config, to_plain
 from crisalad_jax.states import StateStore
 from crisalad_jax.stops import Stop, put_off_signals
@@ -133,11 +133,14 @@ def fit(
         quiet: no progress bar.
 
     Raises:
-        InputError: `out` holds something else, or a run of another configuration or start; an image
-            cannot be read; there are too few places or images; the loss is no longer finite (the
-            state before that step is saved); or a file cannot be written.
+        InputError: an argument is out of range; `out` holds something else, or a run of another
+            configuration or start; an image cannot be read; there are too few places or images; the
+            loss is no longer finite (the state before that step is saved); or a file cannot be
+            written.
         Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
+    if workers < 0:
+        raise InputError(f"workers: found {workers}, expected at least 0")
     try:
         run = _Run(config, places, out, initial, validation, split_state=split_state)
         with contextlib.closing(run):
@@ -158,21 +161,30 @@ def _train(run: "_Run", rest_of_epoch: Callable[[], _Batches], quiet: bool) -> N
     bar = progress_bar("training", run.steps, "steps", quiet=silent, done=run.step)
     with put_off_signals() as stop, bar as bar:
         try:
-            while not run.is_done():
-                if run.validation_is_due():
-                    bar.say(run.validate(stop))
-                    processes.agreed(run.save)
-                with contextlib.closing(rest_of_epoch()) as batches:
-                    for batch in processes.together(batches):
-                        note = processes.agreed(functools.partial(run.take_step, batch))
-                        bar.advance(1, note=note)
-                        if processes.largest(run.save_is_due()):
-                            processes.agreed(run.save)
-                        stop.check(processes.largest)
+            try:
+                _take_steps(run, rest_of_epoch, stop, bar)
+            except InputError:
+                # A signal to a whole group of processes ends those that read images, too.
+                stop.check(processes.largest)
+                raise
         except Stopped as stopped:
             run.save()
             where = f"after step {run.step}; the same command goes on"
             raise Stopped(stopped.number, where) from None
+
+
+def _take_steps(run: "_Run", rest_of_epoch: Callable[[], _Batches], stop: Stop, bar: Bar) -> None:
+    while not run.is_done():
+        if run.validation_is_due():
+            bar.say(run.validate(stop))
+            processes.agreed(run.save)
+        with contextlib.closing(rest_of_epoch()) as batches:
+            for batch in processes.together(batches):
+                note = processes.agreed(functools.partial(run.take_step, batch))
+                bar.advance(1, note=note)
+                if processes.largest(run.save_is_due()):
+                    processes.agreed(run.save)
+                stop.check(processes.largest)
 
 
 class _Run:
@@ -194,7 +206,7 @@ class _Run:
             "places": _checksum([_text(places.files), places.place_start]),
             "validation": 0 if validation is None else _checksum_of(validation),
         }
-        for what, number in checksums.items():
+        for what, number in (checksums | {"--split-state": int(split_state)}).items():
             processes.check_same(what, number)
         self.steps_per_epoch = len(
             epoch_batches(
@@ -209,6 +221,11 @@ class _Run:
         self.config, self.out = config, out
         self._places, self._validation = places, validation
         self._devices = _devices(config)
+        if split_state and self._devices.mesh.size == 1:
+            raise InputError(
+                "split_state: found one device to keep the state on, expected several; a CPU's do "
+                "not share a step where all trains"
+            )
         self.steps = self.steps_per_epoch * config.epochs
         self._cache = ImageCache()
         self._compiled = StepConfig(
@@ -338,10 +355,11 @@ class _Run:
                 f"training: found none of the {size} images of step {self.step + 1} readable, "
                 "expected at least one"
             )
-        if not all(math.isfinite(value) for value in metrics.values()):
+        judged = {name: metrics[name] for name in ("loss", "b_acc", "gradient_norm")}
+        if not all(map(math.isfinite, judged.values())):
             self.save()
             raise InputError(
-                f"training: found {_words(metrics)} at step {self.step + 1}, expected finite "
+                f"training: found {_words(judged)} at step {self.step + 1}, expected finite "
                 f"numbers; the state after step {self.step} is kept in {self.out}"
             )
         now = time.monotonic()
@@ -354,7 +372,8 @@ class _Run:
                 {
                     "step": self.step,
                     "epoch": (self.step - 1) // self.steps_per_epoch + 1,
-                    **metrics,
+                    # A plan without any mass has no shares, and JSON no such numbers.
+                    **{name: value for name, value in metrics.items() if math.isfinite(value)},
                     "images_per_second": round(rate, 2),
                     "waited_for_images": round(waited / seconds, 4),
                     "skipped_images": skipped,
@@ -434,7 +453,7 @@ class _Run:
         if self._files is not None:
             params = functools.partial(self._merged, state.trainable)
             self._files.save(self.step, self.record, state, params)
-        self._saved_at = time.monotonic()
+        self._saved_at = self._stepped_at = time.monotonic()
 
     def close(self) -> None:
         """Wait for what is being written."""

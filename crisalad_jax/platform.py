@@ -202,14 +202,19 @@ class Devices(NamedTuple):
         return jax.tree.map(put, tree)
 
     def whole(self, tree: _Tree) -> _Tree:
-        """Arrays that are shared or split, each whole on a device of this process.
+        """Arrays that are shared, on one device; those that are split, whole on the host.
 
-        Of several processes all call it, if any array is split.
+        One after the other, so that no device has all of them. Of several processes all call it, if
+        any array is split.
         """
-        if all(leaf.is_fully_replicated for leaf in jax.tree.leaves(tree)):
-            return on_one_device(tree)
         alike = NamedSharding(self.mesh, PartitionSpec())
-        return on_one_device(jax.jit(lambda tree: tree, out_shardings=alike)(tree))
+
+        def gather(leaf: jax.Array) -> Any:
+            if leaf.is_fully_replicated:
+                return leaf.addressable_data(0)
+            return np.asarray(jax.device_put(leaf, alike).addressable_data(0))
+
+        return jax.tree.map(gather, tree)
 
 
 def split_on(mesh: Mesh, shape: tuple[int, ...]) -> NamedSharding:

@@ -342,6 +342,35 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
     assert fit(RECIPE, places, tmp_path, initial=params, quiet=True).steps == STEPS
 
 
+def test_a_plan_without_mass_has_no_statistics_and_ends_nothing(
+    tmp_path, places, params, monkeypatch
+):
+    def step(*args):
+        state, metrics = train_step(*args)
+        transport = metrics.transport._replace(dustbin_share=np.float32(np.nan))
+        return state, metrics._replace(transport=transport)
+
+    monkeypatch.setattr(crisalad_jax.fit, "train_step", step)
+    assert fit(RECIPE, places, tmp_path, initial=params, quiet=True).steps == STEPS
+    for line in metrics_of(tmp_path):
+        assert "dustbin_share" not in line
+        assert line["column_error"] >= 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"workers": -1}, "workers: found -1, expected at least 0"),
+        ({"split_state": True}, "split_state: found one device"),
+    ],
+)
+def test_arguments_that_cannot_be_leave_no_folder(tmp_path, places, params, arguments, words):
+    out = tmp_path / "run"
+    with pytest.raises(InputError, match=words):
+        fit(RECIPE, places, out, initial=params, quiet=True, **arguments)
+    assert not out.exists()
+
+
 def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, params):
     places = read_places(city, min_images=2)
     bad = np.arange(0, len(places.files), 5)

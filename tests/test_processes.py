@@ -200,7 +200,12 @@ def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("more", "what"), [(("--cities", "Aston"), "places"), (("--epochs", "9"), "configuration")]
+    ("more", "what"),
+    [
+        (("--cities", "Aston"), "places"),
+        (("--epochs", "9"), "configuration"),
+        (("--split-state",), "--split-state"),
+    ],
 )
 @pytest.mark.slow
 def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
@@ -212,11 +217,15 @@ def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
 
 
 @pytest.mark.slow
-def test_data_that_one_process_lacks_ends_both(shared, tmp_path):
-    found = ends(start(shared, tmp_path / "run", "--data", str(tmp_path / "none")))
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [(("--data", "none"), "crisalad: none"), (("--image-size", "43", "43"), "found 43")],
+)
+def test_what_fails_in_one_process_before_training_ends_both(shared, tmp_path, more, words):
+    found = ends(start(shared, tmp_path / "run", *more))
     assert [code for code, _ in found] == [2, 2], found
     assert "crisalad: processes: another one failed; see what it says" in found[0][1]
-    assert f"crisalad: {tmp_path / 'none'}" in found[1][1]
+    assert words in found[1][1]
 
 
 @pytest.mark.slow

@@ -255,7 +255,13 @@ def _batches(
                 batch.labels[: len(part)] = labels[part]
                 batch.indices[: len(part)] = indices[part]
                 for slot in range(len(part)):
-                    image, problem = next(stream)
+                    try:
+                        image, problem = next(stream)
+                    except RuntimeError as error:
+                        if not workers:
+                            raise
+                        words = f"workers: one of {workers} that read images has ended: {error}"
+                        raise InputError(words) from error
                     if image is not None:
                         batch.images[slot] = image
                         batch.valid[slot] = True
