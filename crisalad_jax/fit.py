@@ -9,7 +9,7 @@ import math
 import pathlib
 import time
 import zlib
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +22,7 @@ from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import TrainConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import (
+    ImageBatch,
     ImageCache,
     OnBadImage,
     image_batches,
@@ -308,17 +309,11 @@ class _Run:
         """
         if self.is_done():
             return
-        config = self.config
         epoch, start_step = divmod(self.step, self.steps_per_epoch)
-        batches = training_batches(
+        batches = batches_of(
+            self.config,
             self._places,
-            image_size=config.model.image_size,
-            places_per_batch=config.places_per_batch,
-            images_per_place=config.images_per_place,
-            order=config.batch_order,
-            augment=config.augmentation,
-            seed=config.seed,
-            epoch=epoch,
+            epoch,
             start_step=start_step,
             part=(jax.process_index(), jax.process_count()),
             on_bad_image=on_bad_image,
@@ -515,6 +510,23 @@ class _Files:
         for path in set((self._out / "best").glob("step-*.safetensors")) - kept:
             self.states.wait()  # or a kill now would leave a state that still counts them
             path.unlink()
+
+
+def batches_of(
+    config: TrainConfig, places: Places, epoch: int, **options: Any
+) -> Iterator[ImageBatch]:
+    """The batches of an epoch as a configuration says; `options` are of `training_batches`."""
+    return training_batches(
+        places,
+        image_size=config.model.image_size,
+        places_per_batch=config.places_per_batch,
+        images_per_place=config.images_per_place,
+        order=config.batch_order,
+        augment=config.augmentation,
+        seed=config.seed,
+        epoch=epoch,
+        **options,
+    )
 
 
 @jax.jit

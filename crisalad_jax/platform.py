@@ -244,8 +244,3 @@ def devices_for(count: int, *, processes: bool = False) -> Devices:
     fewest = min(map(len, groups))
     most = max(n for n in range(1, fewest + 1) if each % n == 0)
     return Devices(Mesh(np.array([group[:most] for group in groups]).ravel(), ("image",)))
-
-
-def on_one_device(tree: _Tree) -> _Tree:
-    """The first device's own arrays of a tree that is on several alike: nothing is copied."""
-    return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)

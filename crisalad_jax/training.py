@@ -20,7 +20,6 @@ from crisalad_jax.model import Crisalad, among, relate, tokenise
 from crisalad_jax.nn.layers import split_key
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.nn.vit import Block
-from crisalad_jax.platform import split_on
 from crisalad_jax.pytree import named_leaves
 
 ADAPTERS_AND_HEAD, ALL = "adapters+head", "all"
@@ -262,7 +261,11 @@ def train_step(
             return tree
 
         def place(leaf: Array) -> Array:
-            where = NamedSharding(mesh, PartitionSpec()) if whole else split_on(mesh, leaf.shape)
+            where = (
+                NamedSharding(mesh, PartitionSpec())
+                if whole
+                else platform.split_on(mesh, leaf.shape)
+            )
             return jax.lax.with_sharding_constraint(leaf, where)
 
         return jax.tree.map(place, tree)

@@ -205,7 +205,7 @@ def main() -> None:
     )
     header = ("files", "cores", "contender", "times faster")
     fewest = [value for value in values if value["cores"] == len(ONE_AND_ALL[0])]
-    label = f"times the DataLoader's speed, cores: {len(ONE_AND_ALL[0])}"
+    label = f"times as fast, cores: {len(ONE_AND_ALL[0])}"
     figure = bars(fewest, lambda value: value["size"], "faster", label)
     leave("bench_loader", Study(Table(header, rows, caption, 3), values, figure), arguments)
 

@@ -24,9 +24,8 @@ from fragments import Study, Table, count, flags, leave, read
 
 from crisalad_jax import platform
 from crisalad_jax.config import PRESETS, TrainConfig, recipe
-from crisalad_jax.data.loader import training_batches
 from crisalad_jax.data.places import Places, read_places
-from crisalad_jax.fit import fit
+from crisalad_jax.fit import batches_of, fit
 from crisalad_jax.metrics import read_metrics
 
 LEFT_OUT = 4
@@ -43,18 +42,8 @@ def steps_of(config: TrainConfig, places: Places, out: pathlib.Path) -> tuple[li
 
 def loader_alone(config: TrainConfig, places: Places) -> list[float]:
     """Seconds of each batch."""
-    batches = training_batches(
-        places,
-        image_size=config.model.image_size,
-        places_per_batch=config.places_per_batch,
-        images_per_place=config.images_per_place,
-        order=config.batch_order,
-        augment=config.augmentation,
-        seed=config.seed,
-        epoch=0,
-    )
     seconds, started = [], time.perf_counter()
-    for _ in batches:
+    for _ in batches_of(config, places, epoch=0):
         seconds.append(time.perf_counter() - started)
         started = time.perf_counter()
     return seconds[LEFT_OUT:]
