@@ -198,7 +198,7 @@ def test_an_interrupt_is_no_traceback(capfd, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(crisalad_jax.cli, "part_costs", interrupt)
+    monkeypatch.setattr(crisalad_jax.cli.info, "part_costs", interrupt)
     assert main(["info"]) == 130
     assert capfd.readouterr().err == "crisalad: interrupted\n"
 
@@ -210,7 +210,7 @@ def test_the_console_script_and_the_module_are_the_same_thing(tmp_path):
     save_weights(tmp_path / "w.safetensors", random_params(MODEL), MODEL)
     command = [sys.executable, "-m", "crisalad_jax", "extract", "--quiet"]
     command += ["--weights", "w.safetensors", "--images", ".", "--out", "d.npy"]
-    root = pathlib.Path(crisalad_jax.cli.__file__).parents[1]
+    root = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
     done = subprocess.run(
         command,
         cwd=tmp_path,

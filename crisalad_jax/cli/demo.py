@@ -1,0 +1,36 @@
+"""`crisalad demo`."""
+
+import dataclasses
+import pathlib
+
+from crisalad_jax.cli.common import console, grouping_words
+from crisalad_jax.evaluation import GROUPINGS
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Render a synthetic city, train a tiny model on it, and show Recall@K before and after."""
+
+    out: pathlib.Path = pathlib.Path("demo")
+    """Folder for the city, the run, the tables and the pictures."""
+    seed: int = 0
+    quiet: bool = False
+    """No progress bars."""
+
+
+def run(arguments: Demo) -> None:
+    """Run the demo, and print its table."""
+    from crisalad_jax.demo import DemoConfig, run_demo
+    from crisalad_jax.report import recall_table
+
+    summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
+    console.print(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
+    console.print(
+        f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.",
+        soft_wrap=True,
+    )
+    console.print(
+        f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "
+        f"Pictures: {', '.join(str(p) for p in summary.pictures)}",
+        soft_wrap=True,
+    )
