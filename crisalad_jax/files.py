@@ -75,6 +75,28 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def durable_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """As `atomic_path`; afterwards the file is on the disk, even if the power fails.
+
+    Raises:
+        InputError: what `check_target` raises.
+    """
+    with atomic_path(path) as temporary:
+        yield temporary
+        _sync(temporary)
+    _sync(pathlib.Path(path).parent)
+
+
+def _sync(path: pathlib.Path) -> None:
+    """A file's bytes, or a folder's names, to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Write `value` as indented JSON, whole or not at all."""
     with atomic_path(path) as temporary:

@@ -186,7 +186,7 @@ def prediction_gallery(
     database: Sequence[Path],
     indices: Int[np.ndarray, "q k"],
     similarities: Float[np.ndarray, "q k"],
-    positives: Sequence[Int[np.ndarray, " _"]],
+    positives: Sequence[Int[np.ndarray, " _"]] | None,
     *,
     rows: int = 6,
     columns: int = 4,
@@ -197,6 +197,7 @@ def prediction_gallery(
     Retrievals are framed green where right and red where wrong, with rank and similarity below.
     Half of the rows are queries whose first retrieval is right, half are others, as far as there
     are both, each half spread evenly over the data set: the same input gives the same picture.
+    Where nothing is known to be right, all are framed grey, and queries spread evenly.
 
     Args:
         path: the picture to write.
@@ -204,7 +205,7 @@ def prediction_gallery(
         database: image files that `indices` count.
         indices: database indices retrieved for each query, best first.
         similarities: those of `indices`.
-        positives: the database indices that are right for each query.
+        positives: the database indices that are right for each query; None where that is unknown.
         rows: queries shown, at most q.
         columns: retrievals shown for each, at most k.
         title: stands above the picture.
@@ -218,8 +219,13 @@ def prediction_gallery(
         if value < 1:
             raise InputError(f"{name}: found {value}, expected at least 1")
     shown = indices[:, :columns]
-    right = np.stack([np.isin(row, wanted) for row, wanted in zip(shown, positives, strict=True)])
-    chosen = _choose_queries(right[:, 0], rows)
+    if positives is None:
+        right = None
+        chosen = _evenly(np.arange(len(queries)), min(rows, len(queries)))
+    else:
+        verdicts = zip(shown, positives, strict=True)
+        right = np.stack([np.isin(row, wanted) for row, wanted in verdicts])
+        chosen = _choose_queries(right[:, 0], rows)
 
     # Inches. Frames and captions are drawn into the gaps.
     width, gap, between, margin = 1.7, 0.16, 0.34, 0.25
@@ -251,25 +257,35 @@ def prediction_gallery(
 
     for row, query in enumerate(chosen):
         axes = place(row, 0, thumbnails[queries[query]])
-        note = "" if np.size(positives[query]) else ", no positive exists"
+        note = "" if positives is None or np.size(positives[query]) else ", no positive exists"
         _caption(axes, f"query {query}{note}", _INK)
         axes.spines[:].set(color=_GREY, linewidth=0.5)
         for rank, index in enumerate(shown[query]):
             axes = place(row, rank + 1, thumbnails[database[index]])
+            caption = f"{rank + 1}   {similarities[query, rank]:.3f}"
+            if right is None:
+                axes.spines[:].set(color=_GREY, linewidth=0.5)
+                _caption(axes, caption, _INK)
+                continue
             good = right[query, rank]
             colour = _RIGHT if good else _WRONG
             axes.spines[:].set(color=colour, linewidth=3)
             # A sign too, for those who cannot tell green from red.
             sign = "\N{CHECK MARK}" if good else "\N{BALLOT X}"
-            _caption(axes, f"{rank + 1}   {similarities[query, rank]:.3f}   {sign}", colour)
+            _caption(axes, f"{caption}   {sign}", colour)
 
     left = margin / size[0]
     top = 1 - 0.2 / size[1]
     if title:
         _fit(figure.text(left, top, title, fontsize=13, color=_INK, va="top"), figure)
         top -= 0.3 / size[1]
-    legend = "query, then retrievals: rank, similarity, "
-    parts = ((legend, _GREY), ("\N{CHECK MARK} right   ", _RIGHT), ("\N{BALLOT X} wrong", _WRONG))
+    parts = [("query, then retrievals: rank, similarity", _GREY)]
+    if right is not None:
+        parts += [
+            (", ", _GREY),
+            ("\N{CHECK MARK} right   ", _RIGHT),
+            ("\N{BALLOT X} wrong", _WRONG),
+        ]
     for text, colour in parts:
         drawn = figure.text(left, top, text, fontsize=9, color=colour, va="top")
         left += drawn.get_window_extent().width / figure.bbox.width
@@ -289,7 +305,7 @@ def _check_gallery(
     database: Sequence[Path],
     indices: Int[np.ndarray, "q k"],
     similarities: Float[np.ndarray, "q2 k2"],
-    positives: Sequence[Int[np.ndarray, " _"]],
+    positives: Sequence[Int[np.ndarray, " _"]] | None,
 ) -> None:
     if not indices.size:
         raise InputError(f"indices: found shape {indices.shape}, expected queries and retrievals")
@@ -299,7 +315,7 @@ def _check_gallery(
             "as of the indices"
         )
     for name, found in (("queries", queries), ("positives", positives)):
-        if len(found) != len(indices):
+        if found is not None and len(found) != len(indices):
             raise InputError(f"{name}: found {len(found)}, expected {len(indices)} as of indices")
     if indices.min() < 0 or indices.max() >= len(database):
         raise InputError(
@@ -313,11 +329,13 @@ def _choose_queries(right: Bool[np.ndarray, " q"], rows: int) -> list[int]:
     good, bad = np.flatnonzero(right), np.flatnonzero(~right)
     good_count = min(len(good), max(rows - rows // 2, rows - len(bad)))
     bad_count = min(len(bad), rows - good_count)
-    return [
-        int(group[place])
-        for group, count in ((good, good_count), (bad, bad_count))
-        for place in np.linspace(0, len(group) - 1, count).round().astype(int)
-    ]
+    return _evenly(good, good_count) + _evenly(bad, bad_count)
+
+
+def _evenly(queries: Int[np.ndarray, " n"], count: int) -> list[int]:
+    """So many of them, from the first to the last."""
+    places = np.linspace(0, len(queries) - 1, count).round().astype(int)
+    return queries[places].tolist()
 
 
 def _thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:

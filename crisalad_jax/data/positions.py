@@ -1,0 +1,79 @@
+"""Where images were taken: from their @UTM names, or from a table."""
+
+import csv
+import math
+import os
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from crisalad_jax.errors import InputError
+
+AXES = (("east", "north"), ("lat", "lon"))
+"""What the two numbers of a position may be: metres of UTM, or degrees."""
+
+
+class Positions(NamedTuple):
+    """Positions by the names of images; images that have none are not in it."""
+
+    axes: tuple[str, str]
+    of: dict[str, tuple[float, float]]
+
+
+def utm_positions(names: Sequence[str]) -> Positions:
+    """East and north in metres of those images whose names say so, `@UTM_east@UTM_north@...`."""
+    found = {}
+    for name in names:
+        fields = pathlib.PurePosixPath(name).name.split("@")
+        try:
+            position = float(fields[1]), float(fields[2])
+        except (IndexError, ValueError):
+            continue
+        if all(map(math.isfinite, position)):
+            found[name] = position
+    return Positions(AXES[0], found)
+
+
+def read_positions(path: str | os.PathLike[str]) -> Positions:
+    """Read a table with the header `name,east,north` or `name,lat,lon`; more columns do not matter.
+
+    Raises:
+        InputError: the file cannot be read, has another header, a name twice, or a value that is no
+            finite number, or no latitude or longitude.
+    """
+    path = pathlib.Path(path)
+    found: dict[str, tuple[float, float]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = csv.DictReader(file)
+            header = rows.fieldnames or []
+            axes = next((axes for axes in AXES if {"name", *axes} <= set(header)), None)
+            if axes is None:
+                raise InputError(
+                    f"{path}: found columns {', '.join(header) or 'none'}, expected "
+                    "name,east,north or name,lat,lon"
+                )
+            for row in rows:
+                where = f"{path}: line {rows.line_num}"
+                if row["name"] in found:
+                    raise InputError(f"{where}: found {row['name']!r} twice, expected it once")
+                found[row["name"]] = _position(row, axes, where)
+    except (OSError, ValueError, csv.Error) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot read these positions: {reason}") from error
+    return Positions(axes, found)
+
+
+def _position(row: dict[str, str], axes: tuple[str, str], where: str) -> tuple[float, float]:
+    texts = [row[axis] for axis in axes]
+    try:
+        first, second = map(float, texts)
+    except (TypeError, ValueError):
+        first = second = math.nan
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise InputError(f"{where}: found {texts}, expected two finite numbers")
+    if axes == AXES[1] and not (abs(first) <= 90 and abs(second) <= 180):
+        raise InputError(f"{where}: found {texts}, expected a latitude and a longitude")
+    return first, second

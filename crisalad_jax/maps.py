@@ -1,0 +1,419 @@
+"""Maps: a folder of descriptors that says of itself what they are, and grows by appending.
+
+Each addition is a segment: its descriptors go to the store, then the record of its images appears
+under its name. That is one rename, and it makes the addition count: a map whose writer is killed at
+any moment is the map as it was before the addition or after it. docs/maps.md has the format.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import hashlib
+import json
+import os
+import pathlib
+import uuid
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from crisalad_jax.config import ModelConfig
+from crisalad_jax.data.positions import Positions
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import durable_path
+from crisalad_jax.model import Crisalad
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.retrieval import Neighbours
+from crisalad_jax.serial import from_plain, to_plain
+from crisalad_jax.stores import Store, open_store, store_name
+from crisalad_jax.stores.files import remove_leftovers
+
+FORMAT = 1
+"""Version of the format that this package writes, and the newest that it reads."""
+# float16 keeps unit vectors to 1e-3.
+_UNIT_TOLERANCE = 1e-2
+_DESCRIPTION, _SEGMENTS, _LOCK = "map.json", "segments", ".lock"
+
+
+@dataclasses.dataclass(frozen=True)
+class MapDescription:
+    """What map.json says."""
+
+    model: str
+    """The `model_hash` of the weights that describe its images, and its queries."""
+    weights: str
+    """Where those weights were."""
+    config: ModelConfig
+    """The model, at the image size and in the type in which images are described."""
+    descriptor_length: int
+    store: str = "files"
+    """Where descriptors are; see `stores.store_name`."""
+    dtype: str = "float32"
+    """What descriptors are kept as."""
+    grouping: str = "single"
+    """Every image is described alone: what a map says of a place depends on no neighbour."""
+    collection: str = ""
+    """What Milvus keeps the descriptors under."""
+    created: str = ""
+    format: int = FORMAT
+
+
+class MapImage(NamedTuple):
+    """What a map knows of an image besides its descriptor."""
+
+    name: str
+    """Its posix path relative to `root`; no two images of a map share one."""
+    bytes: int
+    """Size of the file that was described: another size is another picture."""
+    position: tuple[float, float] | None
+    root: str
+
+
+class _Segment(NamedTuple):
+    first: int
+    count: int
+    sha256: str
+
+
+def model_hash(params: Crisalad, config: ModelConfig) -> str:
+    """A digest of everything that descriptors are a function of, besides image size and rounding.
+
+    Of parameters by name, type, shape and value, and of the configuration without the image size,
+    the type that is computed in, what is kept for the gradient, and dropout: the same for a file of
+    weights and for its copy in another layout.
+    """
+    plain = to_plain(config)
+    for part, field in (("", "image_size"), ("", "compute_dtype"), ("", "keeps")):
+        (plain[part] if part else plain).pop(field)
+    for part in ("salad", "encoder"):
+        plain[part].pop("dropout")
+    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name, leaf in sorted(named_leaves(params).items()):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def describe_map(
+    params: Crisalad,
+    config: ModelConfig,
+    weights: pathlib.Path,
+    folder: pathlib.Path,
+    *,
+    store: str = "files",
+    dtype: str = "float32",
+) -> MapDescription:
+    """The description of a new map in `folder`, of images that this model is to describe.
+
+    Raises:
+        InputError: what `store_name` raises.
+    """
+    return MapDescription(
+        model=model_hash(params, config),
+        weights=str(weights.resolve()),
+        config=config,
+        descriptor_length=config.descriptor_dim,
+        store=store_name(store, folder, dtype),
+        dtype=dtype,
+        collection=f"crisalad_{uuid.uuid4().hex}",
+        created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    )
+
+
+def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
+    """What the map in `folder` says of itself; None where a new one can be made.
+
+    Raises:
+        InputError: the folder is a file or holds other things than a map, or the map is damaged or
+            of a newer version of this package.
+    """
+    folder = pathlib.Path(folder)
+    path = folder / _DESCRIPTION
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: found a file, expected a map's folder") from None
+        # Hidden is what a process leaves that was killed before it had made the map.
+        others = sorted(p.name for p in folder.glob("[!.]*"))
+        if others and others != [_SEGMENTS]:
+            raise InputError(
+                f"{folder}: found {others[0]} and no {_DESCRIPTION}, expected a map or an empty "
+                "folder"
+            ) from None
+        return None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read this map: {error}") from error
+    version = value.get("format") if isinstance(value, dict) else None
+    if type(version) is int and version > FORMAT:
+        raise InputError(
+            f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
+            "crisalad-jax"
+        )
+    return from_plain(MapDescription, value, source=str(path))
+
+
+def check_model(
+    description: MapDescription, folder: str | os.PathLike[str], found: str, weights: object
+) -> None:
+    """Check that a map is of the model whose hash is `found`.
+
+    Raises:
+        InputError: it is not; the message has both hashes.
+    """
+    if found != description.model:
+        raise InputError(
+            f"{folder}: found a map made by model {description.model[:12]} "
+            f"({description.weights}), but {weights} is model {found[:12]}"
+        )
+
+
+class Map:
+    """An open map; make it by `open_map` or, to append, by `open_for_appending`."""
+
+    def __init__(self, folder: pathlib.Path, description: MapDescription, store: Store) -> None:
+        """Read all records, and check that the store has as many descriptors."""
+        self.folder, self.description = folder, description
+        self.images: list[MapImage] = []
+        """By number."""
+        self._numbers: dict[str, int] = {}
+        self.axes: tuple[str, str] | None = None
+        """What positions are: see `positions.AXES`; None where no image has one."""
+        self._store = store
+        self._segments: list[_Segment] = []
+        for path in sorted((folder / _SEGMENTS).glob("[0-9]*.json")):
+            self._read_record(path)
+        store.check([(first, count) for first, count, _ in self._segments])
+
+    def __len__(self) -> int:
+        """How many images."""
+        return len(self.images)
+
+    def image(self, name: str) -> MapImage | None:
+        """What the map knows of the image of this name, if it has it."""
+        number = self._numbers.get(name)
+        return None if number is None else self.images[number]
+
+    def _record(self, first: int) -> pathlib.Path:
+        return self.folder / _SEGMENTS / f"{first:010d}.json"
+
+    def _read_record(self, path: pathlib.Path) -> None:
+        if path != self._record(len(self)):
+            raise InputError(f"{path}: expected {self._record(len(self)).name} before it")
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            columns = (record["names"], record["bytes"], record["positions"])
+            images = [
+                MapImage(str(name), int(size), at and (float(at[0]), float(at[1])), record["root"])
+                for name, size, at in zip(*columns, strict=True)
+            ]
+            axes = record["axes"] and (record["axes"][0], record["axes"][1])
+            segment = _Segment(len(self), len(images), str(record["sha256"]))
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise InputError(f"{path}: not a whole record of images: {error!r}") from error
+        self._take(images, axes, segment)
+
+    def _take(
+        self, images: list[MapImage], axes: tuple[str, str] | None, segment: _Segment
+    ) -> None:
+        self._numbers |= {image.name: segment.first + i for i, image in enumerate(images)}
+        self.images += images
+        self.axes = self.axes or axes
+        self._segments.append(segment)
+
+    def search(self, queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+        """The k most similar images of each query, best first, or all where the map has fewer.
+
+        Search is exact, by inner product; of equal similarities the earlier image stands first.
+
+        Args:
+            queries: unit descriptors, of the map's model.
+            k: neighbours per query.
+
+        Raises:
+            InputError: no queries, none in the map, descriptors that are no unit vectors of the
+                map's length, k below 1; or the store is damaged or gone.
+        """
+        if k < 1:
+            raise InputError(f"k: found {k}, expected at least 1")
+        if not len(self):
+            raise InputError(f"{self.folder}: found a map without images, expected at least one")
+        self._check_descriptors("queries", queries)
+        return self._store.search(queries, min(k, len(self)), len(self))
+
+    def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
+        length = self.description.descriptor_length
+        if descriptors.ndim != 2 or not len(descriptors) or descriptors.shape[1] != length:
+            raise InputError(
+                f"{name}: found shape {descriptors.shape}, expected (images, {length})"
+            )
+        # "Not within" rather than "beyond", so that NaN counts as wrong.
+        norms = np.linalg.norm(descriptors.astype(np.float32), axis=1)
+        if (wrong := np.flatnonzero(~(np.abs(norms - 1) <= _UNIT_TOLERANCE))).size:
+            raise InputError(
+                f"{name}: row {wrong[0]} is of length {norms[wrong[0]]:.4g}, expected unit vectors"
+            )
+
+    def append(
+        self,
+        names: Sequence[str],
+        sizes: Sequence[int],
+        descriptors: Float[np.ndarray, "n d"],
+        *,
+        root: str,
+        positions: Positions | None = None,
+    ) -> None:
+        """Append images; once this returns they are there for good, until then none of them is.
+
+        Args:
+            names: relative to `root`, none of which the map has.
+            sizes: of their files, in bytes.
+            descriptors: unit vectors; kept as the map's type.
+            root: the folder of these images.
+            positions: where they were taken, as far as that is known.
+
+        Raises:
+            InputError: a name that is there already or twice, descriptors that are no unit vectors,
+                positions in other axes than the map's, or a store that cannot be written to.
+        """
+        self._check_descriptors("descriptors", descriptors)
+        if twice := len(names) - len(set(names) - self._numbers.keys()):
+            raise InputError(
+                f"{self.folder}: found {twice} of {len(names)} names twice, or in the map already, "
+                "expected new ones"
+            )
+        known = positions.of if positions else {}
+        images = [
+            MapImage(name, size, known.get(name), root)
+            for name, size in zip(names, sizes, strict=True)
+        ]
+        axes = positions.axes if positions and any(image.position for image in images) else None
+        if axes and self.axes and axes != self.axes:
+            raise InputError(
+                f"{self.folder}: found positions in {', '.join(axes)}, expected "
+                f"{', '.join(self.axes)} as in the map"
+            )
+        kept = np.ascontiguousarray(descriptors, self.description.dtype)
+        segment = _Segment(len(self), len(images), hashlib.sha256(kept.data).hexdigest())
+        self._store.add(segment.first, kept)
+        record = {
+            "root": root,
+            "axes": axes,
+            "sha256": segment.sha256,
+            "names": list(names),
+            "bytes": list(sizes),
+            "positions": [image.position for image in images],
+        }
+        _write(self._record(segment.first), record)
+        self._take(images, axes, segment)
+
+    @property
+    def descriptors(self) -> Iterator[Float[np.ndarray, "n d"]]:
+        """All descriptors in order, as many at a time as were appended together."""
+        for first, count, _ in self._segments:
+            yield self._store.read(first, count)
+
+    def verify(self) -> None:
+        """Read all descriptors, and compare them with the digests that were taken of them.
+
+        Raises:
+            InputError: one has changed; the message says of which images.
+        """
+        for segment, descriptors in zip(self._segments, self.descriptors, strict=True):
+            kept = np.ascontiguousarray(descriptors, self.description.dtype)
+            if hashlib.sha256(kept.data).hexdigest() != segment.sha256:
+                raise InputError(
+                    f"{self._record(segment.first).with_suffix('')}: descriptors {segment.first} "
+                    f"to {segment.first + segment.count - 1} have changed since they were written"
+                )
+
+    def close(self) -> None:
+        """Let go of the store."""
+        self._store.close()
+
+
+@contextlib.contextmanager
+def open_map(folder: str | os.PathLike[str]) -> Iterator[Map]:
+    """Open a map to search it, as it is now: what is appended meanwhile is not seen.
+
+    Raises:
+        InputError: there is no map, or it or its store is damaged, gone, or of a newer version.
+    """
+    folder = pathlib.Path(folder)
+    description = read_description(folder)
+    if description is None:
+        raise InputError(f"{folder}: found no map, expected a folder that `crisalad index` wrote")
+    with contextlib.closing(_opened(folder, description)) as opened:
+        yield opened
+
+
+@contextlib.contextmanager
+def open_for_appending(
+    folder: str | os.PathLike[str], description: MapDescription
+) -> Iterator[Map]:
+    """Open the map that has this description to append to it, or make it.
+
+    One process at a time may; others may search meanwhile.
+
+    Raises:
+        InputError: another process appends, the map there is another one or what `open_map` raises,
+            or the folder cannot be written to.
+    """
+    folder = pathlib.Path(folder)
+    read_description(folder)  # or something else is there, where nothing is to be made
+    with contextlib.ExitStack() as stack:
+        try:
+            (folder / _SEGMENTS).mkdir(parents=True, exist_ok=True)
+            stack.enter_context(_locked(folder))
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+        found = read_description(folder)
+        remove_leftovers(folder / _SEGMENTS)
+        if found is None:
+            _write(folder / _DESCRIPTION, to_plain(description))
+        elif found != description:
+            raise InputError(f"{folder}: found another map than was expected here")
+        yield stack.enter_context(contextlib.closing(_opened(folder, description, append=True)))
+
+
+def _opened(folder: pathlib.Path, description: MapDescription, *, append: bool = False) -> Map:
+    records = (folder / _SEGMENTS).glob("[0-9]*.json")
+    store = open_store(
+        description.store,
+        folder,
+        collection=description.collection,
+        length=description.descriptor_length,
+        dtype=description.dtype,
+        new=append and next(records, None) is None,
+    )
+    try:
+        return Map(folder, description, store)
+    except BaseException:
+        store.close()
+        raise
+
+
+@contextlib.contextmanager
+def _locked(folder: pathlib.Path) -> Iterator[None]:
+    """Hold the map's lock, which ends with the process if not before."""
+    import fcntl
+
+    with (folder / _LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"{folder}: another process is appending to this map, expected to be the only one"
+            ) from error
+        yield
+
+
+def _write(path: pathlib.Path, value: Any) -> None:
+    try:
+        with durable_path(path) as temporary:
+            temporary.write_text(json.dumps(value) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,102 @@
+"""Descriptors in .npy files, one for each addition, searched exactly by FAISS."""
+
+import bisect
+import os
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import durable_path
+from crisalad_jax.retrieval import Neighbours
+from crisalad_jax.stores.ties import lower_first
+
+
+class FileStore:
+    """A `Store` in a folder of files, each named by the number of its first descriptor.
+
+    Files are mapped one after the other and let go again: a search has one in memory, whatever the
+    size of the map, and never more files open.
+    """
+
+    def __init__(self, folder: pathlib.Path, length: int, dtype: str) -> None:
+        """Descriptors of `length` numbers, kept as `dtype`; the folder is made by the first add."""
+        self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
+        names = (path.stem for path in folder.glob("*.npy") if path.stem.isdecimal())
+        self._firsts = sorted(map(int, names))
+
+    def _path(self, first: int) -> pathlib.Path:
+        return self._folder / f"{first:010d}.npy"
+
+    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+        """See `Store`."""
+        path = self._path(first)
+        try:
+            with durable_path(path) as temporary:
+                np.save(temporary, descriptors.astype(self._dtype))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error}") from error
+        # What a killed addition left may stand here already.
+        del self._firsts[bisect.bisect_left(self._firsts, first) :]
+        self._firsts.append(first)
+
+    def check(self, segments: Sequence[tuple[int, int]]) -> None:
+        """See `Store`."""
+        for first, count in segments:
+            self._open(first, count)
+
+    def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
+        """See `Store`."""
+        return np.array(self._open(first, count))
+
+    def _open(self, first: int, count: int | None = None) -> Float[np.ndarray, "n d"]:
+        path = self._path(first)
+        try:
+            rows = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise InputError(f"{path}: not a whole file of descriptors: {reason}") from error
+        expected = (len(rows) if count is None else count, self._length)
+        if rows.dtype != self._dtype or rows.shape != expected:
+            raise InputError(
+                f"{path}: found {rows.dtype} {rows.shape}, expected {self._dtype} {expected}"
+            )
+        return rows
+
+    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+        """See `Store`."""
+        import faiss
+
+        firsts = self._firsts[: bisect.bisect_left(self._firsts, count)]
+
+        def ask(queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+            best = Neighbours(
+                np.empty((len(queries), 0), np.int64), np.empty((len(queries), 0), np.float32)
+            )
+            for first in firsts:
+                block = np.ascontiguousarray(self._open(first), np.float32)
+                similarities, indices = faiss.knn(
+                    queries, block, min(k, len(block)), metric=faiss.METRIC_INNER_PRODUCT
+                )
+                both = np.concatenate([best.similarities, similarities], axis=1)
+                numbers = np.concatenate([best.indices, indices + first], axis=1)
+                order = np.argsort(-both, axis=1, kind="stable")[:, :k]
+                best = Neighbours(
+                    np.take_along_axis(numbers, order, axis=1),
+                    np.take_along_axis(both, order, axis=1),
+                )
+            return best
+
+        return lower_first(ask, np.ascontiguousarray(queries, np.float32), k, count)
+
+    def close(self) -> None:
+        """See `Store`: there are none."""
+
+
+def remove_leftovers(folder: pathlib.Path) -> None:
+    """Remove the temporary files that a killed addition left."""
+    for path in folder.glob(".*"):
+        if path.is_file():
+            os.unlink(path)

@@ -1,0 +1,209 @@
+"""Descriptors in Milvus: a server, or milvus-lite in this process, by the same code."""
+
+import contextlib
+import importlib.util
+import logging
+import os
+import pathlib
+import urllib.parse
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.retrieval import Neighbours
+from crisalad_jax.stores.ties import lower_first
+
+TOKEN = "CRISALAD_MILVUS_TOKEN"
+"""The environment variable that holds a server's token, or its user:password."""
+# Of the 64 MiB that a message of Milvus may have by default.
+_MESSAGE_BYTES = 2**24
+_MOST = 16384
+"""So many neighbours, and queries at once, and rows back, Milvus gives at most."""
+_LOGS = ("pymilvus.decorators", "milvus_lite.server_manager")
+
+
+def check_address(address: str) -> bool:
+    """Check where Milvus is: whether at an http address (True), or in a file (False).
+
+    Raises:
+        InputError: neither, or an address with a user's name.
+    """
+    if address.startswith(("http://", "https://")):
+        if "@" in urllib.parse.urlsplit(address).netloc:
+            raise InputError(
+                "store: found a user's name in the address, expected it in the environment "
+                f"variable {TOKEN}, which no file keeps"
+            )
+        return True
+    if "://" in address or not address.endswith(".db"):
+        raise InputError(
+            f"store: found {address!r} after milvus:, expected a file name.db or an address "
+            "http://host:port"
+        )
+    return False
+
+
+class MilvusStore:
+    """A `Store` in a collection of Milvus, whose index is FLAT: exact, as that of the files is."""
+
+    def __init__(self, address: str, collection: str, length: int, *, new: bool) -> None:
+        """Connect to `address`; a collection that is missing is made if this may be `new`."""
+        needed = ("pymilvus",) if check_address(address) else ("pymilvus", "milvus_lite")
+        if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
+            raise InputError(
+                f"store: found no {' nor '.join(missing)}, expected them installed: "
+                'pip install "crisalad-jax[milvus]"'
+            )
+        import pymilvus
+
+        self._address, self._collection = address, collection
+        self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
+        self._is_file = "milvus_lite" in needed
+        if self._is_file and new:
+            _make_folder(pathlib.Path(address).parent)
+        if self._is_file and not new and not pathlib.Path(address).exists():
+            raise InputError(f"{address}: found nothing, expected the descriptors of this map")
+        with self._one_line():
+            token = os.environ.get(TOKEN, "")
+            self._client = pymilvus.MilvusClient(address, token=token)
+            if not self._client.has_collection(collection):
+                if not new:
+                    raise InputError(
+                        f"{address}: found no collection {collection}, expected it with the "
+                        "descriptors of this map"
+                    )
+                self._create(length)
+            self._client.load_collection(collection)
+
+    @contextlib.contextmanager
+    def _one_line(self) -> Iterator[None]:
+        """What Milvus raises, as one line; the pages that it logs of the same are left out."""
+        import grpc
+        import pymilvus
+
+        loggers = [logging.getLogger(name) for name in _LOGS]
+        levels = [logger.level for logger in loggers]
+        try:
+            for logger in loggers:
+                logger.setLevel(logging.CRITICAL + 1)
+            yield
+        except (pymilvus.MilvusException, grpc.RpcError) as error:
+            words = getattr(error, "message", None) or str(error)
+            if "Open local milvus failed" in words:
+                words += " (damaged, or another process has it open)"
+            raise InputError(f"{self._address}: Milvus says: {' '.join(words.split())}") from error
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+
+    def _create(self, length: int) -> None:
+        from pymilvus import DataType
+
+        schema = self._client.create_schema(auto_id=False, enable_dynamic_field=False)
+        schema.add_field("id", DataType.INT64, is_primary=True)
+        schema.add_field("descriptor", DataType.FLOAT_VECTOR, dim=length)
+        index = self._client.prepare_index_params()
+        index.add_index("descriptor", index_type="FLAT", metric_type="IP")
+        self._client.create_collection(
+            self._collection, schema=schema, index_params=index, consistency_level="Strong"
+        )
+
+    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+        """See `Store`."""
+        rows = np.ascontiguousarray(descriptors, np.float32)
+        with self._one_line():
+            for start in range(0, len(rows), self._rows):
+                part = rows[start : start + self._rows]
+                self._client.upsert(
+                    self._collection,
+                    [{"id": first + start + i, "descriptor": row} for i, row in enumerate(part)],
+                )
+            self._client.flush(self._collection)
+
+    def check(self, segments: Sequence[tuple[int, int]]) -> None:
+        """See `Store`."""
+        expected = sum(count for _, count in segments)
+        with self._one_line():
+            answer = self._client.query(
+                self._collection, filter=f"id < {expected}", output_fields=["count(*)"]
+            )
+        if (found := answer[0]["count(*)"]) != expected:
+            raise InputError(
+                f"{self._address}: found {found} descriptors in {self._collection}, expected "
+                f"{expected}, as many as the map has images"
+            )
+
+    def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
+        """See `Store`."""
+        parts: list[Any] = []
+        for start in range(first, first + count, self._rows):
+            stop = min(start + self._rows, first + count)
+            with self._one_line():
+                parts += self._client.query(
+                    self._collection,
+                    filter=f"{start} <= id and id < {stop}",
+                    output_fields=["id", "descriptor"],
+                )
+        parts.sort(key=lambda part: part["id"])
+        if [part["id"] for part in parts] != list(range(first, first + count)):
+            raise InputError(
+                f"{self._address}: found {len(parts)} descriptors in {self._collection} from "
+                f"{first}, expected {count}"
+            )
+        return np.array([part["descriptor"] for part in parts], np.float32)
+
+    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+        """See `Store`."""
+        if k > _MOST:
+            raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
+
+        def ask(queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+            # Answers have bounds too: 12 bytes for each neighbour, and the number once more.
+            size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
+            parts = [
+                self._ask(queries[start : start + size], k, count)
+                for start in range(0, len(queries), size)
+            ]
+            return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
+
+        return lower_first(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
+
+    def _ask(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+        with self._one_line():
+            answers = self._client.search(
+                self._collection,
+                data=list(queries),
+                limit=k,
+                filter=f"id < {count}",
+                # milvus-lite takes an empty list for all fields, the descriptors among them.
+                output_fields=["id"],
+                search_params={"metric_type": "IP"},
+            )
+        if any(len(hits) != k for hits in answers):
+            raise InputError(
+                f"{self._address}: found {min(map(len, answers))} descriptors in "
+                f"{self._collection}, expected at least {k}"
+            )
+        return Neighbours(
+            np.array([[hit["id"] for hit in hits] for hits in answers], np.int64),
+            np.array([[hit["distance"] for hit in hits] for hits in answers], np.float32),
+        )
+
+    def close(self) -> None:
+        """See `Store`. A file may be opened by other processes again."""
+        with self._one_line():
+            self._client.close()
+        if self._is_file:
+            from milvus_lite.server_manager import server_manager_instance
+
+            server_manager_instance.release_server(self._address)
+
+
+def _make_folder(folder: pathlib.Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot make this folder: {error.strerror}") from error
