@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from crisalad_jax.config import choose
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path
+from crisalad_jax.files import atomic_path, check_source
 
 Descriptors = Float[np.ndarray, "image descriptor"]
 
@@ -61,3 +61,61 @@ def _write_h5(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]
             if f"{name}/global_descriptor" in file:
                 raise InputError(f"{path}: found the image name {name!r} twice, expected it once")
             file.create_dataset(f"{name}/global_descriptor", data=descriptor)
+
+
+def read_descriptors(path: str | os.PathLike[str]) -> tuple[list[str], Descriptors]:
+    """Names and descriptors from a file that `writer_for` writes, or hloc; of any float type.
+
+    A .npy file is mapped into memory, and read as it is used.
+
+    Raises:
+        InputError: the file, or the names beside a .npy, is missing, not whole, or holds something
+            else.
+    """
+    path = pathlib.Path(path)
+    readers = {".npy": _read_npy, ".h5": _read_h5}
+    read = choose(f"{path}: suffix of the descriptors' file", path.suffix, readers)
+    check_source(path, "a file of descriptors")
+    return read(path)
+
+
+def _read_npy(path: pathlib.Path) -> tuple[list[str], Descriptors]:
+    listed = _names_of(path)
+    check_source(listed, f"the names of the images in {path.name}")
+    names = listed.read_text(encoding="utf-8").splitlines()
+    try:
+        descriptors = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: not a whole .npy file: {error}") from error
+    if descriptors.ndim != 2 or len(descriptors) != len(names) or descriptors.dtype.kind != "f":
+        raise InputError(
+            f"{path}: found {descriptors.dtype} {descriptors.shape}, expected floats "
+            f"({len(names)}, descriptor), a row for each name in {listed.name}"
+        )
+    return names, descriptors
+
+
+def _read_h5(path: pathlib.Path) -> tuple[list[str], Descriptors]:
+    names: list[str] = []
+    rows: list[np.ndarray] = []
+
+    def take(name: str, item: object) -> None:
+        group, _, last = name.rpartition("/")
+        if last != "global_descriptor" or not isinstance(item, h5py.Dataset):
+            return
+        if item.ndim != 1 or item.dtype.kind != "f" or (rows and item.shape != rows[0].shape):
+            raise InputError(
+                f"{path}: found {item.dtype} {item.shape} as {name}, expected floats "
+                f"{rows[0].shape if rows else '(descriptor,)'}"
+            )
+        names.append(group)
+        rows.append(item[()])
+
+    try:
+        with h5py.File(path) as file:
+            file.visititems(take)
+    except OSError as error:
+        raise InputError(f"{path}: not a whole HDF5 file: {error}") from error
+    if not rows:
+        raise InputError(f"{path}: found no dataset global_descriptor, expected one for each image")
+    return names, np.stack(rows)

@@ -373,7 +373,7 @@ def open_for_appending(
         found = read_description(folder)
         remove_leftovers(folder / _SEGMENTS)
         if found is None:
-            _write(folder / _DESCRIPTION, to_plain(description))
+            _write(folder / _DESCRIPTION, to_plain(description), indent=2)
         elif found != description:
             raise InputError(f"{folder}: found another map than was expected here")
         yield stack.enter_context(contextlib.closing(_opened(folder, description, append=True)))
@@ -411,9 +411,9 @@ def _locked(folder: pathlib.Path) -> Iterator[None]:
         yield
 
 
-def _write(path: pathlib.Path, value: Any) -> None:
+def _write(path: pathlib.Path, value: Any, indent: int | None = None) -> None:
     try:
         with durable_path(path) as temporary:
-            temporary.write_text(json.dumps(value) + "\n", encoding="utf-8")
+            temporary.write_text(json.dumps(value, indent=indent) + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error

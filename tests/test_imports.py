@@ -21,7 +21,7 @@ LAYERS = (
     ("checkpoint", "states", "costs", "layouts"),
     ("convert",),
     ("training", "retrieval", "report", "descriptors"),
-    ("evaluation", "stores"),
+    ("evaluation", "pairs", "stores"),
     ("maps",),
     ("indexing",),
     ("fit",),

@@ -6,10 +6,17 @@ from typing import Literal
 
 from crisalad_jax.cli.common import console, model_of
 from crisalad_jax.data.images import list_images
-from crisalad_jax.descriptors import config_of, targets, writer_for
+from crisalad_jax.descriptors import (
+    Descriptors,
+    config_of,
+    read_descriptors,
+    targets,
+    writer_for,
+)
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, group, read_tokens
 from crisalad_jax.files import check_target, write_json
+from crisalad_jax.pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.serial import to_plain
 
 
@@ -33,6 +40,14 @@ class Extract:
     gains and loses."""
     seed: int = 0
     """Draws the shuffled order."""
+    root: pathlib.Path | None = None
+    """Folder that names are relative to, by default --images: hloc's folder of all images."""
+    pairs: pathlib.Path | None = None
+    """File for hloc's pairs: each image with those most similar to it, a pair a line."""
+    database: pathlib.Path | None = None
+    """Descriptors, .h5 or .npy, of the images that are paired with these; by default these."""
+    k: int = 20
+    """Pairs of each image; never with itself."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
     quiet: bool = False
@@ -42,8 +57,10 @@ class Extract:
 def run(arguments: Extract) -> None:
     """Describe the images, and write the descriptors."""
     write = writer_for(arguments.out)
-    for target in targets(arguments.out):
+    for target in (*targets(arguments.out), *([arguments.pairs] if arguments.pairs else [])):
         check_target(target)
+    if arguments.database is not None and arguments.pairs is None:
+        raise InputError("--database: found without --pairs, expected both")
     check_grouping([arguments.grouping], arguments.batch_size, arguments.seed)
     params, config, _ = model_of(
         arguments.weights,
@@ -51,6 +68,8 @@ def run(arguments: Extract) -> None:
         compute_dtype=arguments.compute_dtype,
     )
     paths = list_images(arguments.images)
+    names = _names(arguments, paths)
+    database = _database(arguments, names, config.descriptor_dim)
     folder = read_tokens(
         params,
         config,
@@ -68,7 +87,6 @@ def run(arguments: Extract) -> None:
         batch_size=arguments.batch_size,
         seed=arguments.seed,
     )[folder.readable]
-    names = [path.relative_to(arguments.images).as_posix() for path in paths]
     skipped = [name for name, ok in zip(names, folder.readable, strict=True) if not ok]
     kept = [name for name, ok in zip(names, folder.readable, strict=True) if ok]
     if not kept:
@@ -86,9 +104,45 @@ def run(arguments: Extract) -> None:
             "model": to_plain(config),
         },
     )
+    if arguments.pairs is not None:
+        pairs = nearest_pairs(kept, descriptors, *(database or (kept, descriptors)), k=arguments.k)
+        write_pairs(arguments.pairs, pairs)
+        console.print(f"{arguments.pairs}: {len(pairs)} pairs", soft_wrap=True)
     console.print(
         f"{arguments.out}: {len(kept)} descriptors of {config.descriptor_dim} numbers, "
         f"grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]})"
         + (f"; {len(skipped)} unreadable images left out" if skipped else ""),
         soft_wrap=True,
     )
+
+
+def _names(arguments: Extract, paths: list[pathlib.Path]) -> list[str]:
+    """Posix paths relative to --root, which holds --images."""
+    folder = pathlib.PurePath()
+    if arguments.root is not None:
+        images, root = arguments.images.resolve(), arguments.root.resolve()
+        if not images.is_relative_to(root):
+            raise InputError(f"--root: found {root}, expected a folder that holds {images}")
+        folder = images.relative_to(root)
+    return [(folder / path.relative_to(arguments.images)).as_posix() for path in paths]
+
+
+def _database(
+    arguments: Extract, names: list[str], length: int
+) -> tuple[list[str], Descriptors] | None:
+    """What these images are to be paired with; all is checked that can be before the work."""
+    if arguments.pairs is None:
+        return None
+    if arguments.k < 1:
+        raise InputError(f"k: found {arguments.k}, expected at least 1")
+    check_names(arguments.pairs, names)
+    if arguments.database is None:
+        return None
+    listed, descriptors = read_descriptors(arguments.database)
+    check_names(arguments.pairs, listed)
+    if descriptors.shape[1] != length:
+        raise InputError(
+            f"{arguments.database}: found descriptors of {descriptors.shape[1]} numbers, expected "
+            f"{length} as of these weights"
+        )
+    return listed, descriptors

@@ -22,7 +22,8 @@ TOKEN = "CRISALAD_MILVUS_TOKEN"
 _MESSAGE_BYTES = 2**24
 _MOST = 16384
 """So many neighbours, and queries at once, and rows back, Milvus gives at most."""
-_LOGS = ("pymilvus.decorators", "milvus_lite.server_manager")
+# The last: of a call that milvus-lite has not, and whose failure the client expects.
+_LOGS = ("pymilvus.decorators", "milvus_lite.server_manager", "grpc._server")
 
 
 def check_address(address: str) -> bool:
