@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from crisalad_jax.config import choose
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_source
+from crisalad_jax.files import atomic_path, check_source, write_npy
 
 Descriptors = Float[np.ndarray, "image descriptor"]
 
@@ -51,7 +51,7 @@ def _write_npy(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str
     with atomic_path(_names_of(path)) as temporary:
         temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
     with atomic_path(path) as temporary:
-        np.save(temporary, descriptors)
+        write_npy(temporary, descriptors)
 
 
 def _write_h5(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:

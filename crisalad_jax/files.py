@@ -8,6 +8,8 @@ import uuid
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from crisalad_jax.errors import InputError
 
 
@@ -95,6 +97,19 @@ def _sync(path: pathlib.Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_npy(path: pathlib.Path, array: np.ndarray) -> None:
+    """As `np.save`, which says nothing where the end of an array finds the disk full.
+
+    Raises:
+        OSError: the disk is full, or what `open` raises.
+    """
+    array = np.ascontiguousarray(array)
+    with path.open("wb") as file:
+        header = np.lib.format.header_data_from_array_1_0(array)
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(array.data)
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import durable_path
+from crisalad_jax.files import durable_path, write_npy
 from crisalad_jax.retrieval import Neighbours
 from crisalad_jax.stores.ties import lower_first
 
@@ -35,9 +35,9 @@ class FileStore:
         path = self._path(first)
         try:
             with durable_path(path) as temporary:
-                np.save(temporary, descriptors.astype(self._dtype))
+                write_npy(temporary, descriptors.astype(self._dtype))
         except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error}") from error
+            raise InputError(f"{path}: cannot be written: {error.strerror}") from error
         # What a killed addition left may stand here already.
         del self._firsts[bisect.bisect_left(self._firsts, first) :]
         self._firsts.append(first)

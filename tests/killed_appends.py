@@ -1,0 +1,188 @@
+"""Appends to maps in processes that die: a program for test_maps.
+
+Forked from one program that has imported everything, a child takes milliseconds. Prints how many
+children died.
+"""
+
+import os
+import pathlib
+import random
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+import crisalad_jax.stores.files
+from crisalad_jax.config import ModelConfig
+from crisalad_jax.errors import InputError
+from crisalad_jax.maps import MapDescription, open_for_appending, open_map, read_description
+
+LENGTH = 48
+
+
+def description(store: str) -> MapDescription:
+    return MapDescription(
+        model="0" * 64,
+        weights="w.safetensors",
+        config=ModelConfig(),
+        descriptor_length=LENGTH,
+        store=store,
+        collection="crisalad_map",
+    )
+
+
+def rows(first: int, count: int) -> np.ndarray:
+    """Descriptors of these numbers: functions of the number alone."""
+    numbers = range(first, first + count)
+    found = np.stack([np.random.default_rng(n).standard_normal(LENGTH) for n in numbers])
+    return (found / np.linalg.norm(found, axis=1, keepdims=True)).astype(np.float32)
+
+
+def names(first: int, count: int) -> list[str]:
+    return [f"{number}.jpg" for number in range(first, first + count)]
+
+
+def append_until(folder: pathlib.Path, total: int, store: str = "files") -> None:
+    """In segments of one to five."""
+    with open_for_appending(folder, description(store)) as target:
+        while (first := len(target)) < total:
+            count = min(1 + first % 5, total - first)
+            new = names(first, count)
+            target.append(new, [7] * count, rows(first, count), root="/images")
+
+
+def check(folder: pathlib.Path) -> int:
+    """How many images the map has, all of which are as they were appended."""
+    if read_description(folder) is None:
+        return 0
+    with open_map(folder) as opened:
+        opened.verify()
+        count = len(opened)
+        assert [image.name for image in opened.images] == names(0, count)
+        if count:
+            assert np.array_equal(np.concatenate(list(opened.descriptors)), rows(0, count))
+    return count
+
+
+def forked(work: Callable[[], object], kill_after: float | None = None) -> int:
+    """Do something in a child; its exit code, or minus the signal that it was killed by."""
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+            os._exit(0)
+        except InputError as error:
+            print(error, flush=True)
+            os._exit(2)
+        except BaseException as error:
+            print(repr(error), file=sys.stderr, flush=True)
+            os._exit(1)
+    if kill_after is not None:
+        time.sleep(kill_after)
+        os.kill(child, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def at_random(folder: pathlib.Path, store: str, kills: int, longest: float) -> None:
+    """Kill appends after up to `longest` seconds; a map that is finished is followed by another."""
+    generator = random.Random(kills)
+    killed, number, total = 0, 0, 100
+    while killed < kills:
+        target = folder / str(number)
+        code = forked(
+            lambda target=target: append_until(target, total, store),
+            kill_after=generator.uniform(0, longest),
+        )
+        assert code in (0, -signal.SIGKILL), code
+        killed += code != 0
+        # In a child too: Milvus starts threads, and what has threads should not fork.
+        assert forked(lambda target=target: check(target)) == 0
+        number += code == 0
+    assert forked(lambda: append_until(folder / str(number), total, store)) == 0
+    for path in folder.iterdir():
+        assert forked(lambda path=path: _expect(check(path), total)) == 0
+    print(killed)
+
+
+def _expect(found: int, expected: int) -> None:
+    assert found == expected, (found, expected)
+
+
+def at_every_step(folder: pathlib.Path, _store: str, _kills: int, _longest: float) -> None:
+    """Die before each call that changes the disk, or half-way through it, one child after another.
+
+    Between 3 images and 7 there are several appends.
+    """
+
+    def dying(step: int, target: pathlib.Path) -> None:
+        left = step
+
+        def now() -> bool:
+            nonlocal left
+            left -= 1
+            return left < 0
+
+        def instead(module: object, name: str, half: Callable[..., object]) -> None:
+            real = getattr(module, name)
+
+            def call(*arguments: object, **options: object) -> object:
+                if now():
+                    half(*arguments, **options)
+                    os._exit(9)
+                return real(*arguments, **options)
+
+            setattr(module, name, call)
+
+        def half_array(path: pathlib.Path, array: np.ndarray) -> None:
+            path.write_bytes(array.tobytes()[: array.nbytes // 2])
+
+        def half_text(path: pathlib.Path, text: str, **_: object) -> None:
+            path.write_bytes(text.encode()[: len(text) // 2])
+
+        for name in ("replace", "fsync", "mkdir", "unlink"):
+            instead(os, name, lambda *_, **__: None)
+        instead(crisalad_jax.stores.files, "write_npy", half_array)
+        instead(pathlib.Path, "write_text", half_text)
+        append_until(target, 7)
+
+    for start in (0, 3):
+        step = 0
+        while True:
+            target = folder / f"{start} {step}"
+            if start:
+                append_until(target, start)
+            code = forked(lambda step=step, target=target: dying(step, target))
+            assert start <= check(target) <= 7
+            if code == 0:
+                break
+            assert code == 9, code
+            append_until(target, 7)
+            assert check(target) == 7
+            assert not list((target / "segments").glob(".*"))
+            step += 1
+        print(step)
+
+
+def on_a_full_disk(folder: pathlib.Path, _store: str, _kills: int, _longest: float) -> None:
+    """No file may grow beyond some sizes: the description, a record, or descriptors do not fit."""
+
+    def limited(limit: int) -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        append_until(folder / str(limit), 7)
+
+    for limit, start in ((100, 0), (300, 3), (600, 3)):
+        if start:
+            append_until(folder / str(limit), start)
+        assert forked(lambda limit=limit: limited(limit)) == 2
+        assert start <= check(folder / str(limit)) < 7
+        append_until(folder / str(limit), 7)
+        assert check(folder / str(limit)) == 7
+
+
+if __name__ == "__main__":
+    how = {"random": at_random, "steps": at_every_step, "disk": on_a_full_disk}
+    how[sys.argv[1]](pathlib.Path(sys.argv[2]), sys.argv[3], int(sys.argv[4]), float(sys.argv[5]))
