@@ -137,9 +137,9 @@ def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
     except (FileNotFoundError, NotADirectoryError):
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: found a file, expected a map's folder") from None
-        # Hidden is what a process leaves that was killed before it had made the map.
+        # Hidden, or empty, is what a process leaves that was killed before it had made the map.
         others = sorted(p.name for p in folder.glob("[!.]*"))
-        if others and others != [_SEGMENTS]:
+        if others != [_SEGMENTS] * len(others) or any((folder / _SEGMENTS).glob("[!.]*")):
             raise InputError(
                 f"{folder}: found {others[0]} and no {_DESCRIPTION}, expected a map or an empty "
                 "folder"

@@ -95,6 +95,11 @@ def spoil(path: pathlib.Path, how: str) -> None:
     path.write_bytes({"empty": b"", "cut": data[: len(data) // 2], "text": b"no image"}[how])
 
 
+POSITIONAL = {
+    ("convert", "source"): "SRC",
+    ("convert", "target"): "DST",
+    ("query", "images"): "IMAGE",
+}
 SPOILT = pytest.mark.parametrize("how", ["empty", "cut", "text"])
 
 
@@ -107,8 +112,8 @@ def test_help_lists_every_command_and_flag(capfd):
         assert f"{command} {kind.__doc__}" in out
         help_text = succeeds(capfd, command, "--help")
         for field in dataclasses.fields(kind):
-            if field.name in ("source", "target"):
-                assert {"source": "SRC", "target": "DST"}[field.name] in help_text
+            if (command, field.name) in POSITIONAL:
+                assert POSITIONAL[command, field.name] in help_text
             elif field.name != "settings":
                 assert f"--{field.name.replace('_', '-')}" in help_text
     for flag in (

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from crisalad_jax.descriptors import writer_for
+from crisalad_jax.descriptors import read_descriptors, writer_for
 from crisalad_jax.errors import InputError
 
 NAMES = ["a.jpg", "summer/a.jpg", "summer/noon/with space.jpg", "Straße.jpg"]
@@ -67,3 +67,71 @@ def test_an_older_file_is_replaced(tmp_path, suffix):
 def test_another_suffix_is_refused_before_any_work(name):
     with pytest.raises(InputError, match=rf"{name}: suffix.*expected one of \.h5, \.npy"):
         writer_for(name)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "h5"])
+def test_what_was_written_is_read(tmp_path, suffix):
+    path = tmp_path / f"map.{suffix}"
+    writer_for(path)(path, DESCRIPTORS, NAMES)
+    names, descriptors = read_descriptors(path)
+    found = dict(zip(names, descriptors, strict=True))
+    assert set(found) == set(NAMES)
+    for name, expected in zip(NAMES, DESCRIPTORS, strict=True):
+        np.testing.assert_array_equal(found[name], expected)
+
+
+def write_h5(path: pathlib.Path, **arrays: np.ndarray) -> None:
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(f"{name}.jpg/global_descriptor", data=array)
+            file.create_dataset(f"{name}.jpg/keypoints", data=np.zeros((3, 2)))
+
+
+def test_hlocs_own_files_are_read_in_half_precision_beside_other_features(tmp_path):
+    write_h5(tmp_path / "f.h5", a=np.ones(4, np.float16), b=np.zeros(4, np.float16))
+    names, descriptors = read_descriptors(tmp_path / "f.h5")
+    assert names == ["a.jpg", "b.jpg"]
+    np.testing.assert_array_equal(descriptors, np.float16([[1] * 4, [0] * 4]))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda h5: h5.unlink(), "found no such file, expected a file of descriptors"),
+        (lambda h5: h5.write_bytes(h5.read_bytes()[:100]), "not a whole HDF5 file"),
+        (lambda h5: write_h5(h5), "found no dataset global_descriptor, expected one for each"),
+        (
+            lambda h5: write_h5(h5, a=np.ones(4), b=np.ones(5)),
+            r"found float64 \(5,\) as b\.jpg/glob",
+        ),
+        (lambda h5: write_h5(h5, a=np.ones((1, 4))), r"found float64 \(1, 4\) as a\.jpg/glob"),
+        (lambda h5: write_h5(h5, a=np.ones(4, int)), "found int64 .* expected floats"),
+    ],
+)
+def test_an_h5_that_is_no_file_of_descriptors_is_one_line(tmp_path, spoil, words):
+    path = tmp_path / "f.h5"
+    write_h5(path, a=np.ones(4))
+    spoil(path)
+    with pytest.raises(InputError, match=rf"f\.h5: {words}"):
+        read_descriptors(path)
+
+
+@pytest.mark.parametrize(
+    ("names", "array", "words"),
+    [
+        (None, DESCRIPTORS, r"map\.names\.txt: found no such file, expected the names of"),
+        (NAMES[1:], DESCRIPTORS, r"map\.npy: found float32 \(4, 6\), expected floats \(3, des"),
+        (NAMES, DESCRIPTORS.astype(int), r"map\.npy: found int64 \(4, 6\), expected floats"),
+        (NAMES, None, r"map\.npy: not a whole \.npy file"),
+    ],
+)
+def test_an_npy_without_its_names_is_one_line(tmp_path, names, array, words):
+    path = tmp_path / "map.npy"
+    if array is None:
+        path.write_bytes(b"none")
+    else:
+        np.save(path, array)
+    if names is not None:
+        path.with_suffix(".names.txt").write_text("\n".join(names))
+    with pytest.raises(InputError, match=words):
+        read_descriptors(path)

@@ -4,10 +4,11 @@ import json
 import os
 import pathlib
 
+import numpy as np
 import pytest
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_target, write_json
+from crisalad_jax.files import atomic_path, check_target, durable_path, write_json, write_npy
 
 
 def test_the_file_appears_when_it_is_whole(tmp_path: pathlib.Path):
@@ -71,3 +72,33 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: pathlib.Path):
         write_json(path, {"a": object()})
     assert json.loads(path.read_text()) == {"a": [1, 2.5, None]}
     assert os.listdir(tmp_path) == ["x.json"]
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+@pytest.mark.parametrize("shape", [(0, 3), (5, 3), (4000, 30)])
+def test_an_array_is_written_as_numpy_writes_it(tmp_path, dtype, shape):
+    array = np.random.default_rng(0).standard_normal(shape[::-1]).T.astype(dtype)
+    write_npy(tmp_path / "ours.npy", array)
+    np.save(tmp_path / "theirs.npy", np.ascontiguousarray(array))
+    assert (tmp_path / "ours.npy").read_bytes() == (tmp_path / "theirs.npy").read_bytes()
+
+
+def test_a_durable_file_is_on_the_disk_before_and_after_it_has_its_name(tmp_path, monkeypatch):
+    """First its bytes, then its name: the order in which both are told to the disk."""
+    told = []
+
+    def spied(name, real):
+        def call(first, *more):
+            path = os.readlink(f"/proc/self/fd/{first}") if name == "fsync" else str(first)
+            told.append((name, pathlib.Path(path).name[:1]))
+            return real(first, *more)
+
+        monkeypatch.setattr(os, name, call)
+
+    spied("fsync", os.fsync)
+    spied("replace", os.replace)
+    folder = tmp_path / "folder"
+    with durable_path(folder / "file.json") as temporary:
+        temporary.write_text("whole")
+    assert told == [("fsync", "."), ("replace", "."), ("fsync", "f")]
+    assert os.listdir(folder) == ["file.json"]

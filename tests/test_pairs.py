@@ -24,11 +24,10 @@ def pairs_as_hloc_reads_them(pairs: pathlib.Path, *features: pathlib.Path) -> di
     for line in text[:-1].split("\n"):
         query, image = line.split(" ")  # more or fewer than two is an error
         found.setdefault(query, []).append(image)
+    images = {name for paired in found.values() for name in paired}
     lengths = set()
-    for side, names in enumerate(
-        (set(found), {name for names in found.values() for name in names})
-    ):
-        with h5py.File(features[min(side, len(features) - 1)]) as file:
+    for path, names in ((features[0], set(found)), (features[-1], images)):
+        with h5py.File(path) as file:
             for name in names:
                 dataset = file[name]["global_descriptor"]
                 assert dataset.ndim == 1
@@ -39,12 +38,13 @@ def pairs_as_hloc_reads_them(pairs: pathlib.Path, *features: pathlib.Path) -> di
 
 
 def brute_force(queries: dict, database: dict, k: int) -> dict[str, list[str]]:
-    """In float64, a Python loop for each pair; names to vectors."""
+    """In float64, a Python loop for each pair; names to vectors; of equals the earlier first."""
     found = {}
     for query, vector in queries.items():
         others = [name for name in database if name != query]
         closeness = [float(np.dot(np.float64(vector), np.float64(database[n]))) for n in others]
-        found[query] = [others[i] for i in np.argsort(closeness)[::-1][:k]]
+        order = np.argsort(-np.array(closeness), kind="stable")
+        found[query] = [others[i] for i in order[:k]]
     return found
 
 

@@ -60,7 +60,7 @@ def _gallery(photographs, path, indices, positives, **options):
         photographs["database"],
         indices,
         similarities,
-        [np.array(p, np.int64) for p in positives],
+        positives and [np.array(p, np.int64) for p in positives],
         **options,
     )
     return _read(path)
@@ -207,6 +207,18 @@ def test_gallery_frames_are_green_where_right_and_red_where_wrong(photographs, t
         for left, top, _, box_height in boxes:
             below = picture[top + box_height + 1 : top + box_height + 25, left : left + 120]
             assert _near(below, colour).any()
+
+
+def test_gallery_without_positives_is_neither_green_nor_red(photographs, tmp_path):
+    """Two of four queries, from first to last, each with its own two pictures beside it."""
+    indices = [[0, 5], [1, 4], [2, 3], [3, 2]]
+    picture = _gallery(photographs, tmp_path / "g.png", indices, None, rows=2, columns=2)
+    assert not _is(picture, GREEN).any()
+    assert not _is(picture, RED).any()
+    # Queries 0 and 3, in the colours of pictures 0 and 3; found: 0 and 5, 3 and 2.
+    levels = [_is(picture, (60, 20 * number + 60, 90)).sum() for number in range(6)]
+    assert levels[1] == levels[4] == 0
+    assert levels[0] == levels[3] == 2 * levels[5] == 2 * levels[2] > 0
 
 
 def test_gallery_shows_the_pictures_asked_for(photographs, tmp_path):

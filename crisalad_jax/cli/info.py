@@ -12,6 +12,7 @@ from crisalad_jax.config import recipe
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.evaluation import check_grouping
 from crisalad_jax.files import check_target, write_json
+from crisalad_jax.maps import open_map
 from crisalad_jax.model import init_crisalad
 
 
@@ -23,6 +24,10 @@ class Info:
     """tiny, s14, b14, l14 or g14."""
     weights: pathlib.Path | None = None
     """Describe the model in this file instead."""
+    map: pathlib.Path | None = None
+    """Describe the map in this folder instead."""
+    verify: bool = False
+    """Read all of the map's descriptors, and compare them with their digests."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of 14; by default the model's."""
     trains: str | None = None
@@ -40,6 +45,9 @@ def run(arguments: Info) -> None:
     check_grouping((), arguments.batch_size, seed=0)
     if arguments.json is not None:
         check_target(arguments.json)
+    if arguments.map is not None:
+        _describe_map(arguments.map, arguments)
+        return
     if arguments.weights is not None:
         _, config = load_weights(arguments.weights)
         title = str(arguments.weights)
@@ -89,5 +97,30 @@ def run(arguments: Info) -> None:
             "patch)",
         ]
     console.print("\n".join(lines), soft_wrap=True, highlight=False)
+    if arguments.json is not None:
+        write_json(arguments.json, summary)
+
+
+def _describe_map(folder: pathlib.Path, arguments: Info) -> None:
+    with open_map(folder) as opened:
+        if arguments.verify:
+            opened.verify()
+        description = opened.description
+        summary = {
+            "images": len(opened),
+            "positions": sum(image.position is not None for image in opened.images),
+            "axes": opened.axes,
+            "descriptor": f"{description.descriptor_length} numbers, {description.dtype}",
+            "image_size": list(description.config.image_size),
+            "grouping": description.grouping,
+            "store": description.store,
+            "model": description.model,
+            "weights": description.weights,
+            "created": description.created,
+            "verified": arguments.verify,
+        }
+    width = max(map(len, summary))
+    lines = (f"{name:<{width}}  {value}" for name, value in summary.items())
+    console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
     if arguments.json is not None:
         write_json(arguments.json, summary)

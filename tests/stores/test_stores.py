@@ -219,7 +219,7 @@ def test_what_is_missing_in_milvus_is_named(tmp_path, in_milvus):
 
 
 def test_a_server_that_does_not_answer_is_one_line(tmp_path, capfd):
-    with pytest.raises(InputError, match="^http://127.0.0.1:9: Milvus says: Fail connecting"):
+    with pytest.raises(InputError, match=r"^http://127\.0\.0\.1:9: Milvus says: Fail connecting"):
         opened(tmp_path, "milvus:http://127.0.0.1:9")
     assert capfd.readouterr() == ("", "")
 
@@ -233,7 +233,7 @@ def test_a_server_gets_the_token_of_the_environment(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pymilvus, "MilvusClient", refuse)
     monkeypatch.setenv(milvus.TOKEN, "root:secret")
-    with pytest.raises(InputError, match="^https://a.b:1: Milvus says: auth check failure$"):
+    with pytest.raises(InputError, match=r"^https://a\.b:1: Milvus says: auth check failure$"):
         opened(tmp_path, "milvus:https://a.b:1")
     assert given == [(("https://a.b:1",), {"token": "root:secret"})]
 

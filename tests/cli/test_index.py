@@ -1,0 +1,340 @@
+"""`crisalad index`, `query` and `info --map`: maps made, grown, asked, refused."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoint import load_weights, save_weights
+from crisalad_jax.data.images import list_images
+from crisalad_jax.descriptors import read_descriptors, writer_for
+from crisalad_jax.evaluation import group, read_tokens
+from crisalad_jax.maps import open_map
+from tests.conftest import BATCH, MODEL, random_params
+from tests.stores.test_stores import ROUNDING, brute_force
+from tests.test_cli import fails, files_in, succeeds
+from tests.test_pairs import brute_force as nearest
+from tests.test_pairs import by_name, pairs_as_hloc_reads_them
+
+MILVUS = "milvus:{map}/rows.db"
+
+
+def index(shared: pathlib.Path, images: pathlib.Path, out: pathlib.Path, *more: object) -> tuple:
+    return (
+        *("index", "--weights", shared / "weights.safetensors", "--images", images),
+        *("--out", out, "--batch-size", BATCH, "--quiet", *more),
+    )
+
+
+def query(folder: pathlib.Path, *more: object) -> tuple:
+    return ("query", *more, "--map", folder, "--batch-size", BATCH, "--quiet")
+
+
+@pytest.fixture(scope="module")
+def database(shared) -> pathlib.Path:
+    return shared / "town" / "images" / "test" / "database"
+
+
+@pytest.fixture(scope="module")
+def queries(shared) -> pathlib.Path:
+    return shared / "town" / "images" / "test" / "queries"
+
+
+@pytest.fixture
+def folder(shared, database, tmp_path, capfd) -> pathlib.Path:
+    """A map of the town's database."""
+    succeeds(capfd, *index(shared, database, tmp_path / "map"))
+    return tmp_path / "map"
+
+
+def expected_answers(shared, database, queries, k: int) -> list[list[str]]:
+    """Names, by descriptors of the library and brute force."""
+    params, config = load_weights(shared / "weights.safetensors")
+    sides = []
+    for paths in (list_images(database), list_images(queries)):
+        tokens = read_tokens(params, config, paths, batch_size=BATCH, label="", quiet=True)
+        sides.append(group(params, config, tokens, "single", batch_size=BATCH))
+    names = [path.name for path in list_images(database)]
+    return [[names[i] for i in row] for row in brute_force(*sides, k)]
+
+
+@pytest.mark.parametrize("store", ["files", MILVUS])
+def test_a_map_is_made_grown_and_asked(shared, database, queries, tmp_path, capfd, store):
+    out, part = tmp_path / "map", tmp_path / "part"
+    part.mkdir()
+    for path in list_images(database)[:2]:
+        (part / path.name).symlink_to(path)
+    stored = ("--store", store.format(map=out))
+    said = succeeds(capfd, *index(shared, part, out, *stored))
+    assert f"{out}: 2 images added, 2 with positions; 2 descriptors of 48 numbers" in said
+    said = succeeds(capfd, *index(shared, database, out))
+    assert "5 images added, 5 with positions; 2 were there already; 7 descriptors" in said
+    assert "7 were there already" in succeeds(capfd, *index(shared, database, out, *stored))
+    assert (out / "rows.db").exists() == (store != "files")
+    assert any(name.endswith(".npy") for name in files_in(out)) == (store == "files")
+
+    answers = tmp_path / "answers.jsonl"
+    said = succeeds(capfd, *query(out, queries, "--k", 3, "--json", answers))
+    assert said == f"{answers}: 5 queries in a map of 7 images"
+    lines = [json.loads(line) for line in answers.read_text().splitlines()]
+    assert [line["query"] for line in lines] == [p.as_posix() for p in list_images(queries)]
+    found = [[answer["name"] for answer in line["neighbours"]] for line in lines]
+    assert found == expected_answers(shared, database, queries, 3)
+    first = lines[0]["neighbours"]
+    assert [answer["rank"] for answer in first] == [1, 2, 3]
+    east = float(first[0]["name"].split("@")[1])
+    assert first[0]["position"] == {"east": east, "north": 5000000.0}
+    assert 1 >= first[0]["similarity"] >= first[1]["similarity"] >= first[2]["similarity"]
+
+
+def test_answers_are_a_table_json_or_a_gallery(folder, queries, tmp_path, capfd, monkeypatch):
+    one, two = list_images(queries)[:2]
+    table = succeeds(capfd, *query(folder, one, two, "--k", 2))
+    for word in ("query", "rank", "similarity", "east, north", "7 images", "5000000"):
+        assert word in table
+    assert table.count("@@@database") == 4
+
+    printed = succeeds(capfd, *query(folder, one, two, "--k", 2, "--json", "-"))
+    decoder, rest, names = json.JSONDecoder(), printed, []
+    for _ in range(2):
+        line, end = decoder.raw_decode(rest)
+        names.append(line["query"])
+        rest = rest[end:].strip()
+    assert (names, rest) == ([one.as_posix(), two.as_posix()], "")
+
+    picture = tmp_path / "gallery.png"
+    said = succeeds(capfd, *query(folder, queries, "--gallery", picture))
+    assert said == f"{picture}: 5 queries in a map of 7 images"
+    image = cv2.imread(str(picture))
+    assert image is not None
+    # Five rows of a query and five answers, each 204 pixels wide, and wide rather than high.
+    assert image.shape[1] > 6 * 204
+    assert image.std() > 20
+
+
+def test_queries_are_searched_for_in_portions_all_the_same(
+    folder, queries, tmp_path, capfd, monkeypatch
+):
+    found = []
+    for number, at_once in enumerate((1024, 1)):
+        monkeypatch.setattr("crisalad_jax.cli.query._AT_ONCE", at_once)
+        path = tmp_path / f"{number}.jsonl"
+        succeeds(capfd, *query(folder, queries, "--json", path))
+        found.append([json.loads(line) for line in path.read_text().splitlines()])
+    for whole, part in zip(*found, strict=True):
+        for one, other in zip(whole["neighbours"], part["neighbours"], strict=True):
+            assert one["name"] == other["name"]
+            # To six decimals, of which rounding may change the last.
+            assert abs(one["similarity"] - other["similarity"]) <= ROUNDING
+    assert len(found[1]) == 5
+
+
+def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(
+    shared, database, queries, tmp_path, capfd
+):
+    weights = tmp_path / "weights.safetensors"
+    weights.write_bytes((shared / "weights.safetensors").read_bytes())
+    images = tmp_path / "images"
+    images.mkdir()
+    for path in list_images(database):
+        (images / path.name).write_bytes(path.read_bytes())
+    made = ("index", "--weights", weights, "--images", images, "--out", tmp_path / "map")
+    succeeds(capfd, *made, "--batch-size", BATCH, "--quiet")
+    folder = (tmp_path / "map").rename(tmp_path / "moved")
+    weights.unlink()
+    images.rename(tmp_path / "elsewhere")
+    asked = query(folder, queries, "--gallery", tmp_path / "g.png")
+    fails(capfd, *asked, words=(f"found no {weights}, which made this map", "--weights"))
+    asked = (*asked, "--weights", shared / "weights.safetensors")
+    fails(capfd, *asked, words=(images, "No such file"))
+    succeeds(capfd, *asked, "--map-images", tmp_path / "elsewhere")
+    assert files_in(tmp_path / "moved") == {
+        *("map.json", ".lock", "segments/0000000000.json", "segments/0000000000.npy")
+    }
+
+
+def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
+    said = succeeds(capfd, "info", "--map", folder, "--verify", "--json", tmp_path / "info.json")
+    assert "images 7" in said
+    assert "axes ('east', 'north')" in said
+    summary = json.loads((tmp_path / "info.json").read_text())
+    assert summary["weights"] == str(shared / "weights.safetensors")
+    assert summary["verified"] is True
+    path = folder / "segments" / "0000000000.npy"
+    path.write_bytes(path.read_bytes()[:-1] + b"!")
+    assert "verified False" in succeeds(capfd, "info", "--map", folder)
+    fails(capfd, "info", "--map", folder, "--verify", words=("descriptors 0 to 6 have changed",))
+
+
+def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
+    table = tmp_path / "positions.csv"
+    name = list_images(database)[1].name
+    table.write_text(f"name,lat,lon\n{name},1.5,-2.5\nother.jpg,0,0\n")
+    out = tmp_path / "map"
+    said = succeeds(capfd, *index(shared, database, out, "--positions", table))
+    assert "7 images added, 1 with positions" in said
+    with open_map(out) as found:
+        assert found.axes == ("lat", "lon")
+        assert [image.position for image in found.images][:3] == [None, (1.5, -2.5), None]
+    table.write_text("name,lat,lon\nother.jpg,0,0\n")
+    made = index(shared, database, tmp_path / "none", "--positions", table)
+    fails(capfd, *made, words=(table, "found none of the 7 images of", "expected names such as"))
+    assert not (tmp_path / "none").exists()
+
+
+def test_files_may_keep_half_precision(shared, database, queries, tmp_path, capfd):
+    succeeds(capfd, *index(shared, database, tmp_path / "map", "--dtype", "float16"))
+    assert np.load(tmp_path / "map" / "segments" / "0000000000.npy").dtype == np.float16
+    succeeds(capfd, *query(tmp_path / "map", queries, "--k", 1, "--json", tmp_path / "a.jsonl"))
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    best = [[answer["name"] for answer in line["neighbours"]] for line in lines]
+    assert best == expected_answers(shared, database, queries, 1)
+
+
+# Refused
+
+
+def test_a_map_of_another_model_is_refused(shared, folder, database, queries, tmp_path, capfd):
+    salad = dataclasses.replace(
+        MODEL.salad, sinkhorn=dataclasses.replace(MODEL.salad.sinkhorn, iterations=5)
+    )
+    config = dataclasses.replace(MODEL, salad=salad)
+    other = tmp_path / "other.safetensors"
+    save_weights(other, random_params(config), config)
+    before = files_in(folder)
+    words = (f"{folder}: found a map made by model", "is model", other)
+    made = ("index", "--weights", other, "--images", database, "--out", folder)
+    fails(capfd, *made, words=words)
+    fails(capfd, *query(folder, queries, "--weights", other), words=words)
+    assert files_in(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--image-size", 56, 56), "found image size (56, 56), expected (42, 56) as in the map"),
+        (("--compute-dtype", "bfloat16"), "found compute dtype bfloat16, expected float32"),
+        (("--dtype", "float16"), "found dtype float16, expected float32 as in the map"),
+        (("--store", "milvus:x.db"), "expected files as in the map"),
+        (("--store", "redis"), "store: found 'redis', expected files or milvus:URI"),
+        (("--batch-size", 0), "batch size: found 0, expected at least 1"),
+    ],
+)
+def test_a_map_keeps_its_settings(shared, folder, database, capfd, flags, words):
+    fails(capfd, *index(shared, database, folder, *flags), words=(words,))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("{images}", "--k", 0), "k: found 0, expected at least 1"),
+        (("{map}/map.json",), "map.json: found"),
+        (("{map}/none.jpg",), "none.jpg: cannot read: No such file"),
+        (("{map}/segments",), "segments: found no image"),
+        (("{images}", "--gallery", "{map}"), "map: found a folder, expected a file"),
+        (("{images}", "--json", "{map}"), "map: found a folder, expected a file"),
+        (("{images}", "--map", "{images}"), "and no map.json, expected a map"),
+        (("{images}", "--map", "{map}/none"), "none: found no map, expected a folder that"),
+    ],
+)
+def test_bad_questions_are_one_line(folder, queries, capfd, arguments, words):
+    filled = [str(part).format(map=folder, images=queries) for part in arguments]
+    fails(capfd, *query(folder)[:1], "--map", folder, *filled, "--quiet", words=(words,))
+
+
+def test_a_folder_without_a_readable_image_makes_no_images(shared, tmp_path, capfd):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(b"none")
+    made = index(shared, tmp_path / "images", tmp_path / "map", "--on-bad-image", "skip")
+    fails(capfd, *made, words=("found 1 images, none of them readable",))
+
+
+@pytest.mark.slow
+def test_the_command_killed_while_it_appends_goes_on(shared, database, tmp_path):
+    """The real program, two images a segment, killed as soon as another segment is there."""
+    program = (
+        "import sys, crisalad_jax.indexing, crisalad_jax.cli as cli\n"
+        "crisalad_jax.indexing.SEGMENT = 2\n"
+        "sys.exit(cli.main(sys.argv[1:]))"
+    )
+    out = tmp_path / "map"
+    made = [str(part) for part in index(shared, database, out, "--batch-size", 1)]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
+
+    def segments() -> int:
+        return len(list((out / "segments").glob("*.json")))
+
+    kills = 0
+    while True:
+        before = segments()
+        running = subprocess.Popen([sys.executable, "-c", program, *made], env=environment)
+        while running.poll() is None and segments() == before:
+            pass
+        if running.poll() is not None:
+            break
+        running.kill()
+        running.wait()
+        kills += 1
+    assert running.returncode == 0
+    assert kills >= 2
+    whole = tmp_path / "whole"
+    made = [str(part) for part in index(shared, database, whole, "--batch-size", 1)]
+    subprocess.run([sys.executable, "-c", program, *made], check=True, env=environment)
+    with open_map(out) as one, open_map(whole) as other:
+        one.verify()
+        assert one.images == other.images
+        np.testing.assert_array_equal(
+            np.concatenate(list(one.descriptors)), np.concatenate(list(other.descriptors))
+        )
+
+
+# Pairs
+
+
+def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_path, capfd):
+    """Names relative to the folder of all images, as hloc has them; against brute force."""
+    root = shared / "town" / "images" / "test"
+
+    def extract(images: pathlib.Path, out: str, *more: object) -> tuple:
+        return (
+            *("extract", "--weights", shared / "weights.safetensors", "--images", images),
+            *("--root", root, "--out", tmp_path / out, "--batch-size", BATCH, "--quiet", *more),
+        )
+
+    one, two = tmp_path / "among.txt", tmp_path / "pairs.txt"
+    said = succeeds(capfd, *extract(database, "db.h5", "--pairs", one, "--k", 2))
+    assert f"{one}: 14 pairs" in said
+    shared_flags = ("--pairs", two, "--k", 3, "--database", tmp_path / "db.h5")
+    assert f"{two}: 15 pairs" in succeeds(capfd, *extract(queries, "q.h5", *shared_flags))
+
+    sides = [by_name(*read_descriptors(tmp_path / name)) for name in ("db.h5", "q.h5")]
+    assert set(sides[1]) == {f"queries/{path.name}" for path in list_images(queries)}
+    among = pairs_as_hloc_reads_them(one, tmp_path / "db.h5")
+    assert among == nearest(sides[0], sides[0], 2)
+    between = pairs_as_hloc_reads_them(two, tmp_path / "q.h5", tmp_path / "db.h5")
+    assert between == nearest(sides[1], sides[0], 3)
+
+    for more, words in (
+        (("--database", tmp_path / "db.h5"), "--database: found without --pairs, expected both"),
+        (("--pairs", two, "--k", 0), "k: found 0, expected at least 1"),
+        (("--pairs", two, "--database", tmp_path / "no.h5"), "no.h5: found no such file, expected"),
+        (("--root", queries), f"--root: found {queries}, expected a folder that holds {database}"),
+    ):
+        fails(capfd, *extract(database, "x.h5", *more), words=(words,))
+    short = tmp_path / "short.h5"
+    writer_for(short)(short, np.eye(3, dtype=np.float32), ["a", "b", "c"])
+    wrong = extract(database, "x.h5", "--pairs", two, "--database", short)
+    fails(capfd, *wrong, words=("short.h5: found descriptors of 3 numbers, expected 48",))
+    spaced = tmp_path / "images"
+    spaced.mkdir()
+    (spaced / "a b.jpg").write_bytes(list_images(database)[0].read_bytes())
+    wrong = extract(spaced, "x.h5", "--root", spaced, "--pairs", tmp_path / "none.txt")
+    fails(capfd, *wrong, words=("none.txt: found the image name 'a b.jpg'", "without spaces"))
+    assert not list(tmp_path.glob("x.*"))
+    assert not (tmp_path / "none.txt").exists()

@@ -1,0 +1,55 @@
+"""Positions from names and tables."""
+
+import pytest
+
+from crisalad_jax.data.positions import read_positions, utm_positions
+from crisalad_jax.errors import InputError
+
+
+def test_names_say_east_and_north():
+    found = utm_positions(
+        ["a/@0012.50@5000000.25@10@S@.jpg", "@1@-2@.png", "plain.jpg", "@x@y@.jpg", "@nan@1@.jpg"]
+    )
+    assert found.axes == ("east", "north")
+    assert found.of == {
+        "a/@0012.50@5000000.25@10@S@.jpg": (12.5, 5000000.25),
+        "@1@-2@.png": (1.0, -2.0),
+    }
+
+
+@pytest.mark.parametrize("axes", [("east", "north"), ("lat", "lon")])
+def test_a_table_in_any_order_with_more_columns(tmp_path, axes):
+    path = tmp_path / "positions.csv"
+    text = f'\ufeff{axes[1]},time,name,{axes[0]}\n2.5,x,"a, b.jpg",1\n-4e1,y,c/d.jpg,3\n'
+    path.write_text(text, encoding="utf-8")
+    found = read_positions(path)
+    assert found.axes == axes
+    assert found.of == {"a, b.jpg": (1.0, 2.5), "c/d.jpg": (3.0, -40.0)}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "found columns none, expected name,east,north or name,lat,lon"),
+        ("name,east,y\n", "found columns name, east, y, expected name,east,north"),
+        ("name,east,north\na,1,2\na,1,2\n", "line 3: found 'a' twice"),
+        ("name,east,north\na,1,\n", r"line 2: found \['1', ''\], expected two finite numbers"),
+        ("name,east,north\na,1\n", r"line 2: found \['1', None\], expected two finite"),
+        ("name,east,north\na,1,inf\n", "line 2: .*expected two finite numbers"),
+        ("name,lat,lon\na,91,0\n", "line 2: .*expected a latitude and a longitude"),
+        ("name,lat,lon\na,0,181\n", "line 2: .*expected a latitude and a longitude"),
+    ],
+)
+def test_a_table_that_is_none_is_one_line(tmp_path, text, words):
+    path = tmp_path / "positions.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=rf"positions\.csv: {words}"):
+        read_positions(path)
+
+
+def test_a_table_that_cannot_be_read_is_one_line(tmp_path):
+    with pytest.raises(InputError, match=r"none\.csv: cannot read these positions: No such file"):
+        read_positions(tmp_path / "none.csv")
+    (tmp_path / "bytes.csv").write_bytes(b"name,east,north\n\xff,1,2\n")
+    with pytest.raises(InputError, match=r"bytes\.csv: cannot read these positions: 'utf-8'"):
+        read_positions(tmp_path / "bytes.csv")
