@@ -340,12 +340,15 @@ def open_map(folder: str | os.PathLike[str]) -> Iterator[Map]:
     """Open a map to search it, as it is now: what is appended meanwhile is not seen.
 
     Raises:
-        InputError: there is no map, or it or its store is damaged, gone, or of a newer version.
+        InputError: there is no map, it has no images yet, or it or its store is damaged, gone, or
+            of a newer version.
     """
     folder = pathlib.Path(folder)
     description = read_description(folder)
     if description is None:
         raise InputError(f"{folder}: found no map, expected a folder that `crisalad index` wrote")
+    if not _has_images(folder):
+        raise InputError(f"{folder}: found a map without images, expected at least one")
     with contextlib.closing(_opened(folder, description)) as opened:
         yield opened
 
@@ -376,18 +379,21 @@ def open_for_appending(
             _write(folder / _DESCRIPTION, to_plain(description), indent=2)
         elif found != description:
             raise InputError(f"{folder}: found another map than was expected here")
-        yield stack.enter_context(contextlib.closing(_opened(folder, description, append=True)))
+        yield stack.enter_context(contextlib.closing(_opened(folder, description)))
 
 
-def _opened(folder: pathlib.Path, description: MapDescription, *, append: bool = False) -> Map:
-    records = (folder / _SEGMENTS).glob("[0-9]*.json")
+def _has_images(folder: pathlib.Path) -> bool:
+    return any((folder / _SEGMENTS).glob("[0-9]*.json"))
+
+
+def _opened(folder: pathlib.Path, description: MapDescription) -> Map:
     store = open_store(
         description.store,
         folder,
         collection=description.collection,
         length=description.descriptor_length,
         dtype=description.dtype,
-        new=append and next(records, None) is None,
+        new=not _has_images(folder),
     )
     try:
         return Map(folder, description, store)

@@ -56,7 +56,8 @@ def append_until(folder: pathlib.Path, total: int, store: str = "files") -> None
 
 def check(folder: pathlib.Path) -> int:
     """How many images the map has, all of which are as they were appended."""
-    if read_description(folder) is None:
+    if not any((folder / "segments").glob("[0-9]*.json")):
+        read_description(folder)
         return 0
     with open_map(folder) as opened:
         opened.verify()

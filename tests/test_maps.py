@@ -9,13 +9,14 @@ import sys
 
 import jax
 import numpy as np
+import pymilvus
 import pytest
 
 from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.errors import InputError
+from crisalad_jax.files import write_json
 from crisalad_jax.maps import (
-    MapDescription,
     check_model,
     describe_map,
     model_hash,
@@ -23,6 +24,7 @@ from crisalad_jax.maps import (
     open_map,
     read_description,
 )
+from crisalad_jax.serial import to_plain
 from tests import killed_appends
 from tests.conftest import MODEL, random_params
 from tests.killed_appends import append_until, description, names, rows
@@ -36,7 +38,7 @@ def killed(how: str, folder: pathlib.Path, store: str = "files", kills: int = 0,
     """Run tests/killed_appends.py; what it printed."""
     program = [sys.executable, "-m", "tests.killed_appends", how, folder, store, kills, longest]
     done = subprocess.run(list(map(str, program)), cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout.splitlines()
 
 
@@ -298,6 +300,26 @@ def test_queries_that_are_none_are_refused(folder, queries, k, words):
 
 def test_a_map_without_images_answers_nothing(tmp_path):
     with open_for_appending(tmp_path / "map", description("files")) as target:
-        assert isinstance(target.description, MapDescription)
-    with open_map(tmp_path / "map") as found, pytest.raises(InputError, match="a map without imag"):
-        found.search(rows(0, 1), 1)
+        assert len(target) == 0
+        with pytest.raises(InputError, match="map: found a map without images"):
+            target.search(rows(0, 1), 1)
+    with pytest.raises(InputError, match="found a map without imag"), open_map(tmp_path / "map"):
+        pass
+
+
+def test_a_map_in_milvus_that_was_killed_before_it_had_images_goes_on(tmp_path):
+    """The file is not there yet; or the collection is, but without its index."""
+    for number in range(2):
+        made = description("milvus:rows.db")
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        write_json(folder / "map.json", to_plain(made))
+        if number:
+            client = pymilvus.MilvusClient(str(folder / "rows.db"))
+            schema = client.create_schema(auto_id=False)
+            schema.add_field("id", pymilvus.DataType.INT64, is_primary=True)
+            schema.add_field("descriptor", pymilvus.DataType.FLOAT_VECTOR, dim=LENGTH)
+            client.create_collection(made.collection, schema=schema)
+            client.close()
+        append_until(folder, 4, made.store)
+        assert killed_appends.check(folder) == 4

@@ -35,7 +35,9 @@ _ROWS = 24
 class Query:
     """Find the images of a map that are most similar to others, and say where they were taken."""
 
-    images: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")]
+    images: Annotated[
+        tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")
+    ]
     """Images, or folders of them."""
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""

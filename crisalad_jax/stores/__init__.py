@@ -83,7 +83,7 @@ def open_store(
         collection: what Milvus keeps this map's descriptors under.
         length: numbers in a descriptor.
         dtype: of the files.
-        new: whether the store may be missing, and is made then.
+        new: whether the store is made, in place of what is left of one that a kill kept from that.
 
     Raises:
         InputError: it cannot be reached, is missing, or holds something else.

@@ -51,7 +51,7 @@ class MilvusStore:
     """A `Store` in a collection of Milvus, whose index is FLAT: exact, as that of the files is."""
 
     def __init__(self, address: str, collection: str, length: int, *, new: bool) -> None:
-        """Connect to `address`; a collection that is missing is made if this may be `new`."""
+        """Connect to `address`; the collection is made if it is `new`, else it has to be there."""
         needed = ("pymilvus",) if check_address(address) else ("pymilvus", "milvus_lite")
         if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
             raise InputError(
@@ -70,14 +70,15 @@ class MilvusStore:
         with self._one_line():
             token = os.environ.get(TOKEN, "")
             self._client = pymilvus.MilvusClient(address, token=token)
-            if not self._client.has_collection(collection):
-                if not new:
-                    raise InputError(
-                        f"{address}: found no collection {collection}, expected it with the "
-                        "descriptors of this map"
-                    )
+            if new:
+                self._client.drop_collection(collection)
                 self._create(length)
-            self._client.load_collection(collection)
+            elif not self._client.has_collection(collection):
+                raise InputError(
+                    f"{address}: found no collection {collection}, expected it with the "
+                    "descriptors of this map"
+                )
+            self._load()
 
     @contextlib.contextmanager
     def _one_line(self) -> Iterator[None]:
@@ -106,11 +107,29 @@ class MilvusStore:
         schema = self._client.create_schema(auto_id=False, enable_dynamic_field=False)
         schema.add_field("id", DataType.INT64, is_primary=True)
         schema.add_field("descriptor", DataType.FLOAT_VECTOR, dim=length)
+        self._client.create_collection(
+            self._collection, schema=schema, index_params=self._flat(), consistency_level="Strong"
+        )
+
+    def _flat(self) -> Any:
         index = self._client.prepare_index_params()
         index.add_index("descriptor", index_type="FLAT", metric_type="IP")
-        self._client.create_collection(
-            self._collection, schema=schema, index_params=index, consistency_level="Strong"
-        )
+        return index
+
+    def _load(self) -> None:
+        import pymilvus
+
+        try:
+            self._client.load_collection(self._collection)
+        except pymilvus.MilvusException:
+            if not self._is_file:
+                raise
+            # milvus-lite writes indices, which are made of the descriptors, in place: one that a
+            # kill cut short would never load again.
+            self._client.release_collection(self._collection)
+            self._client.drop_index(self._collection, "descriptor")
+            self._client.create_index(self._collection, self._flat())
+            self._client.load_collection(self._collection)
 
     def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
         """See `Store`."""

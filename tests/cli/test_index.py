@@ -6,6 +6,7 @@ import os
 import pathlib
 import subprocess
 import sys
+import time
 
 import cv2
 import numpy as np
@@ -275,7 +276,7 @@ def test_the_command_killed_while_it_appends_goes_on(shared, database, tmp_path)
         before = segments()
         running = subprocess.Popen([sys.executable, "-c", program, *made], env=environment)
         while running.poll() is None and segments() == before:
-            pass
+            time.sleep(0.01)
         if running.poll() is not None:
             break
         running.kill()

@@ -218,6 +218,22 @@ def test_what_is_missing_in_milvus_is_named(tmp_path, in_milvus):
         )
 
 
+def test_an_index_that_a_kill_cut_short_is_made_again(tmp_path, in_milvus, capfd):
+    """milvus-lite writes it in place, and cannot load what is left of it."""
+    rows = unit_rows(10)
+    fill(in_milvus, rows, (6, 4))
+    in_milvus.close()
+    indices = sorted((tmp_path / "rows.db").rglob("*.idx"))
+    assert indices
+    for path, rest in zip(indices, (b"", b"half"), strict=False):
+        path.write_bytes(rest)
+    again = opened(tmp_path, "milvus:rows.db", new=False)
+    again.check([(0, 6), (6, 4)])
+    np.testing.assert_array_equal(again.search(rows, 1, 10).indices[:, 0], range(10))
+    again.close()
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_server_that_does_not_answer_is_one_line(tmp_path, capfd):
     with pytest.raises(InputError, match=r"^http://127\.0\.0\.1:9: Milvus says: Fail connecting"):
         opened(tmp_path, "milvus:http://127.0.0.1:9")
