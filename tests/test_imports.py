@@ -15,12 +15,13 @@ SOURCE = pathlib.Path(__file__).parents[1] / PACKAGE
 LAYERS = (
     ("errors", "cores"),
     ("config", "pytree", "files", "progress", "platform", "processes"),
-    ("sinkhorn", "losses", "serial", "data", "metrics", "stops"),
-    ("nn",),
+    ("sinkhorn", "losses", "serial", "data", "metrics", "stops", "groupings", "scores"),
+    ("nn", "same_place"),
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),
     ("convert",),
     ("training", "retrieval", "report", "descriptors"),
+    ("results",),
     ("evaluation",),
     ("fit",),
     ("demo",),
@@ -33,6 +34,7 @@ LEAVES = {
     "pytree": set(),
     "sinkhorn": {"config", "errors", "pytree"},
     "losses": {"config", "errors"},
+    "scores": {"errors"},
     "data": {"config", "cores", "errors", "files", "data"},
 }
 CORE = (
