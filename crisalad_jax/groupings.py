@@ -30,8 +30,9 @@ DEFAULT_GROUPINGS = ("single", "shuffled", "sequential", "window/single")
 class Grouping:
     """A protocol: one of `GROUPINGS` for the queries and one for the database.
 
-    A database by `window` is a map whose images were described as they were recorded, one by one on
-    the way; of a database in no such order it says nothing.
+    `window` takes the order of the files for the order in time. That is so of numbered frames;
+    @UTM names stand in the order of their eastings. A database by `window` is a map whose images
+    were described as they were recorded, one by one on the way.
     """
 
     queries: str

@@ -99,7 +99,7 @@ def summarise(
         )
         for each, curve in zip(rankings.values(), curves, strict=True)
     ]
-    mean = _over(scores, statistics.fmean)
+    mean = _over(scores, statistics.mean)
     return GroupingResult(
         grouping,
         mean.recalls,
@@ -133,7 +133,7 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
     Below each recall stands its interval, and behind a mean over shuffles their spread.
     """
     table = Table(show_lines=True)
-    table.add_column("queries/\ndatabase", overflow="fold")
+    table.add_column("queries/\ndatabase", no_wrap=True)
     recall_names = [f"R@{k}\n95 %" for k in results[0].recalls]
     for name in ("same place\nq / db", *recall_names, "AP", "R at\n100 % P"):
         table.add_column(name, justify="right", overflow="fold")
