@@ -205,7 +205,7 @@ def evaluate(
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
         radius: metres within which two images of one side show the same place, where the benchmark
-            has positions; elsewhere its ground truth tells (see `same_place.by_truth`).
+            has positions; elsewhere its ground truth tells (`same_place.by_truth`).
         cache: of decoded images.
         quiet: no progress bars.
 
@@ -259,17 +259,20 @@ class _Side(NamedTuple):
     """From a shuffle's seed to that of this side: two sides are never shuffled alike."""
 
 
+def same_place_rule(benchmark: Benchmark, radius: float) -> str:
+    """By what `evaluate` tells whether two images of one side show the same place, in words."""
+    if benchmark.query_positions is None or benchmark.database_positions is None:
+        return "a common positive"
+    return f"a distance of at most {radius:g} m"
+
+
 def _same_place(
     benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]], radius: float
 ) -> tuple[SamePlace, SamePlace]:
     """Of the queries and of the database: by positions, or where there are none by ground truth."""
-    by_positives = by_truth(positives, len(benchmark.database))
-    positions = benchmark.query_positions, benchmark.database_positions
-    queries, database = (
-        told if where is None else near(where, radius)
-        for told, where in zip(by_positives, positions, strict=True)
-    )
-    return queries, database
+    if benchmark.query_positions is None or benchmark.database_positions is None:
+        return by_truth(positives, len(benchmark.database))
+    return near(benchmark.query_positions, radius), near(benchmark.database_positions, radius)
 
 
 def _mean_share(side: _Side, kind: str, seeds: Sequence[int], batch_size: int) -> float | None:
@@ -296,11 +299,12 @@ def _rank(
     fixed = {
         side.name: descriptors(side, kind, seeds[0]) for side, kind in sides if kind != "shuffled"
     }
-    rankings = {}
-    for seed in seeds:
+
+    def ranking(seed: int) -> Neighbours:
         database, queries = (
             fixed[side.name] if side.name in fixed else descriptors(side, kind, seed)
             for side, kind in sides
         )
-        rankings[seed] = search(database, queries, k=min(max(KS), len(database)))
-    return rankings
+        return search(database, queries, k=min(max(KS), len(database)))
+
+    return {seed: ranking(seed) for seed in seeds}

@@ -1,5 +1,7 @@
 """How many of the images that an image looked at show its own place: what a grouping gives away."""
 
+import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -36,40 +38,49 @@ def by_truth(
     """
     found = np.concatenate(positives) if positives else np.empty(0, np.int64)
     asking = np.repeat(np.arange(len(positives)), [len(each) for each in positives])
-    queries = _share(asking, found, len(positives), database)
-    return queries, _share(found, asking, database, len(positives))
+    queries = _Sharing(asking, found, len(positives), database)
+    return queries, _Sharing(found, asking, database, len(positives))
 
 
-def _share(
-    owners: Int64[np.ndarray, " entry"],
-    things: Int64[np.ndarray, " entry"],
-    owner_count: int,
-    thing_count: int,
-) -> SamePlace:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Sharing:
     """Whether two owners have a thing in common. Memory is linear in entries and pairs."""
-    codes = np.unique(owners * thing_count + things)
-    owned = codes % max(thing_count, 1)
-    bounds = np.searchsorted(codes, np.arange(owner_count + 1) * thing_count)
-    sizes = np.diff(bounds)
-    step = max(1, _CHUNK // max(1, int(sizes.max(initial=0))))
 
-    def same(a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]) -> np.ndarray:
-        parts = [_same(a[i : i + step], b[i : i + step]) for i in range(0, len(a), step)]
-        return np.concatenate(parts) if parts else np.zeros(0, bool)
+    owners: Int64[np.ndarray, " entry"]
+    things: Int64[np.ndarray, " entry"]
+    owner_count: int
+    thing_count: int
 
-    def _same(a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]) -> np.ndarray:
-        # Everything that the one has, looked up at the other.
-        counts = sizes[a]
+    @functools.cached_property
+    def _codes(self) -> Int64[np.ndarray, " code"]:
+        """Each entry as one number, ascending: those of an owner stand together."""
+        return np.unique(self.owners * self.thing_count + self.things)
+
+    @functools.cached_property
+    def _bounds(self) -> Int64[np.ndarray, " bound"]:
+        """Where each owner's begin, and the end."""
+        return np.searchsorted(self._codes, np.arange(self.owner_count + 1) * self.thing_count)
+
+    def __call__(
+        self, a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]
+    ) -> Bool[np.ndarray, " pair"]:
+        most = int(np.diff(self._bounds).max(initial=1))
+        step = max(1, _CHUNK // most)
+        found = [self._part(a[i : i + step], b[i : i + step]) for i in range(0, len(a), step)]
+        return np.concatenate([np.zeros(0, bool), *found])
+
+    def _part(
+        self, a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]
+    ) -> Bool[np.ndarray, " pair"]:
+        """Everything that the one has, looked up at the other."""
+        counts = np.diff(self._bounds)[a]
         pair = np.repeat(np.arange(len(a)), counts)
         place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
-        wanted = b[pair] * thing_count + owned[bounds[a][pair] + place]
-        where = np.searchsorted(codes, wanted)
-        hit = np.zeros(len(wanted), bool)
-        inside = where < len(codes)
-        hit[inside] = codes[where[inside]] == wanted[inside]
+        things = self._codes[self._bounds[a][pair] + place] % max(self.thing_count, 1)
+        wanted = b[pair] * self.thing_count + things
+        first = np.searchsorted(self._codes, wanted, side="left")
+        hit = np.searchsorted(self._codes, wanted, side="right") > first
         return np.bincount(pair[hit], minlength=len(a)) > 0
-
-    return same
 
 
 def same_place_share(batches: Batches, same: SamePlace) -> float | None:
@@ -77,6 +88,8 @@ def same_place_share(batches: Batches, same: SamePlace) -> float | None:
 
     It is the mean over all images that looked at another one; None where none did.
     """
+    if not batches.mutual:
+        return None
     count = int(batches.kept.sum())
     share, looking = 0.0, 0
     readable = np.ones(count, bool)

@@ -575,7 +575,8 @@ def test_evaluate_prints_and_writes_the_table(
         assert f"{100 * result.recalls[1]:.1f}" in out
     assert table["model"] == to_plain(MODEL)
     assert (table["batch_size"], table["seed"], table["seeds"]) == (BATCH, 3, 2)
-    assert (table["radius"], table["rule"]) == (25.0, benchmark.rule)
+    assert table["rule"] == benchmark.rule
+    assert f"the image's own place, told by {table['same_place']}" in out
     assert files_in(tmp_path / "pictures") == {
         "config.json",
         *(f"gallery_{name.replace('/', '-')}.png" for name in groupings),

@@ -11,7 +11,7 @@ import pytest
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import FolderTokens, evaluate, group, read_tokens
+from crisalad_jax.evaluation import FolderTokens, evaluate, group, read_tokens, same_place_rule
 from crisalad_jax.groupings import GROUPINGS, batches_of
 from crisalad_jax.model import describe
 from crisalad_jax.results import GroupingResult
@@ -293,6 +293,8 @@ def test_shares_are_told_by_positions_or_else_by_the_truth(params, benchmark):
         )
         return result.query_share, result.database_share
 
+    assert same_place_rule(placed, 45.0) == "a distance of at most 45 m"
+    assert same_place_rule(benchmark, 45.0) == "a common positive"
     # By fours (0 40 80 120) and (160 200 210): each of the last two sees one of two.
     assert shares(placed) == (0, (0.5 + 0.5) / 7)
     # The query at 205 has both of them as positives.

@@ -6,11 +6,16 @@ from typing import Literal
 
 from crisalad_jax.cli.common import console, grouping_words, model_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.evaluation import evaluate, positives_of
+from crisalad_jax.evaluation import evaluate, positives_of, same_place_rule
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
 from crisalad_jax.results import GroupingResult, grouping_table, to_json
 from crisalad_jax.serial import to_plain
+
+_RECALLS = (
+    "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
+    "R at 100 % P: of the queries with a positive, those more alike than the first wrong retrieval."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,18 +91,19 @@ def run(arguments: Evaluate) -> None:
         quiet=arguments.quiet,
     )
     console.print(grouping_table(results))
+    same_place = same_place_rule(benchmark, arguments.radius)
     notes = [_RECALLS]
     if params.encoder is None:
         notes.append("No cross-image encoder: no descriptor depends on its batch.")
     else:
-        notes += _notes(arguments, groupings)
+        notes += _notes(arguments, groupings, same_place)
     for note in notes:
         console.print(note, soft_wrap=True)
     resolved = {
         "weights": None if arguments.weights is None else str(arguments.weights),
         "benchmark": benchmark.name,
         "rule": benchmark.rule,
-        "radius": arguments.radius,
+        "same_place": same_place,
         "batch_size": arguments.batch_size,
         "seed": arguments.seed,
         "seeds": arguments.seeds,
@@ -114,19 +120,13 @@ def run(arguments: Evaluate) -> None:
         write_json(arguments.out / "config.json", resolved)
 
 
-_RECALLS = (
-    "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
-    "R at 100 % P: of the queries with a positive, those more alike than the first wrong retrieval."
-)
-
-
-def _notes(arguments: Evaluate, groupings: list[Grouping]) -> list[str]:
+def _notes(arguments: Evaluate, groupings: list[Grouping], same_place: str) -> list[str]:
     """What the table's groupings are."""
     kinds = dict.fromkeys(kind for each in groupings for kind in (each.queries, each.database))
     notes = [
         "A descriptor of this model depends on the images in its batch of "
         f"{arguments.batch_size}: {grouping_words(kinds)}. Same place: of the others in sight, "
-        "those that show the image's own place."
+        f"those that show the image's own place, told by {same_place}."
     ]
     if "shuffled" in kinds and arguments.seeds > 1:
         notes.append(
