@@ -111,7 +111,9 @@ def group(
     descriptors = np.empty((count, config.descriptor_dim), np.float32)
     # A window gives one descriptor; as many of them as a batch has images are taken at a time.
     step = batch_size if grouping == "window" else 1
-    with progress_bar(f"{label}, {grouping}", count, "images", quiet=quiet) as bar:
+    # Beside the backbone the other groupings take no time.
+    silent = quiet or grouping != "window"
+    with progress_bar(f"{label}, {grouping}", count, "images", quiet=silent) as bar:
         for start in range(0, len(batches.images), step):
             part = batches.part(start, start + step)
             relate_part = _relate_windows if grouping == "window" else _relate_batch
