@@ -106,7 +106,7 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         benchmark.queries,
         benchmark.database,
         *after[0].neighbours,
-        positives_of(benchmark),
+        benchmark.ground_truth(),
         title="Queries and what the trained model finds, every image described alone",
     )
     with atomic_path(out / "recalls.md") as temporary:
@@ -146,4 +146,4 @@ def _hog_recalls(benchmark: Benchmark) -> dict[int, float]:
         hog_descriptors([read_image(path) for path in paths])
         for paths in (benchmark.database, benchmark.queries)
     ]
-    return recalls(search(*sides, k=max(KS)).indices, positives_of(benchmark), KS)
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)

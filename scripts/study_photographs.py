@@ -65,7 +65,7 @@ def hog_recalls(benchmark: Benchmark) -> dict[int, float]:
         hog_descriptors([read_image(path) for path in paths])
         for paths in (benchmark.database, benchmark.queries)
     ]
-    return recalls(search(*sides, k=max(KS)).indices, positives_of(benchmark), KS)
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)
 
 
 def main() -> None:

@@ -27,7 +27,8 @@ class Evaluate:
     """
 
     data: pathlib.Path
-    """Evaluation set: a folder of @UTM names, or VPR-Bench's layout."""
+    """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
+    folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     weights: pathlib.Path | None = None
     """A .safetensors file of this package; none evaluates an untrained model of --preset."""
     preset: str = "b14"
@@ -41,9 +42,18 @@ class Evaluate:
     """Images that a cross-image encoder sees together (the paper: 16)."""
     split: str | None = None
     """train, val or test, where the set has several."""
-    radius: float = 25.0
-    """Largest distance of a positive in metres, for @UTM names; and of two images of one side that
-    show the same place."""
+    layout: str | None = None
+    """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default what DATA looks
+    like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
+    images: pathlib.Path | None = None
+    """Folder of the images that a .mat file or .npy lists name; by default beside them."""
+    radius: float | None = None
+    """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
+    max_heading_difference: float | None = None
+    """Largest difference of compass angles of a positive in degrees, for raw MSLS; by default any
+    (the paper: 40)."""
+    frames: int | None = None
+    """How many frames a positive may be away, for two plain folders of the same moments."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -74,7 +84,16 @@ def run(arguments: Evaluate) -> None:
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
-    benchmark = open_benchmark(arguments.data, arguments.split, arguments.radius)
+    benchmark = open_benchmark(
+        arguments.data,
+        arguments.split,
+        arguments.radius,
+        images=arguments.images,
+        max_heading_difference=arguments.max_heading_difference,
+        frames=arguments.frames,
+        layout=arguments.layout,
+    )
+    positives = benchmark.ground_truth()
     console.print(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
         f"images; positive: {benchmark.rule}\n{model_name}",
