@@ -16,7 +16,7 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import KS, evaluate, positives_of
+from crisalad_jax.evaluation import KS, evaluate
 from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.fit import fit
 from crisalad_jax.metrics import read_metrics

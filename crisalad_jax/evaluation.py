@@ -166,20 +166,6 @@ def _relate_last(
     return jax.vmap(last)(places, masks)
 
 
-def positives_of(benchmark: Benchmark) -> tuple[Int64[np.ndarray, " _"], ...]:
-    """The ground truth.
-
-    Raises:
-        InputError: there is none.
-    """
-    if benchmark.positives is None:
-        raise InputError(
-            f"{benchmark.name}: found no ground truth, expected the right database images of every "
-            "query, to count recalls"
-        )
-    return benchmark.positives
-
-
 def evaluate(
     params: Crisalad,
     config: ModelConfig,
@@ -217,7 +203,7 @@ def evaluate(
     """
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
-    positives = positives_of(benchmark)
+    positives = benchmark.ground_truth()
 
     def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
         tokens = read_tokens(

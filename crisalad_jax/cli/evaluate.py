@@ -6,7 +6,7 @@ from typing import Literal
 
 from crisalad_jax.cli.common import console, grouping_words, model_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.evaluation import evaluate, positives_of, same_place_rule
+from crisalad_jax.evaluation import evaluate, same_place_rule
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
 from crisalad_jax.results import GroupingResult, grouping_table, to_json
@@ -167,6 +167,6 @@ def _write_galleries(
             benchmark.queries,
             benchmark.database,
             *result.neighbours,
-            positives_of(benchmark),
+            benchmark.ground_truth(),
             title=f"{benchmark.name}, {model_name}, {result.grouping}",
         )

@@ -132,10 +132,7 @@ def _validation(arguments: Train) -> Benchmark | None:
         if arguments.val_images is not None:
             raise InputError("--val-images: found no --val, expected it beside --val")
         return None
-    validation = open_benchmark(arguments.val, images=arguments.val_images)
-    # Asked for now, not after the first epoch.
-    validation.ground_truth()
-    return validation
+    return open_benchmark(arguments.val, images=arguments.val_images)
 
 
 def _start(arguments: Train, config: TrainConfig) -> Crisalad | None:
