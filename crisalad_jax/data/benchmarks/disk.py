@@ -41,6 +41,11 @@ def shown(names: Iterable[str]) -> str:
     return f"{some} and {len(ordered) - 8} more" if len(ordered) > 8 else some
 
 
+def has_split(root: pathlib.Path) -> bool:
+    """Whether any of `images/{test,val,train}` is there."""
+    return any((root / "images" / split).is_dir() for split in SPLITS)
+
+
 def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str]:
     """The folder that holds database/ and queries/, and what to call it.
 

@@ -19,6 +19,7 @@ from crisalad_jax.files import check_source
 
 _FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
 _DATABASE_FOLDERS = (".", "images")
+# The folders of queries first: names in them may be those of database images, too.
 _QUERY_FOLDERS = ("queries_real", "queries", "query", ".")
 
 

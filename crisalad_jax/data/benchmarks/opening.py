@@ -8,7 +8,7 @@ from typing import NamedTuple
 from crisalad_jax.config import choose
 from crisalad_jax.data.benchmarks import folders, vpr_bench
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import find_split, is_pair, listing
+from crisalad_jax.data.benchmarks.disk import find_split, has_split, is_pair, listing
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls, read_msls_subtask
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
 from crisalad_jax.data.benchmarks.salad_lists import has_lists, is_list, read_salad_lists
@@ -100,7 +100,7 @@ def _find_layout(root: pathlib.Path, split: str | None) -> str:
         )
     if is_msls(root):
         return "msls"
-    if (root / "images").is_dir() or is_pair(root, "database", "queries"):
+    if has_split(root) or is_pair(root, "database", "queries"):
         folder, _ = find_split(root, split)
         plain = (folder / folders.TRUTH).exists() or not has_utm_names(folder)
         return "folders" if plain else "utm"

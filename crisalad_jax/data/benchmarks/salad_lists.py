@@ -20,7 +20,8 @@ from crisalad_jax.errors import InputError
 
 _FILE = re.compile(r"(?P<prefix>(?:.*_)?)(?P<kind>dbImages|qImages|gt|qIdx|pIdx)\.npy")
 _MSLS_IMAGE = re.compile(r"train_val/([^/]+)/(?:database|query)/images/[^/]+")
-_QUERY_FOLDERS = (".", "queries_real")
+# The folder of queries first: names in it may be those of database images, too.
+_QUERY_FOLDERS = ("queries_real", ".")
 
 _Lists = dict[str, pathlib.Path]
 """The files of a set, by their kind."""

@@ -100,6 +100,15 @@ def test_images_are_found_where_the_tools_have_them(tmp_path, database, queries)
         read_netvlad(path)
 
 
+def test_queries_with_the_names_of_database_images_are_not_taken_for_these(tmp_path):
+    write_images(tmp_path)
+    path = write(tmp_path / "a.mat", qImage=cells(DATABASE_NAMES[:9]))
+    for name in DATABASE_NAMES[:9]:
+        touch(tmp_path / "queries_real" / name)
+    expected = tuple(tmp_path / "queries_real" / name for name in DATABASE_NAMES[:9])
+    assert read_netvlad(path).queries == expected
+
+
 def test_missing_images_are_counted(tmp_path):
     write_images(tmp_path)
     path = write(tmp_path / "a.mat")

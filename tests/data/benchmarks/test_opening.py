@@ -75,6 +75,9 @@ def test_files_of_netvlad_and_salad_are_found(tmp_path):
     write_images(tmp_path / "lists", DATABASE + QUERIES)
     write_lists(tmp_path / "lists", "hall_", dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
     assert open_benchmark(tmp_path / "lists").name == "hall (SALAD's lists)"
+    # A folder images/ is not yet one of splits.
+    touch(tmp_path / "lists" / "images" / "a.jpg")
+    assert open_benchmark(tmp_path / "lists").name == "hall (SALAD's lists)"
     name = open_benchmark(tmp_path / "lists" / "hall_dbImages.npy").name
     assert name == "hall (SALAD's lists)"
     with pytest.raises(InputError, match=r"notes.txt: found a file, expected a folder, a .mat"):

@@ -52,6 +52,13 @@ def test_pittsburgh(tmp_path, queries_in, named_in):
     assert benchmark.database_positions is None
 
 
+def test_queries_with_the_names_of_database_images_are_not_taken_for_these(tmp_path):
+    write_images(tmp_path, DATABASE + [f"queries_real/{name}" for name in DATABASE[:3]])
+    write_lists(tmp_path, "a_", dbImages=DATABASE, qImages=DATABASE[:3], gt=TRUTH)
+    expected = tuple(tmp_path / "queries_real" / name for name in DATABASE[:3])
+    assert read_salad_lists(tmp_path).queries == expected
+
+
 def msls_names(part: str, count: int) -> list[str]:
     return [
         f"train_val/{'cph' if i < count // 2 else 'sf'}/{part}/images/{part[0]}{i}.jpg"
