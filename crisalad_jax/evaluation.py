@@ -15,7 +15,6 @@ from crisalad_jax import platform
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
-from crisalad_jax.errors import InputError
 from crisalad_jax.groupings import (
     DEFAULT_GROUPINGS,
     Batches,
@@ -175,11 +174,13 @@ def evaluate(
     batch_size: int = 16,
     seed: int = 0,
     seeds: int = 3,
-    radius: float = 25.0,
     cache: ImageCache | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
     """Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
+
+    Two images of one side show the same place where the benchmark's positions, or where it has none
+    its ground truth, say so (`same_place`).
 
     A model without a cross-image encoder has one result, `any`: no descriptor depends on a batch.
     Beyond the tokens memory holds the descriptors of one grouping and seed at a time.
@@ -192,8 +193,6 @@ def evaluate(
         batch_size: images that look at each other.
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
-        radius: metres within which two images of one side show the same place, where the benchmark
-            has positions; elsewhere its ground truth tells (`same_place.by_truth`).
         cache: of decoded images.
         quiet: no progress bars.
 
@@ -211,7 +210,7 @@ def evaluate(
         )
         return _Side(name, tokens, same, offset)
 
-    same_queries, same_database = _same_place(benchmark, positives, radius)
+    same_queries, same_database = _same_place(benchmark, positives)
     database = side("database", benchmark.database, same_database, 0)
     queries = side("queries", benchmark.queries, same_queries, 1)
     describe = functools.partial(group, params, config, batch_size=batch_size, quiet=quiet)
@@ -247,19 +246,20 @@ class _Side(NamedTuple):
     """From a shuffle's seed to that of this side: two sides are never shuffled alike."""
 
 
-def same_place_rule(benchmark: Benchmark, radius: float) -> str:
+def same_place_rule(benchmark: Benchmark) -> str:
     """By what `evaluate` tells whether two images of one side show the same place, in words."""
     if benchmark.query_positions is None or benchmark.database_positions is None:
         return "a common positive"
-    return f"a distance of at most {radius:g} m"
+    return f"a distance of at most {benchmark.radius:g} m"
 
 
 def _same_place(
-    benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]], radius: float
+    benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]]
 ) -> tuple[SamePlace, SamePlace]:
     """Of the queries and of the database: by positions, or where there are none by ground truth."""
     if benchmark.query_positions is None or benchmark.database_positions is None:
         return by_truth(positives, len(benchmark.database))
+    radius = benchmark.radius
     return near(benchmark.query_positions, radius), near(benchmark.database_positions, radius)
 
 

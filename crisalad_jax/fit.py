@@ -205,8 +205,6 @@ class _Run:
         split_state: bool = False,
     ) -> None:
         # What does not fit raises before claim_run writes the first file, in all processes.
-        if validation is not None:
-            validation.ground_truth()
         checksums = {
             "configuration": zlib.crc32(json.dumps(to_plain(config)).encode()),
             "places": _checksum([_text(places.files), places.place_start]),

@@ -93,7 +93,6 @@ def run(arguments: Evaluate) -> None:
         frames=arguments.frames,
         layout=arguments.layout,
     )
-    positives = benchmark.ground_truth()
     console.print(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
         f"images; positive: {benchmark.rule}\n{model_name}",
@@ -107,11 +106,10 @@ def run(arguments: Evaluate) -> None:
         batch_size=arguments.batch_size,
         seed=arguments.seed,
         seeds=arguments.seeds,
-        radius=arguments.radius,
         quiet=arguments.quiet,
     )
     console.print(grouping_table(results))
-    same_place = same_place_rule(benchmark, arguments.radius)
+    same_place = same_place_rule(benchmark)
     notes = [_RECALLS]
     if params.encoder is None:
         notes.append("No cross-image encoder: no descriptor depends on its batch.")

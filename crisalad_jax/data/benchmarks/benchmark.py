@@ -26,6 +26,8 @@ class Benchmark:
     database_positions: Float64[np.ndarray, "database 2"] | None = None
     """East and north in metres, for maps; None where there are none, or only placeholders."""
     query_positions: Float64[np.ndarray, "q 2"] | None = None
+    radius: float = 25.0
+    """Metres within which two positions show the same place."""
 
     def ground_truth(self) -> tuple[Int64[np.ndarray, " _"], ...]:
         """`positives`, for those who cannot do without.

@@ -153,6 +153,7 @@ def _read(
         rule=f"{rule}; no panoramas",
         database_positions=np.concatenate([side.positions for side in database]),
         query_positions=np.concatenate([side.positions for side in queries]),
+        radius=radius,
     )
 
 

@@ -71,6 +71,7 @@ def read_netvlad(
         rule=f"UTM distance of at most {radius:g} m",
         database_positions=places,
         query_positions=asked,
+        radius=radius,
     )
 
 

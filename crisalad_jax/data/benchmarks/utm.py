@@ -92,7 +92,7 @@ def read_utm(
     else:
         name = f"{msls_title(cities)}, downloader style, {len(queries)} queries, {radius:g} m"
         rule += f"; by the notes in the names it is MSLS of {', '.join(sorted(cities))}"
-    return Benchmark(name, root, database, queries, positives, rule, places, asked)
+    return Benchmark(name, root, database, queries, positives, rule, places, asked, radius)
 
 
 def has_utm_names(folder: pathlib.Path) -> bool:
