@@ -38,6 +38,8 @@ _CHECKED = 64
 """Rows whose lengths are found at a time."""
 _ALIGNMENT = 64
 """Bytes on whose multiples XLA's arrays begin."""
+_NEIGHBOURS = 2**21
+"""Bytes: the system maps pages around the one that is read, on Linux up to so many."""
 _WIDE = np.dtype(np.float32)
 _KEPT = (_WIDE, np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
 """Types that go to the device as they are; it widens them to float32, which loses nothing."""
@@ -377,5 +379,6 @@ def _let_go(rows: np.ndarray) -> None:
     mapping: Any = owner.base
     origin = np.frombuffer(mapping, np.uint8).ctypes.data
     first, end = (place - origin for place in np.lib.array_utils.byte_bounds(rows))
-    first -= first % mmap.PAGESIZE
+    # Reading the first page has brought some before it back, of those let go last.
+    first = max(0, first - first % mmap.PAGESIZE - _NEIGHBOURS)
     mapping.madvise(mmap.MADV_DONTNEED, first, end - first)

@@ -229,18 +229,24 @@ def test_devices_change_no_bit(count, tmp_path):
 
 
 _IN_MEMORY = """
-import resource, sys
+import pathlib, re, sys
 import jax, numpy as np
 from crisalad_jax.retrieval import search
+
+def most():
+    # What getrusage says begins with the memory of the program that started this one.
+    status = pathlib.Path("/proc/self/status").read_text()
+    return int(re.search("VmHWM:\\s*(\\d+) kB", status)[1])
+
 database, queries = (np.load(path, mmap_mode="r") for path in sys.argv[1:])
 search(database[:2048], queries, 5, chunk=512)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = most()
 search(database, queries, 5, chunk=512)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+print(most() - before)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="counts KiB, and pages that are let go")
+@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's account of memory")
 def test_memory_does_not_grow_with_the_database(tmp_path):
     """10,000 and 100,000 rows of 1 KiB, of which a program that kept them would have 102 MB."""
     generator = np.random.default_rng(0)
@@ -255,9 +261,8 @@ def test_memory_does_not_grow_with_the_database(tmp_path):
         del rows
         said = in_a_program(_IN_MEMORY, tmp_path, str(path), str(tmp_path / "queries.npy"))
         grown[count] = int(said) * 1024
-    # A chunk is 0.5 MB: allocators and threads differ by some MB from run to run.
-    assert grown[100_000] - grown[10_000] < 12e6
-    assert grown[100_000] < 30e6
+    # A chunk is 0.5 MB, as are the pages that the system reads around it.
+    assert grown[100_000] - grown[10_000] < 4e6
 
 
 def test_a_copy_on_write_map_keeps_what_was_written_to_it(tmp_path):
