@@ -7,13 +7,11 @@ that counts every query.
 import functools
 import itertools
 import math
-import mmap
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import ml_dtypes
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Float32, Int, Int32, Int64
@@ -22,11 +20,10 @@ from crisalad_jax import platform
 from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.errors import InputError
 from crisalad_jax.progress import progress_bar
+from crisalad_jax.rows import KEPT, UNIT_TOLERANCE, WIDE, Block, aligned, as_rows, blocks
 
 # Queries compared at a time: with 4,096 database rows their similarities are 16 MiB.
 _QUERY_CHUNK = 1024
-# Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
-_UNIT_TOLERANCE = 1e-2
 _GROUP = 16
 """Rows of which the best one stands for all, until the best groups are known: of the groupings by
 8, 16, 32 and 64 the one that takes least time on a CPU, half of that of one large top_k."""
@@ -34,15 +31,6 @@ _SPARE = 16
 """Candidates beyond k that a device names, for products that float32 cannot tell apart."""
 _PIECE = 2**17
 """Numbers in a piece of what is multiplied in float64: a MiB, which stays in a core's cache."""
-_CHECKED = 64
-"""Rows whose lengths are found at a time."""
-_ALIGNMENT = 64
-"""Bytes on whose multiples XLA's arrays begin."""
-_NEIGHBOURS = 2**21
-"""Bytes: the system maps pages around the one that is read, on Linux up to so many."""
-_WIDE = np.dtype(np.float32)
-_KEPT = (_WIDE, np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
-"""Types that go to the device as they are; it widens them to float32, which loses nothing."""
 
 
 class Neighbours(NamedTuple):
@@ -90,12 +78,7 @@ def search(
     for name, value in (("k", k), ("chunk", chunk)):
         if value < 1:
             raise InputError(f"{name}: found {value}, expected at least 1")
-    database, queries = _typed(database), _typed(queries)
-    for name, array in (("database", database), ("queries", queries)):
-        if array.ndim != 2 or 0 in array.shape:
-            raise InputError(
-                f"{name}: found shape {array.shape}, expected (images, descriptor), neither zero"
-            )
+    database, queries = as_rows(database, "database"), as_rows(queries, "queries")
     if database.shape[1] != queries.shape[1]:
         raise InputError(
             f"queries: found descriptors of length {queries.shape[1]}, "
@@ -106,14 +89,14 @@ def search(
     chunk = _even(count, chunk, len(jax.local_devices()) * _GROUP)
     devices = platform.devices_for(chunk)
     size = min(_QUERY_CHUNK, len(queries))
-    fresh = (_aligned((size, queries.shape[1]), _WIDE) for _ in itertools.count())
-    parts = [_Part(block, k, devices) for block in _blocks(queries, "queries", fresh)]
+    fresh = (aligned((size, queries.shape[1]), WIDE) for _ in itertools.count())
+    parts = [_Part(block, k, devices) for block in blocks(queries, "queries", fresh)]
     # One is read, one is with the devices, one is finished.
-    dtype = database.dtype if database.dtype in _KEPT else _WIDE
-    buffers = [_aligned((chunk, database.shape[1]), dtype) for _ in range(3)]
+    dtype = database.dtype if database.dtype in KEPT else WIDE
+    buffers = [aligned((chunk, database.shape[1]), dtype) for _ in range(3)]
     with progress_bar(label, count, "rows", quiet=quiet) as bar:
         at_work = None
-        for block in one_ahead(_blocks(database, "database", itertools.cycle(buffers))):
+        for block in one_ahead(blocks(database, "database", itertools.cycle(buffers))):
             rows = devices.spread(block.rows)
             found = [_candidates(rows, block.valid, part.shared, k, devices) for part in parts]
             # While the devices are at this chunk, the one before is finished here.
@@ -168,70 +151,9 @@ def recalls(
     return {k: float(right[:, :k].any(axis=1).mean()) for k in ks}
 
 
-def _typed(array: np.ndarray) -> np.ndarray:
-    """Two bytes that a .npy file gives no type are bfloat16's, for which numpy has no name."""
-    array = np.asanyarray(array)
-    return array.view(ml_dtypes.bfloat16) if array.dtype == np.dtype("V2") else array
-
-
 def _even(count: int, chunk: int, each: int) -> int:
     """A multiple of `each` that splits `count` rows into as few parts as `chunk` does, alike."""
     return -(-count // (each * -(-count // chunk))) * each
-
-
-class _Block(NamedTuple):
-    start: int
-    rows: Float[np.ndarray, "size d"]
-    """Zeros behind those that are valid."""
-    valid: int
-
-
-def _blocks(
-    array: Float[np.ndarray, "n d"],
-    name: str,
-    buffers: Iterator[Float[np.ndarray, "size d"]],
-) -> Generator[_Block, None, None]:
-    """The array's rows, checked, in the buffers, one after the other."""
-    start = 0
-    while start < len(array):
-        buffer = next(buffers)
-        rows = array[start : start + len(buffer)]
-        with np.errstate(over="ignore"):  # what overflows is reported
-            np.copyto(buffer[: len(rows)], rows, casting="unsafe")
-        buffer[len(rows) :] = 0
-        _let_go(rows)
-        _check(buffer[: len(rows)], name, start)
-        yield _Block(start, buffer, len(rows))
-        start += len(buffer)
-
-
-def _check(rows: Float[np.ndarray, "rows d"], name: str, start: int) -> None:
-    """Check that these rows, from `start` on, are unit vectors."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        squares = [
-            np.einsum("nd,nd->n", wide, wide)
-            for i in range(0, len(rows), _CHECKED)
-            for wide in [rows[i : i + _CHECKED].astype(np.float32, copy=False)]
-        ]
-        norms = np.sqrt(np.concatenate(squares))
-    # "Not within" rather than "beyond", so that NaN and infinity count as wrong.
-    wrong = np.flatnonzero(~(np.abs(norms - 1) <= _UNIT_TOLERANCE))
-    if wrong.size:
-        row = wrong[0]
-        finite = np.isfinite(rows[row].astype(np.float32)).all()
-        found = f"of length {norms[row]:.4g}" if finite else "not finite"
-        raise InputError(
-            f"{name}: row {start + row} is {found}, expected finite unit vectors "
-            f"({wrong.size} wrong of {len(rows)} rows from {start})"
-        )
-
-
-def _aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
-    """An array that the devices of a CPU use as it lies, without a copy."""
-    size = math.prod(shape) * dtype.itemsize
-    memory = np.empty(size + _ALIGNMENT, np.uint8)
-    offset = -memory.ctypes.data % _ALIGNMENT
-    return memory[offset : offset + size].view(dtype).reshape(shape)
 
 
 def _candidates(
@@ -275,7 +197,7 @@ def _program(mesh: Mesh, count: int) -> Any:
 class _Part:
     """Some of the queries, and the best that is known for them."""
 
-    def __init__(self, block: _Block, k: int, devices: platform.Devices) -> None:
+    def __init__(self, block: Block, k: int, devices: platform.Devices) -> None:
         """`block` is of queries."""
         self.queries = block.rows[: block.valid]
         self.shared: Any = devices.share(block.rows)
@@ -284,7 +206,7 @@ class _Part:
 
     def take(
         self,
-        block: _Block,
+        block: Block,
         values: Float32[np.ndarray, "device q m"],
         places: Int32[np.ndarray, "device q m"],
     ) -> None:
@@ -314,7 +236,7 @@ class _Part:
         self._insert(block, query[order], row[order])
 
     def _insert(
-        self, block: _Block, query: Int[np.ndarray, " pair"], row: Int[np.ndarray, " pair"]
+        self, block: Block, query: Int[np.ndarray, " pair"], row: Int[np.ndarray, " pair"]
     ) -> None:
         """Sort pairs of a query and a row of the block, ordered so, into the best."""
         if not query.size:
@@ -340,7 +262,7 @@ def _rounding(length: int) -> float:
     The probabilistic bound of Higham and Mary (2019), lambda sqrt(n) u, at lambda = 8, where it
     fails less than once in 10^9 products; the sum of |a_i b_i| is at most the lengths' product.
     """
-    return 8 * math.sqrt(length) * 2.0**-24 * (1 + _UNIT_TOLERANCE) ** 2
+    return 8 * math.sqrt(length) * 2.0**-24 * (1 + UNIT_TOLERANCE) ** 2
 
 
 def _similarities(
@@ -360,25 +282,9 @@ def _similarities(
     return similarities + np.float32(0)  # -0.0 and 0.0 are equal, and sort so
 
 
-def _finish(parts: Sequence[_Part], block: _Block, found: Sequence[tuple[Array, Array]]) -> int:
+def _finish(parts: Sequence[_Part], block: Block, found: Sequence[tuple[Array, Array]]) -> int:
     """Take in what the devices found in a block for each part; how many rows it had."""
     for part, arrays in zip(parts, found, strict=True):
         values, places = (np.asarray(array)[:, : len(part.queries)] for array in arrays)
         part.take(block, values, places)
     return block.valid
-
-
-def _let_go(rows: np.ndarray) -> None:
-    """Give pages of a memory-mapped file back, or all that were read would stay in memory."""
-    owner: Any = rows
-    while isinstance(owner.base, np.ndarray):
-        owner = owner.base
-    # What is written to a copy-on-write map is nowhere but in memory.
-    if not isinstance(owner, np.memmap) or owner.mode == "c" or not hasattr(mmap, "MADV_DONTNEED"):
-        return
-    mapping: Any = owner.base
-    origin = np.frombuffer(mapping, np.uint8).ctypes.data
-    first, end = (place - origin for place in np.lib.array_utils.byte_bounds(rows))
-    # Reading the first page has brought some before it back, of those let go last.
-    first = max(0, first - first % mmap.PAGESIZE - _NEIGHBOURS)
-    mapping.madvise(mmap.MADV_DONTNEED, first, end - first)
