@@ -6,6 +6,7 @@ part of them. What either misses is measured against the exact search: `recall_a
 Descriptors of thousands of numbers are reduced first (`pca`).
 """
 
+import itertools
 import math
 import os
 import pathlib
@@ -51,13 +52,13 @@ class Index(NamedTuple):
     """What `build` makes."""
 
     kind: Kind
-    graph_or_lists: Any
+    faiss_index: Any
     """The index of faiss."""
 
     @property
     def size(self) -> int:
         """Descriptors in it."""
-        return self.graph_or_lists.ntotal
+        return self.faiss_index.ntotal
 
     def search(
         self, queries: Float[np.ndarray, "q d"], k: int, effort: int | None = None
@@ -82,20 +83,20 @@ class Index(NamedTuple):
             if value is not None and value < 1:
                 raise InputError(f"{name}: found {value}, expected at least 1")
         queries = as_rows(queries, "queries")
-        if queries.shape[1] != self.graph_or_lists.d:
+        if queries.shape[1] != self.faiss_index.d:
             raise InputError(
                 f"queries: found descriptors of length {queries.shape[1]}, expected "
-                f"{self.graph_or_lists.d} as in the index"
+                f"{self.faiss_index.d} as in the index"
             )
         k = min(k, self.size)
         if self.kind == "hnsw":
             chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
         else:
-            lists = self.graph_or_lists.nlist
+            lists = self.faiss_index.nlist
             chosen = faiss.SearchParametersIVF(nprobe=min(effort or -(-lists // 16), lists))
         whole = iter([np.empty(queries.shape, WIDE)])
         (block,) = blocks(queries, "queries", whole)
-        similarities, indices = self.graph_or_lists.search(block.rows, k, params=chosen)
+        similarities, indices = self.faiss_index.search(block.rows, k, params=chosen)
         return Neighbours(indices, np.where(indices < 0, -np.inf, similarities).astype(np.float32))
 
 
@@ -128,7 +129,7 @@ def build(
     size = max(1, _CHUNK_BYTES // (4 * length))
     buffer = np.empty((min(size, count), length), WIDE)
     with progress_bar(kind, count, "rows", quiet=quiet) as bar:
-        for block in blocks(database, "database", iter(lambda: buffer, None)):
+        for block in blocks(database, "database", itertools.repeat(buffer)):
             index.add(block.rows[: block.valid])
             bar.advance(block.valid)
     return Index(kind, index)
@@ -173,7 +174,7 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
     """
     with atomic_path(path) as temporary:
         try:
-            faiss.write_index(index.graph_or_lists, str(temporary))
+            faiss.write_index(index.faiss_index, str(temporary))
         except RuntimeError as error:
             raise InputError(f"{path}: cannot be written: {_first_line(error)}") from error
 

@@ -31,7 +31,7 @@ from crisalad_jax.data.loader import (
 )
 from crisalad_jax.data.places import Places, epoch_batches
 from crisalad_jax.errors import InputError, Stopped
-from crisalad_jax.evaluation import evaluate
+from crisalad_jax.evaluation import evaluate, positives_of
 from crisalad_jax.files import write_json
 from crisalad_jax.metrics import MetricsLog
 from crisalad_jax.model import Crisalad, init_crisalad, tokenise
@@ -118,7 +118,7 @@ def fit(
     Written: `config.json`; `metrics.jsonl`, a line a step and a line a validation, and the same for
     TensorBoard in `tensorboard/`; `state/`, what a later call resumes from; `last.safetensors`; and
     with a validation `best.safetensors`, the weights of the best Recall@5 (every image alone, see
-    `evaluation.GROUPINGS`), and the best `config.keep_best` in `best/`.
+    `groupings.GROUPINGS`), and the best `config.keep_best` in `best/`.
 
     A run that is killed at any moment and called again ends with the same bits as one that was not.
 
@@ -202,6 +202,8 @@ class _Run:
         split_state: bool = False,
     ) -> None:
         # What does not fit raises before claim_run writes the first file, in all processes.
+        if validation is not None:
+            positives_of(validation)
         checksums = {
             "configuration": zlib.crc32(json.dumps(to_plain(config)).encode()),
             "places": _checksum([_text(places.files), places.place_start]),

@@ -146,8 +146,8 @@ def fit_pca(
     # A sign for each component that does not depend on the solver.
     largest = np.take_along_axis(components, np.abs(components).argmax(axis=1)[:, None], axis=1)
     components *= np.sign(largest)
-    arrays = (np.asarray(array, np.float32) for array in found)
-    return Pca(*arrays, PcaConfig() if config is None else config)
+    arrays = {name: np.asarray(array, np.float32) for name, array in found._asdict().items()}
+    return Pca(**arrays, config=PcaConfig() if config is None else config)
 
 
 def _rows_at_a_time(length: int) -> int:
@@ -229,7 +229,7 @@ def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    arrays = {name: np.ascontiguousarray(getattr(pca, name)) for name in _ARRAYS}
+    arrays = {name: np.array(getattr(pca, name), order="C") for name in _ARRAYS}
     metadata = {FORMAT: json.dumps(to_plain(pca.config))}
     with atomic_path(path) as temporary:
         try:
@@ -258,20 +258,20 @@ def load_pca(path: str | os.PathLike[str]) -> Pca:
                     f"{path}: found arrays {sorted(names)[:3]} and metadata {sorted(metadata)}, "
                     f"expected {FORMAT!r}, as `crisalad pca` writes it"
                 )
-            arrays = [file.get_tensor(name) for name in _ARRAYS]
+            arrays = {name: file.get_tensor(name) for name in _ARRAYS}
             plain = json.loads(metadata[FORMAT])
     except (safetensors.SafetensorError, OSError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: not a whole file of principal components: {error}") from error
-    _, components, variances, total = arrays
-    dim, length = components.shape if components.ndim == 2 else (0, 0)
-    shapes = [array.shape for array in arrays]
+    found = arrays["components"].shape
+    dim, length = found if len(found) == 2 else (0, 0)
+    shapes = [array.shape for array in arrays.values()]
     if shapes != [(length,), (dim, length), (dim,), ()] or 0 in (dim, length):
         raise InputError(
             f"{path}: found {', '.join(_ARRAYS)} of shapes {shapes}, expected (d,), (dim, d), "
             "(dim,), ()"
         )
-    if not all(array.dtype == np.float32 and np.isfinite(array).all() for array in arrays) or not (
-        (variances > 0).all() and total > 0
-    ):
-        raise InputError(f"{path}: found numbers that are not finite, or variances not positive")
-    return Pca(*arrays, from_plain(PcaConfig, plain, source=str(path)))
+    if not all(array.dtype == np.float32 and np.isfinite(array).all() for array in arrays.values()):
+        raise InputError(f"{path}: found numbers that are not finite, or not of float32")
+    if arrays["variances"].min() <= 0 or arrays["total"] <= 0:
+        raise InputError(f"{path}: found variances of zero or below, expected positive ones")
+    return Pca(**arrays, config=from_plain(PcaConfig, plain, source=str(path)))

@@ -1,7 +1,6 @@
-"""Exact search over descriptors and Recall@K: the one copy of each.
+"""Exact search over descriptors: the one copy of it.
 
-The protocol is the public one of visual place recognition: exact nearest neighbours, and a recall
-that counts every query.
+The protocol is the public one of visual place recognition: exact nearest neighbours.
 """
 
 import functools
@@ -109,46 +108,6 @@ def search(
         np.concatenate([part.best.indices for part in parts]),
         np.concatenate([part.best.similarities for part in parts]),
     )
-
-
-def recalls(
-    indices: Int[np.ndarray, "q k"],
-    positives: Sequence[Int[np.ndarray, " _"]],
-    ks: Sequence[int] = (1, 5, 10, 20),
-) -> dict[int, float]:
-    """Recall@K: queries with at least one positive among their top K, over **all** queries.
-
-    A query without positives is a miss. `search` for max(ks) returns fewer columns only where the
-    database is smaller, so a K beyond the columns counts them all.
-
-    Args:
-        indices: database indices of each query's neighbours, best first.
-        positives: the database indices that are right for each query, possibly none.
-        ks: the values of K.
-
-    Returns:
-        K -> fraction of the queries, 0 to 1.
-
-    Raises:
-        InputError: no queries; positives for another number of queries; a negative positive (some
-            ground truths write -1 for "no match": leave it out); a K below 1.
-    """
-    if len(indices) == 0:
-        raise InputError("indices: found no queries, expected at least one")
-    if len(positives) != len(indices):
-        raise InputError(
-            f"positives: found {len(positives)} lists, expected {len(indices)}, one for each query"
-        )
-    if min(ks, default=1) < 1:
-        raise InputError(f"ks: found {min(ks)}, expected at least 1")
-    right = np.zeros(indices.shape, bool)
-    for query, wanted in enumerate(positives):
-        if np.size(wanted) and np.min(wanted) < 0:
-            raise InputError(
-                f"positives: query {query} has {np.min(wanted)}, expected database indices"
-            )
-        right[query] = np.isin(indices[query], wanted)
-    return {k: float(right[:, :k].any(axis=1).mean()) for k in ks}
 
 
 def _even(count: int, chunk: int, each: int) -> int:

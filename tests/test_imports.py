@@ -15,13 +15,13 @@ SOURCE = pathlib.Path(__file__).parents[1] / PACKAGE
 LAYERS = (
     ("errors", "cores"),
     ("config", "pytree", "files", "progress", "platform", "processes"),
-    ("sinkhorn", "losses", "serial", "data", "metrics", "stops", "rows"),
-    ("nn",),
+    ("sinkhorn", "losses", "serial", "data", "metrics", "stops", "groupings", "scores", "rows"),
+    ("nn", "same_place"),
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),
     ("convert",),
     ("training", "retrieval", "report", "descriptors", "pca"),
-    ("approximate",),
+    ("results", "approximate"),
     ("evaluation",),
     ("fit",),
     ("demo",),
@@ -34,6 +34,7 @@ LEAVES = {
     "pytree": set(),
     "sinkhorn": {"config", "errors", "pytree"},
     "losses": {"config", "errors"},
+    "scores": {"errors"},
     "data": {"config", "cores", "errors", "files", "data"},
 }
 CORE = (

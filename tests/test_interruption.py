@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 import pytest
 
@@ -34,11 +35,17 @@ from tests.test_interruption import CONFIG
 city, town, out = map(pathlib.Path, sys.argv[1:4])
 platform.set_up()
 crisalad_jax.fit.SAVE_SECONDS = -1.0
+workers = 0
 for statement in sys.argv[4:]:
     exec(statement)
 try:
     crisalad_jax.fit.fit(
-        CONFIG, read_places(city, min_images=2), out, validation=open_benchmark(town), quiet=True
+        CONFIG,
+        read_places(city, min_images=2),
+        out,
+        validation=open_benchmark(town),
+        workers=workers,
+        quiet=True,
     )
 except InputError as error:
     sys.exit(str(error))
@@ -54,7 +61,7 @@ def start(shared: pathlib.Path, tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
 
-    def go(out: pathlib.Path, *statements: str) -> subprocess.Popen[str]:
+    def go(out: pathlib.Path, *statements: str, **options: Any) -> subprocess.Popen[str]:
         command = [
             sys.executable,
             "-c",
@@ -68,6 +75,7 @@ def start(shared: pathlib.Path, tmp_path_factory):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            **options,
         )
 
     return go
@@ -138,6 +146,26 @@ def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_pat
     step = metrics_of(out)[-1]["step"]
     assert f"after step {step}; the same command goes on" in said
     assert max(int(path.name) for path in (out / "state").iterdir()) == step
+    program = start(out)
+    _, errors = program.communicate()
+    assert program.returncode == 0, errors
+    assert_same_end(out, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.0, 0.5, 2.0, 4.0])
+def test_a_signal_to_all_processes_saves_first_even_while_readers_start(
+    start, whole, tmp_path, seconds
+):
+    """As a scheduler sends it: to those that read images too, which start anew each epoch."""
+    out = tmp_path / "run"
+    program = start(out, "workers = 2", start_new_session=True)
+    wait_for_lines(program, out, 2)  # steps of the first epoch
+    time.sleep(seconds)
+    os.killpg(program.pid, signal.SIGTERM)
+    said, errors = program.communicate()
+    assert program.returncode == 128 + signal.SIGTERM, errors
+    assert "the same command goes on" in said
     program = start(out)
     _, errors = program.communicate()
     assert program.returncode == 0, errors

@@ -42,11 +42,19 @@ from tests.test_processes import CONFIG
 shared, out = map(pathlib.Path, sys.argv[1:])
 places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
 devices, step, seen = jax.devices(), module.train_step, set()
+compiled, after_step = [], []
+
+def count(name, *_, **__):
+    if name.endswith("backend_compile_duration"):
+        compiled.append(name)
+
+jax.monitoring.register_event_duration_secs_listener(count)
 
 def train_step(state, frozen, images, *rest):
     state, metrics = step(state, frozen, images, *rest)
     parts = [leaf for leaf in jax.tree.leaves(state) if not leaf.is_fully_replicated]
     seen.add((len(images.sharding.device_set), len(parts) > 50))
+    after_step.append(len(compiled))
     return state, metrics
 
 def run(name, config, count, **options):
@@ -63,7 +71,9 @@ for count in (1, 2, 4, 8):
     # A validation owes nothing to the devices of the steps: that of the processes is compared.
     run(str(count), CONFIG, count, validation=town if count == 1 else None)
 platform.SPLIT_FROM = 64  # numbers: this model has no larger arrays
+after_step.clear()
 run("split", CONFIG, 8, split_state=True)
+print("compiled after the first step of ten:", after_step[9] - after_step[0])
 run("all", dataclasses.replace(CONFIG, trains="all", epochs=1), 8)
 """
 
@@ -85,7 +95,7 @@ def by_devices(shared: pathlib.Path, tmp_path_factory) -> pathlib.Path:
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         *("1 1 False 1", "2 2 False 1", "4 4 False 1", "8 8 False 1"),
-        *("split 8 True 1", "all 1 False 1"),
+        *("split 8 True 1", "compiled after the first step of ten: 0", "all 1 False 1"),
     ]
     return out
 
@@ -243,15 +253,35 @@ def test_an_image_that_one_process_cannot_read_ends_both(shared, tmp_path):
     assert words[1] == "crisalad: processes: another one failed; see what it says"
 
 
+def wait_for_steps(programs: list[subprocess.Popen[str]], out: pathlib.Path) -> None:
+    log = out / "metrics.jsonl"
+    while not (log.exists() and log.read_bytes().count(b"\n") > 2):
+        assert programs[0].poll() is None, ends(programs)
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [0, 1])
+def test_where_one_process_is_killed_the_other_ends_and_both_go_on(
+    shared, by_devices, tmp_path, killed
+):
+    out = tmp_path / "run"
+    programs = start(shared, out)
+    wait_for_steps(programs, out)
+    programs[killed].kill()
+    codes = [code for code, _ in ends(programs)]
+    assert codes[killed] == -signal.SIGKILL
+    assert codes[1 - killed] != 0
+    assert [code for code, _ in ends(start(shared, out))] == [0, 0]
+    assert_same_run(out, by_devices / "1")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("both", [(), ("--split-state", "--workers", "1")], ids=str)
 def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path, both):
     out = tmp_path / "run"
     programs = start(shared, out, both=both)
-    log = out / "metrics.jsonl"
-    while not (log.exists() and log.read_bytes().count(b"\n") > 2):
-        assert programs[0].poll() is None, ends(programs)
-        time.sleep(0.05)
+    wait_for_steps(programs, out)
     programs[1].send_signal(signal.SIGTERM)
     for code, words in ends(programs):
         assert code == 128 + signal.SIGTERM, words

@@ -1,4 +1,4 @@
-"""Search against a float64 stable argsort and faiss, and recall by hand."""
+"""Search against a float64 stable argsort, and against faiss."""
 
 import sys
 
@@ -308,45 +308,3 @@ def test_wrong_shapes_and_numbers_are_named():
             retrieval.search(*arguments)
     with pytest.raises(InputError, match=r"^chunk: found 0"):
         retrieval.search(rows, rows, 1, chunk=0)
-
-
-def test_recall_by_hand():
-    indices = np.array(
-        [
-            [4, 1, 2, 3, 0],  # right at rank 1
-            [4, 1, 2, 3, 0],  # right at ranks 3 and 4
-            [0, 1, 2, 3, 4],  # its positives were not found
-            [0, 1, 2, 3, 4],  # it has none: a miss, and still counted
-            [3, 2, 1, 4, 0],  # right at rank 5
-        ]
-    )
-    positives = [np.array(p, np.int64) for p in ([4], [2, 3], [7, 9], [], [0, 12])]
-    found = retrieval.recalls(indices, positives, ks=(1, 2, 3, 5, 20))
-    assert found == {1: 1 / 5, 2: 1 / 5, 3: 2 / 5, 5: 3 / 5, 20: 3 / 5}
-    assert list(retrieval.recalls(indices, positives)) == [1, 5, 10, 20]
-
-
-@hypothesis.settings(max_examples=50, deadline=None)
-@hypothesis.given(seed=st.integers(0, 2**32 - 1))
-def test_recall_agrees_with_sets_and_never_falls(seed):
-    rng = np.random.default_rng(seed)
-    indices = np.stack([rng.permutation(30)[:12] for _ in range(8)])
-    positives = [rng.permutation(30)[: rng.integers(0, 4)] for _ in range(8)]
-    ks = (1, 2, 5, 12)
-    found = retrieval.recalls(indices, positives, ks)
-    for k in ks:
-        hits = [bool(set(i[:k]) & set(p)) for i, p in zip(indices, positives, strict=True)]
-        assert found[k] == sum(hits) / 8
-    assert sorted(found.values()) == list(found.values())
-
-
-def test_recall_rejects_what_it_cannot_count():
-    indices = np.array([[0, 1]])
-    with pytest.raises(InputError, match=r"^indices: found no queries"):
-        retrieval.recalls(np.zeros((0, 3), np.int64), [])
-    with pytest.raises(InputError, match=r"^positives: found 2 lists, expected 1"):
-        retrieval.recalls(indices, [np.array([0]), np.array([1])])
-    with pytest.raises(InputError, match=r"^positives: query 0 has -1"):
-        retrieval.recalls(indices, [np.array([-1])])
-    with pytest.raises(InputError, match=r"^ks: found 0"):
-        retrieval.recalls(indices, [np.array([0])], ks=(0, 5))

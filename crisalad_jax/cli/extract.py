@@ -8,8 +8,9 @@ from crisalad_jax.cli.common import console, model_of
 from crisalad_jax.data.images import list_images
 from crisalad_jax.descriptors import config_of, targets, writer_for
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import GROUPINGS, check_grouping, group, read_tokens
+from crisalad_jax.evaluation import group, read_tokens
 from crisalad_jax.files import check_target, write_json
+from crisalad_jax.groupings import GROUPINGS, check_grouping
 from crisalad_jax.pca import load_pca
 from crisalad_jax.serial import to_plain
 
@@ -27,7 +28,8 @@ class Extract:
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of 14; by default the model's."""
     grouping: str = "single"
-    """single, shuffled or sequential: a cross-image model's descriptors depend on it."""
+    """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
+    all): a cross-image model's descriptors depend on it."""
     batch_size: int = 16
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
@@ -73,6 +75,7 @@ def run(arguments: Extract) -> None:
         arguments.grouping,
         batch_size=arguments.batch_size,
         seed=arguments.seed,
+        quiet=arguments.quiet,
     )[folder.readable]
     names = [path.relative_to(arguments.images).as_posix() for path in paths]
     skipped = [name for name, ok in zip(names, folder.readable, strict=True) if not ok]

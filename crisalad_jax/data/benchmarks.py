@@ -27,10 +27,14 @@ class Benchmark:
     root: pathlib.Path
     database: tuple[pathlib.Path, ...]
     queries: tuple[pathlib.Path, ...]
-    positives: tuple[Int64[np.ndarray, " _"], ...]
-    """Query -> ascending database indices; empty where the query has no match."""
+    positives: tuple[Int64[np.ndarray, " _"], ...] | None
+    """Query -> ascending database indices; empty where the query has no match. None where the set
+    has no ground truth."""
     rule: str
     """What makes a database image positive, in words."""
+    database_positions: Float64[np.ndarray, "n 2"] | None = None
+    """Metres, where the set has them."""
+    query_positions: Float64[np.ndarray, "n 2"] | None = None
 
 
 def open_benchmark(

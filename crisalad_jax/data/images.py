@@ -7,11 +7,12 @@ import functools
 import os
 import pathlib
 import re
+import threading
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.errors import InputError
@@ -33,6 +34,7 @@ _REDUCED = (
 # OpenBLAS takes several threads for a product of more than so many multiplications: more than all
 # cores have to do, where each decodes an image of its own.
 _SERIAL = 2**18
+_KEPT = 3 * 2**22
 _Band = tuple[slice, slice, np.ndarray]
 """Which outputs are made of which inputs, by which weights."""
 
@@ -146,13 +148,34 @@ def resize_image(
         turned = resize_image(cv2.transpose(image), (new_width, new_height))
         return cv2.transpose(turned)
     pixels = image.reshape(height, 3 * width)
-    rows = np.empty((new_height, 3 * width), np.float32)
+    rows = _scratch("rows", new_height, 3 * width)
     for outputs, inputs, weights in _row_bands(height, new_height, 3 * width):
-        np.matmul(weights, pixels[inputs].astype(np.float32), out=rows[outputs])
-    resized = np.empty((new_height, 3 * new_width), np.float32)
+        band = _scratch("band", inputs.stop - inputs.start, 3 * width)
+        band[:] = pixels[inputs]
+        np.matmul(weights, band, out=rows[outputs])
+    resized = _scratch("resized", new_height, 3 * new_width)
     for outputs, inputs, weights in _column_bands(width, new_width, new_height):
         np.matmul(rows[:, inputs], weights, out=resized[:, outputs])
     return cv2.convertScaleAbs(resized).reshape(new_height, new_width, 3)
+
+
+_kept = threading.local()
+
+
+def _scratch(name: str, rows: int, columns: int) -> Float32[np.ndarray, "rows columns"]:
+    """Memory of this thread, with anything in it; the same the next time.
+
+    Memory that is new each time the system hands out page by page, which takes longer than the
+    products that go into it. What is larger than a photograph of 4 megapixels is not kept.
+    """
+    size = rows * columns
+    if size > _KEPT:
+        return np.empty((rows, columns), np.float32)
+    memory = getattr(_kept, name, None)
+    if memory is None or memory.size < size:
+        memory = np.empty(size, np.float32)
+        setattr(_kept, name, memory)
+    return memory[:size].reshape(rows, columns)
 
 
 @functools.lru_cache(maxsize=64)

@@ -4,6 +4,7 @@ import io
 import pathlib
 import struct
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -267,6 +268,20 @@ def test_resize_of_a_mirrored_view():
     np.testing.assert_array_equal(
         resize_image(mirrored, (28, 42)), resize_image(np.ascontiguousarray(mirrored), (28, 42))
     )
+
+
+def test_pictures_resized_between_and_beside_change_nothing():
+    """What the resize keeps in memory is of its thread, and never part of what it returns."""
+    rng = np.random.default_rng(1)
+    shapes = ((60, 80), (200, 90), (1, 1), (150, 170), (30, 400)) * 8
+    images = [rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in shapes]
+    alone = []
+    for image in images:
+        with ThreadPoolExecutor(1) as fresh:
+            alone.append(fresh.submit(resize_image, image, (70, 84)).result())
+    with ThreadPoolExecutor(4) as together:
+        found = list(together.map(lambda image: resize_image(image, (70, 84)), images))
+    np.testing.assert_array_equal(found, alone)
 
 
 def test_photographs_read_and_resize_as_by_pillow():
