@@ -11,6 +11,7 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import group, read_tokens
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import GROUPINGS, check_grouping
+from crisalad_jax.pca import load_pca
 from crisalad_jax.serial import to_plain
 
 
@@ -35,6 +36,8 @@ class Extract:
     gains and loses."""
     seed: int = 0
     """Draws the shuffled order."""
+    pca: pathlib.Path | None = None
+    """Components that `crisalad pca` fitted, for shorter descriptors."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
     quiet: bool = False
@@ -52,6 +55,9 @@ def run(arguments: Extract) -> None:
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
+    pca = None if arguments.pca is None else load_pca(arguments.pca)
+    if pca is not None:
+        pca.check(config.descriptor_dim, str(arguments.weights))
     paths = list_images(arguments.images)
     folder = read_tokens(
         params,
@@ -76,6 +82,8 @@ def run(arguments: Extract) -> None:
     kept = [name for name, ok in zip(names, folder.readable, strict=True) if ok]
     if not kept:
         raise InputError(f"{arguments.images}: found {len(paths)} images, none of them readable")
+    if pca is not None:
+        descriptors = pca.apply(descriptors)
     write(arguments.out, descriptors, kept)
     write_json(
         config_of(arguments.out),
@@ -85,12 +93,13 @@ def run(arguments: Extract) -> None:
             "grouping": arguments.grouping,
             "batch_size": arguments.batch_size,
             "seed": arguments.seed,
+            "pca": None if arguments.pca is None else str(arguments.pca),
             "skipped": skipped,
             "model": to_plain(config),
         },
     )
     console.print(
-        f"{arguments.out}: {len(kept)} descriptors of {config.descriptor_dim} numbers, "
+        f"{arguments.out}: {len(kept)} descriptors of {descriptors.shape[1]} numbers, "
         f"grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]})"
         + (f"; {len(skipped)} unreadable images left out" if skipped else ""),
         soft_wrap=True,
