@@ -1,6 +1,7 @@
 """The demo: a synthetic city rendered, learnt and looked at, with no data of one's own."""
 
 import dataclasses
+import functools
 import pathlib
 import time
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import KS, GroupingResult, evaluate
+from crisalad_jax.evaluation import KS, evaluate
 from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.fit import fit
 from crisalad_jax.metrics import read_metrics
@@ -28,7 +29,12 @@ from crisalad_jax.report import (
     recall_markdown,
     training_curves,
 )
-from crisalad_jax.retrieval import recalls, search
+from crisalad_jax.results import GroupingResult
+from crisalad_jax.retrieval import search
+from crisalad_jax.scores import recalls
+
+GROUPINGS = ("single", "shuffled", "sequential")
+"""Rendered places are in no order in time: a window of the last frames would say nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,12 +81,15 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
 
     settings = demo_recipe(config)
     untrained = init_crisalad(jax.random.key(config.seed), settings.model)
-    before = evaluate(untrained, settings.model, benchmark, seed=config.seed, quiet=quiet)
+    measure = functools.partial(
+        evaluate, benchmark=benchmark, groupings=GROUPINGS, seed=config.seed, seeds=1, quiet=quiet
+    )
+    before = measure(untrained, settings.model)
     training_started = time.monotonic()
     fit(settings, places, out / "run", quiet=quiet)
     training_seconds = time.monotonic() - training_started
     trained, model = load_weights(out / "run" / "last.safetensors")
-    after = evaluate(trained, model, benchmark, seed=config.seed, quiet=quiet)
+    after = measure(trained, model)
 
     rows = [RecallRow(benchmark.name, "HOG, no learning", "any", _hog_recalls(benchmark))]
     rows += _rows(benchmark, "untrained", before)
@@ -97,7 +106,7 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         benchmark.queries,
         benchmark.database,
         *after[0].neighbours,
-        benchmark.positives,
+        benchmark.ground_truth(),
         title="Queries and what the trained model finds, every image described alone",
     )
     with atomic_path(out / "recalls.md") as temporary:
@@ -137,4 +146,4 @@ def _hog_recalls(benchmark: Benchmark) -> dict[int, float]:
         hog_descriptors([read_image(path) for path in paths])
         for paths in (benchmark.database, benchmark.queries)
     ]
-    return recalls(search(*sides, k=max(KS)).indices, benchmark.positives, KS)
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)

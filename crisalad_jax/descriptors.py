@@ -11,6 +11,7 @@ from jaxtyping import Float
 from crisalad_jax.config import choose
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import atomic_path, check_source, write_npy
+from crisalad_jax.rows import as_rows
 
 Descriptors = Float[np.ndarray, "image descriptor"]
 
@@ -44,6 +45,26 @@ def targets(path: pathlib.Path) -> list[pathlib.Path]:
 
 def _names_of(path: pathlib.Path) -> pathlib.Path:
     return path.with_suffix(".names.txt")
+
+
+def open_npy(path: str | os.PathLike[str]) -> Descriptors:
+    """The array in a .npy file, memory-mapped to read: float32, float16, float64 or bfloat16.
+
+    Raises:
+        InputError: there is no such file, or it holds no matrix of such numbers.
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a .npy file of descriptors")
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: not a whole .npy file: {error}") from error
+    if not isinstance(array, np.ndarray) or (
+        array.dtype.kind != "f" and array.dtype != np.dtype("V2")
+    ):
+        found = array.dtype if isinstance(array, np.ndarray) else "an archive"
+        raise InputError(f"{path}: found {found}, expected an array of floating-point numbers")
+    return as_rows(array, str(path))
 
 
 def _write_npy(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:
@@ -83,14 +104,11 @@ def _read_npy(path: pathlib.Path) -> tuple[list[str], Descriptors]:
     listed = _names_of(path)
     check_source(listed, f"the names of the images in {path.name}")
     names = listed.read_text(encoding="utf-8").splitlines()
-    try:
-        descriptors = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a whole .npy file: {error}") from error
-    if descriptors.ndim != 2 or len(descriptors) != len(names) or descriptors.dtype.kind != "f":
+    descriptors = open_npy(path)
+    if len(descriptors) != len(names):
         raise InputError(
-            f"{path}: found {descriptors.dtype} {descriptors.shape}, expected floats "
-            f"({len(names)}, descriptor), a row for each name in {listed.name}"
+            f"{path}: found {len(descriptors)} descriptors, expected {len(names)}, one for each "
+            f"name in {listed.name}"
         )
     return names, descriptors
 

@@ -1,44 +1,37 @@
-"""Descriptors of whole folders, and Recall@K of a benchmark by how its images are grouped."""
+"""Descriptors of whole folders, and what they are worth on a benchmark by how they are grouped."""
 
+import functools
 import pathlib
-from collections.abc import Sequence
+import statistics
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Int, Int64
 
-from crisalad_jax.config import ModelConfig, choose
+from crisalad_jax import platform
+from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
-from crisalad_jax.errors import InputError
-from crisalad_jax.model import Crisalad, alone, among, relate, tokenise
+from crisalad_jax.groupings import (
+    DEFAULT_GROUPINGS,
+    Batches,
+    Grouping,
+    batches_of,
+    check_grouping,
+    parse_groupings,
+)
+from crisalad_jax.model import Crisalad, relate, tokenise
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.platform import devices_for
 from crisalad_jax.progress import progress_bar
-from crisalad_jax.retrieval import Neighbours, recalls, search
+from crisalad_jax.results import ANY, GroupingResult, summarise
+from crisalad_jax.retrieval import Neighbours, search
+from crisalad_jax.same_place import SamePlace, by_truth, near, same_place_share
 
 KS = (1, 5, 10, 20)
-GROUPINGS = {
-    "single": "every image alone",
-    "shuffled": "batches of images in random order",
-    "sequential": "batches of images in file order: neighbours help each other",
-}
-"""Which images look at each other in the cross-image encoder. Queries and database never mix."""
-
-
-def check_grouping(groupings: Sequence[str], batch_size: int, seed: int) -> None:
-    """Check how images are to be grouped, before the work of describing them.
-
-    Raises:
-        InputError: an unknown grouping, a batch of none, or a negative seed.
-    """
-    for grouping in groupings:
-        choose("grouping", grouping, GROUPINGS)
-    for name, value, least in (("batch size", batch_size, 1), ("seed", seed, 0)):
-        if value < least:
-            raise InputError(f"{name}: found {value}, expected at least {least}")
 
 
 class FolderTokens(NamedTuple):
@@ -102,6 +95,8 @@ def group(
     *,
     batch_size: int,
     seed: int = 0,
+    label: str = "images",
+    quiet: bool = True,
 ) -> Float[np.ndarray, "image descriptor"]:
     """Descriptors of all images, in their order, under one of `GROUPINGS`.
 
@@ -110,32 +105,64 @@ def group(
     Raises:
         InputError: what `check_grouping` raises.
     """
-    check_grouping([grouping], batch_size, seed)
     count = len(folder.readable)
-    order = np.random.default_rng(seed).permutation(count) if grouping == "shuffled" else None
-    order = np.arange(count) if order is None else order
+    batches = batches_of(count, grouping, batch_size, seed)
     descriptors = np.empty((count, config.descriptor_dim), np.float32)
-    for start in range(0, count, batch_size):
-        chosen = order[start : start + batch_size]
-        # A last batch that is not full repeats its first image, unseen, so that shapes stay alike.
-        padded = np.resize(chosen, batch_size)
-        valid = folder.readable[padded] & (np.arange(batch_size) < len(chosen))
-        mask = alone(batch_size) if grouping == "single" else among(jnp.asarray(valid))
-        tokens = Tokens(
-            jnp.asarray(folder.global_tokens[padded]), jnp.asarray(folder.local[padded])
-        )
-        descriptors[chosen] = relate(params, tokens, config, mask=mask)[: len(chosen)]
+    # A window gives one descriptor; as many of them as a batch has images are taken at a time.
+    step = batch_size if grouping == "window" else 1
+    # Beside the backbone the other groupings take no time.
+    silent = quiet or grouping != "window"
+    with progress_bar(f"{label}, {grouping}", count, "images", quiet=silent) as bar:
+        for start in range(0, len(batches.images), step):
+            part = batches.part(start, start + step)
+            relate_part = _relate_windows if grouping == "window" else _relate_batch
+            kept = part.images[part.kept]
+            descriptors[kept] = relate_part(params, config, folder, part)
+            bar.advance(len(kept))
     return descriptors
 
 
-class GroupingResult(NamedTuple):
-    """A benchmark under one grouping."""
+def _relate_batch(
+    params: Crisalad, config: ModelConfig, folder: FolderTokens, batch: Batches
+) -> Float[np.ndarray, "image descriptor"]:
+    """The descriptors that one batch gives."""
+    (images,), (kept,), (mask,) = batch.images, batch.kept, batch.looks(folder.readable)
+    tokens = Tokens(jnp.asarray(folder.global_tokens[images]), jnp.asarray(folder.local[images]))
+    return np.asarray(relate(params, tokens, config, mask=mask))[kept]
 
-    grouping: str
-    recalls: dict[int, float]
-    """Recall@K as a fraction, by K."""
-    neighbours: Neighbours
-    """The nearest database images of every query, best first."""
+
+def _relate_windows(
+    params: Crisalad, config: ModelConfig, folder: FolderTokens, windows: Batches
+) -> Float[np.ndarray, "window descriptor"]:
+    """The descriptors that some windows give, each of its last image."""
+    width = windows.images.shape[1]
+    # Windows overlap: each image goes to the device once. Shapes are those of `width` windows.
+    images, places = np.unique(windows.images, return_inverse=True)
+    images = np.resize(images, 2 * width - 1)
+    rows = np.arange(width) % len(windows.images)
+    found = _relate_last(
+        params,
+        Tokens(jnp.asarray(folder.global_tokens[images]), jnp.asarray(folder.local[images])),
+        places.reshape(windows.images.shape)[rows],
+        windows.looks(folder.readable)[rows],
+        config,
+    )
+    return np.asarray(found)[: len(windows.images)]
+
+
+@functools.partial(platform.jit, static_argnames="config")
+def _relate_last(
+    params: Crisalad,
+    tokens: Tokens,
+    places: Int[Array, "window place"],
+    masks: Bool[Array, "window place place"],
+    config: ModelConfig,
+) -> Float[Array, "window descriptor"]:
+    def last(places: Int[Array, " place"], mask: Bool[Array, "place place"]) -> Array:
+        window = jax.tree.map(lambda leaf: leaf[places], tokens)
+        return relate(params, window, config, mask=mask)[-1]
+
+    return jax.vmap(last)(places, masks)
 
 
 def evaluate(
@@ -143,38 +170,129 @@ def evaluate(
     config: ModelConfig,
     benchmark: Benchmark,
     *,
-    groupings: Sequence[str] = tuple(GROUPINGS),
+    groupings: Sequence[str] = DEFAULT_GROUPINGS,
     batch_size: int = 16,
     seed: int = 0,
+    seeds: int = 3,
     cache: ImageCache | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
-    """Recall@1/5/10/20 under each grouping; images are read and tokenised once.
+    """Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
+
+    Two images of one side show the same place where the benchmark's positions, or where it has none
+    its ground truth, say so (`same_place`).
 
     A model without a cross-image encoder has one result, `any`: no descriptor depends on a batch.
+    Beyond the tokens memory holds the descriptors of one grouping and seed at a time.
+
+    Args:
+        params: of the model.
+        config: of the model, static.
+        benchmark: what to evaluate on.
+        groupings: each as `Grouping.parse` reads it.
+        batch_size: images that look at each other.
+        seed: draws the first shuffle: the database's, and with the next seed the queries'.
+        seeds: shuffles, each from the second seed after the one before.
+        cache: of decoded images.
+        quiet: no progress bars.
 
     Raises:
-        InputError: an image cannot be read, or what `check_grouping` raises.
+        InputError: no ground truth, an image cannot be read, or what `parse_groupings` and
+            `check_grouping` raise.
     """
-    check_grouping(groupings, batch_size, seed)
+    parsed = parse_groupings(groupings)
+    check_grouping((), batch_size, seed, seeds)
+    positives = benchmark.ground_truth()
 
-    def tokens_of(paths: Sequence[pathlib.Path], label: str) -> FolderTokens:
-        return read_tokens(
-            params, config, paths, batch_size=batch_size, label=label, cache=cache, quiet=quiet
+    def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
+        tokens = read_tokens(
+            params, config, paths, batch_size=batch_size, label=name, cache=cache, quiet=quiet
         )
+        return _Side(name, tokens, same, offset)
 
-    database = tokens_of(benchmark.database, "database")
-    queries = tokens_of(benchmark.queries, "queries")
-    if params.encoder is None:
-        groupings = ("single",)
+    same_queries, same_database = _same_place(benchmark, positives)
+    database = side("database", benchmark.database, same_database, 0)
+    queries = side("queries", benchmark.queries, same_queries, 1)
+    describe = functools.partial(group, params, config, batch_size=batch_size, quiet=quiet)
     results = []
-    for grouping in groupings:
-        sides = [
-            group(params, config, folder, grouping, batch_size=batch_size, seed=seed + side)
-            for side, folder in enumerate((database, queries))
-        ]
-        neighbours = search(*sides, k=min(max(KS), len(benchmark.database)))
-        name = "any" if params.encoder is None else grouping
-        found = recalls(neighbours.indices, benchmark.positives, KS)
-        results.append(GroupingResult(name, found, neighbours))
+    for grouping in parsed if params.encoder else [Grouping("single", "single")]:
+        is_random = "shuffled" in (grouping.queries, grouping.database)
+        drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
+        sides = (database, grouping.database), (queries, grouping.queries)
+        database_share, query_share = (
+            _mean_share(side, kind, drawn, batch_size) for side, kind in sides
+        )
+        results.append(
+            summarise(
+                str(grouping) if params.encoder else ANY,
+                _rank(describe, sides, drawn),
+                positives,
+                KS,
+                query_share=query_share,
+                database_share=database_share,
+                is_random=is_random,
+            )
+        )
     return results
+
+
+class _Side(NamedTuple):
+    """Database or queries, read."""
+
+    name: str
+    tokens: FolderTokens
+    same: SamePlace
+    offset: int
+    """From a shuffle's seed to that of this side: two sides are never shuffled alike."""
+
+
+def same_place_rule(benchmark: Benchmark) -> str:
+    """By what `evaluate` tells whether two images of one side show the same place, in words."""
+    if benchmark.query_positions is None or benchmark.database_positions is None:
+        return "a common positive"
+    return f"a distance of at most {benchmark.radius:g} m"
+
+
+def _same_place(
+    benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]]
+) -> tuple[SamePlace, SamePlace]:
+    """Of the queries and of the database: by positions, or where there are none by ground truth."""
+    if benchmark.query_positions is None or benchmark.database_positions is None:
+        return by_truth(positives, len(benchmark.database))
+    radius = benchmark.radius
+    return near(benchmark.query_positions, radius), near(benchmark.database_positions, radius)
+
+
+def _mean_share(side: _Side, kind: str, seeds: Sequence[int], batch_size: int) -> float | None:
+    """See `GroupingResult`."""
+    count = len(side.tokens.readable)
+    found = [
+        same_place_share(batches_of(count, kind, batch_size, seed + side.offset), side.same)
+        for seed in (seeds if kind == "shuffled" else seeds[:1])
+    ]
+    known = [share for share in found if share is not None]
+    return statistics.fmean(known) if known else None
+
+
+def _rank(
+    describe: Callable[..., Float[np.ndarray, "image descriptor"]],
+    sides: Sequence[tuple[_Side, str]],
+    seeds: Sequence[int],
+) -> dict[int, Neighbours]:
+    """The neighbours by seed. Only a side that is shuffled is described for each anew."""
+
+    def descriptors(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
+        return describe(side.tokens, kind, seed=seed + side.offset, label=side.name)
+
+    fixed = {
+        side.name: descriptors(side, kind, seeds[0]) for side, kind in sides if kind != "shuffled"
+    }
+
+    def ranking(seed: int) -> Neighbours:
+        database, queries = (
+            fixed[side.name] if side.name in fixed else descriptors(side, kind, seed)
+            for side, kind in sides
+        )
+        return search(database, queries, k=min(max(KS), len(database)))
+
+    return {seed: ranking(seed) for seed in seeds}

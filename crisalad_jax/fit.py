@@ -118,7 +118,7 @@ def fit(
     Written: `config.json`; `metrics.jsonl`, a line a step and a line a validation, and the same for
     TensorBoard in `tensorboard/`; `state/`, what a later call resumes from; `last.safetensors`; and
     with a validation `best.safetensors`, the weights of the best Recall@5 (every image alone, see
-    `evaluation.GROUPINGS`), and the best `config.keep_best` in `best/`.
+    `groupings.GROUPINGS`), and the best `config.keep_best` in `best/`.
 
     A run that is killed at any moment and called again ends with the same bits as one that was not.
 
@@ -134,14 +134,17 @@ def fit(
         quiet: no progress bar.
 
     Raises:
-        InputError: an argument is out of range; `out` holds something else, or a run of another
-            configuration or start; an image cannot be read; there are too few places or images; the
-            loss is no longer finite (the state before that step is saved); or a file cannot be
-            written.
+        InputError: an argument is out of range; the validation has no ground truth; `out` holds
+            something else, or a run of another configuration or start; an image cannot be read;
+            there are too few places or images; the loss is no longer finite (the state before that
+            step is saved); or a file cannot be written.
         Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
     if workers < 0:
         raise InputError(f"workers: found {workers}, expected at least 0")
+    if validation is not None:
+        # Asked for now, not after the first epoch.
+        validation.ground_truth()
     try:
         run = _Run(config, places, out, initial, validation, split_state=split_state)
         with contextlib.closing(run):

@@ -26,14 +26,13 @@ from crisalad_jax.files import durable_path
 from crisalad_jax.model import Crisalad
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.retrieval import Neighbours
+from crisalad_jax.rows import UNIT_TOLERANCE
 from crisalad_jax.serial import from_plain, to_plain
 from crisalad_jax.stores import Store, open_store, store_name
 from crisalad_jax.stores.files import remove_leftovers
 
 FORMAT = 1
 """Version of the format that this package writes, and the newest that it reads."""
-# float16 keeps unit vectors to 1e-3.
-_UNIT_TOLERANCE = 1e-2
 _DESCRIPTION, _SEGMENTS, _LOCK = "map.json", "segments", ".lock"
 
 
@@ -252,7 +251,7 @@ class Map:
             )
         # "Not within" rather than "beyond", so that NaN counts as wrong.
         norms = np.linalg.norm(descriptors.astype(np.float32), axis=1)
-        if (wrong := np.flatnonzero(~(np.abs(norms - 1) <= _UNIT_TOLERANCE))).size:
+        if (wrong := np.flatnonzero(~(np.abs(norms - 1) <= UNIT_TOLERANCE))).size:
             raise InputError(
                 f"{name}: row {wrong[0]} is of length {norms[wrong[0]]:.4g}, expected unit vectors"
             )

@@ -124,7 +124,16 @@ def recall(arguments: argparse.Namespace) -> Study:
         )
         descriptors[dtype] = group(params, typed, tokens, "single", batch_size=16)
         alike = cosines(descriptors[dtype], descriptors["float32"])
-        for result in evaluate(params, typed, benchmark, batch_size=16, quiet=True):
+        results = evaluate(
+            params,
+            typed,
+            benchmark,
+            groupings=("single", "shuffled", "sequential"),
+            batch_size=16,
+            seeds=1,
+            quiet=True,
+        )
+        for result in results:
             values.append(
                 {
                     "contender": dtype,

@@ -24,7 +24,8 @@ from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.fit import fit
 from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.report import RecallRow, recall_markdown
-from crisalad_jax.retrieval import recalls, search
+from crisalad_jax.retrieval import search
+from crisalad_jax.scores import recalls
 
 TESTS = ("sped_val", "corridor")
 
@@ -64,7 +65,7 @@ def hog_recalls(benchmark: Benchmark) -> dict[int, float]:
         hog_descriptors([read_image(path) for path in paths])
         for paths in (benchmark.database, benchmark.queries)
     ]
-    return recalls(search(*sides, k=max(KS)).indices, benchmark.positives, KS)
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)
 
 
 def main() -> None:
@@ -81,7 +82,16 @@ def main() -> None:
 
     def measure(model_name: str, params: Crisalad, config: TrainConfig) -> None:
         for benchmark in benchmarks:
-            for result in evaluate(params, config.model, benchmark, seed=config.seed, quiet=True):
+            results = evaluate(
+                params,
+                config.model,
+                benchmark,
+                groupings=("single", "shuffled", "sequential"),
+                seed=config.seed,
+                seeds=1,
+                quiet=True,
+            )
+            for result in results:
                 rows.append(RecallRow(benchmark.name, model_name, result.grouping, result.recalls))
 
     timings = []

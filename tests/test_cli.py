@@ -36,6 +36,7 @@ from crisalad_jax.files import write_json
 from crisalad_jax.layouts import public_shapes
 from crisalad_jax.model import Crisalad, describe
 from crisalad_jax.pytree import named_leaves
+from crisalad_jax.results import to_json
 from crisalad_jax.serial import read_config, to_plain
 from tests.checkpoints import random_state, save
 from tests.conftest import (
@@ -159,6 +160,8 @@ def test_no_command_prints_the_usage(capfd):
         ("train --data d --out o --model.backbone.dim 100", "ViTConfig.dim: found 100"),
         ("train --data d --out o --on-bad-image ignore", "ignore.*stop.*skip"),
         ("evaluate --data d --grouping single,sorted", "grouping: found 'sorted', expected one of"),
+        ("evaluate --data d --grouping a/b/c", "grouping: found 'a/b/c', .*QUERIES/DATABASE"),
+        ("evaluate --data d --seeds 0", "seeds: found 0, expected at least 1"),
         ("evaluate --data d --batch-size 0", "batch size: found 0"),
         ("evaluate --data d --seed -1", "seed: found -1"),
         ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
@@ -557,22 +560,31 @@ def test_evaluate_prints_and_writes_the_table(
         capfd,
         *("evaluate", "--weights", shared / "weights.safetensors", "--data", shared / "town"),
         *("--batch-size", BATCH, "--seed", "3", "--json", tmp_path / "table.json", "--quiet"),
-        *("--out", tmp_path / "pictures"),
+        *("--seeds", "2", "--out", tmp_path / "pictures"),
     )
     assert "town/test (@UTM, 25 m): 5 queries, 7 database images; positive: UTM distance" in out
     # The customer is told that a descriptor depends on its batch, and how each row grouped.
     assert f"depends on the images in its batch of {BATCH}: single = every image alone" in out
+    assert "window = every image with those just before it in file order" in out
+    assert "Shuffled: mean of 2 seeds ± their standard deviation" in out
     table = json.loads((tmp_path / "table.json").read_text())
-    expected = evaluate(params, MODEL, benchmark, batch_size=BATCH, seed=3, quiet=True)
-    assert [row["grouping"] for row in table["results"]] == ["single", "shuffled", "sequential"]
+    expected = evaluate(params, MODEL, benchmark, batch_size=BATCH, seed=3, seeds=2, quiet=True)
+    groupings = ["single", "shuffled", "sequential", "window/single"]
+    assert [row["grouping"] for row in table["results"]] == groupings
     for row, result in zip(table["results"], expected, strict=True):
-        assert row["recalls"] == {f"R@{k}": recall for k, recall in result.recalls.items()}
+        assert row == {
+            "benchmark": benchmark.name,
+            "model": f"{shared.name}/weights.safetensors",
+            **json.loads(json.dumps(to_json(result))),
+        }
         assert f"{100 * result.recalls[1]:.1f}" in out
     assert table["model"] == to_plain(MODEL)
-    assert (table["batch_size"], table["seed"]) == (BATCH, 3)
+    assert (table["batch_size"], table["seed"], table["seeds"]) == (BATCH, 3, 2)
+    assert table["rule"] == benchmark.rule
+    assert f"the image's own place, told by {table['same_place']}" in out
     assert files_in(tmp_path / "pictures") == {
         "config.json",
-        *(f"gallery_{grouping}.png" for grouping in ("single", "shuffled", "sequential")),
+        *(f"gallery_{name.replace('/', '-')}.png" for name in groupings),
     }
     written = json.loads((tmp_path / "pictures" / "config.json").read_text())
     assert written == {key: value for key, value in table.items() if key != "results"}

@@ -15,12 +15,13 @@ SOURCE = pathlib.Path(__file__).parents[1] / PACKAGE
 LAYERS = (
     ("errors", "cores"),
     ("config", "pytree", "files", "progress", "platform", "processes"),
-    ("sinkhorn", "losses", "serial", "data", "metrics", "stops"),
-    ("nn",),
+    ("sinkhorn", "losses", "serial", "data", "metrics", "stops", "groupings", "scores", "rows"),
+    ("nn", "same_place"),
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),
     ("convert",),
-    ("training", "retrieval", "report", "descriptors"),
+    ("training", "retrieval", "report", "descriptors", "pca"),
+    ("results", "approximate"),
     ("evaluation", "pairs", "stores"),
     ("maps",),
     ("indexing",),
@@ -35,6 +36,7 @@ LEAVES = {
     "pytree": set(),
     "sinkhorn": {"config", "errors", "pytree"},
     "losses": {"config", "errors"},
+    "scores": {"errors"},
     "data": {"config", "cores", "errors", "files", "data"},
 }
 CORE = (
@@ -149,4 +151,4 @@ def test_what_describes_starts_without_what_trains():
 
 def test_pictures_need_no_jax():
     statement = f"import {PACKAGE}.data.images, {PACKAGE}.data.places, {PACKAGE}.data.benchmarks"
-    assert loaded_after(statement, {"jax", "torch", "cv2"}) == {"cv2"}
+    assert loaded_after(statement, {"jax", "torch", "cv2", "scipy"}) == {"cv2"}

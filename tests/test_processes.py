@@ -253,15 +253,35 @@ def test_an_image_that_one_process_cannot_read_ends_both(shared, tmp_path):
     assert words[1] == "crisalad: processes: another one failed; see what it says"
 
 
+def wait_for_steps(programs: list[subprocess.Popen[str]], out: pathlib.Path) -> None:
+    log = out / "metrics.jsonl"
+    while not (log.exists() and log.read_bytes().count(b"\n") > 2):
+        assert programs[0].poll() is None, ends(programs)
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [0, 1])
+def test_where_one_process_is_killed_the_other_ends_and_both_go_on(
+    shared, by_devices, tmp_path, killed
+):
+    out = tmp_path / "run"
+    programs = start(shared, out)
+    wait_for_steps(programs, out)
+    programs[killed].kill()
+    codes = [code for code, _ in ends(programs)]
+    assert codes[killed] == -signal.SIGKILL
+    assert codes[1 - killed] != 0
+    assert [code for code, _ in ends(start(shared, out))] == [0, 0]
+    assert_same_run(out, by_devices / "1")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("both", [(), ("--split-state", "--workers", "1")], ids=str)
 def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path, both):
     out = tmp_path / "run"
     programs = start(shared, out, both=both)
-    log = out / "metrics.jsonl"
-    while not (log.exists() and log.read_bytes().count(b"\n") > 2):
-        assert programs[0].poll() is None, ends(programs)
-        time.sleep(0.05)
+    wait_for_steps(programs, out)
     programs[1].send_signal(signal.SIGTERM)
     for code, words in ends(programs):
         assert code == 128 + signal.SIGTERM, words

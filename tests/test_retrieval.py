@@ -1,12 +1,17 @@
-"""Search against a float64 stable argsort, and recall by hand."""
+"""Search against a float64 stable argsort, and against faiss."""
 
+import sys
+
+import faiss
 import hypothesis
 import hypothesis.strategies as st
+import ml_dtypes
 import numpy as np
 import pytest
 
 from crisalad_jax import retrieval
 from crisalad_jax.errors import InputError
+from tests.test_platform import in_a_program
 
 
 def _unit(rows):
@@ -125,6 +130,161 @@ def test_search_reads_a_memory_map_of_half_floats(tmp_path):
     _assert_ranked(found, database, queries, 6)
 
 
+def test_search_reads_bfloat16_as_a_npy_file_holds_it(tmp_path):
+    """Which names no such type: it comes back as two bytes each."""
+    database, queries = _random_unit(8, 70, 12).astype(ml_dtypes.bfloat16), _random_unit(9, 4, 12)
+    np.save(tmp_path / "database.npy", database)
+    mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
+    assert mapped.dtype == np.dtype("V2")
+    found = retrieval.search(mapped, queries, 6, chunk=32)
+    _assert_ranked(found, database, queries, 6)
+    again = retrieval.search(database, queries, 6)
+    np.testing.assert_array_equal(found.similarities, again.similarities)
+
+
+def test_similarities_are_float64_sums_rounded_once():
+    """So they are the same bits whatever multiplies; and that is as exact as float32 can be."""
+    database, queries = _random_unit(10, 200, 700), _random_unit(11, 6, 700)
+    wanted = queries.astype(np.float64) @ database.astype(np.float64).T
+    for chunk in (16, 112, 200):
+        found = retrieval.search(database, queries, 30, chunk=chunk)
+        chosen = np.take_along_axis(wanted, found.indices, axis=1)
+        # Two float64 sums differ by 1e-15, which changes none of these roundings.
+        np.testing.assert_array_equal(found.similarities, chosen.astype(np.float32))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_duplicates_and_their_order_are_those_of_faiss(seed):
+    """More equal rows than a device names beside k, at every k; 24 queries are multiplied as one
+    matrix by faiss, 3 one by one."""
+    generator = np.random.default_rng(seed)
+    distinct = np.zeros((40, 64), np.float32)
+    # Products of these are exact in float32, squared distances too.
+    distinct[:, :16] = generator.choice([-0.25, 0.25], (40, 16))
+    distinct = generator.permuted(distinct, axis=1)
+    database = distinct[generator.integers(0, 40, 900)]
+    index = faiss.IndexFlatL2(64)
+    index.add(database)
+    for count, k in ((24, 1), (24, 20), (24, 77), (3, 20)):
+        queries = distinct[generator.integers(0, 40, count)]
+        distances, indices = index.search(queries, k)
+        found = retrieval.search(database, queries, k, chunk=128)
+        np.testing.assert_array_equal(found.indices, indices)
+        np.testing.assert_array_equal(2 - 2 * found.similarities, distances)
+
+
+def test_random_descriptors_with_copies_are_found_as_faiss_does():
+    """Recalls are functions of these indices."""
+    database, queries = _random_unit(12, 2000, 48), _random_unit(13, 60, 48)
+    database[1000:1100] = database[300:400]
+    database[1500:1540] = database[7]
+    queries[:40] = _unit(queries[:40] * 0.2 + database[300:340])
+    queries[40] = database[7]
+    index = faiss.IndexFlatL2(48)
+    index.add(database)
+    distances, indices = index.search(queries, 25)
+    # No distances closer than faiss can tell apart, other than those of copies.
+    gaps = np.diff(distances, axis=1)
+    assert gaps[gaps > 1e-6].size + (gaps == 0).sum() == gaps.size
+    found = retrieval.search(database, queries, 25, chunk=256)
+    np.testing.assert_array_equal(found.indices, indices)
+
+
+def test_all_rows_alike_are_ranked_by_index():
+    """As from a network that has collapsed: every row of every chunk may be among the best."""
+    database = _unit(np.ones((500, 33)) + 1e-9).astype(np.float32)
+    found = retrieval.search(database, database[:40], 20, chunk=64)
+    np.testing.assert_array_equal(found.indices, np.tile(np.arange(20), (40, 1)))
+
+
+_ON_DEVICES = """
+import sys
+import jax, numpy as np
+from crisalad_jax.retrieval import search
+assert len(jax.local_devices()) == int(sys.argv[2])
+arrays = np.load(sys.argv[1])
+for name, (k, chunk) in {"some": (20, 300), "tiny": (3, 1), "all": (700, 4096)}.items():
+    found = search(arrays["database"], arrays["queries"], k, chunk=chunk)
+    np.savez(f"{sys.argv[3]}-{name}.npz", *found)
+"""
+
+
+@pytest.mark.parametrize(
+    "count",
+    [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow), 8],
+)
+def test_devices_change_no_bit(count, tmp_path):
+    database, queries = _random_unit(14, 700, 96), _random_unit(15, 30, 96)
+    database[400:500] = database[:100]
+    database[600:660] = database[3]
+    queries[0] = database[3]
+    np.savez(tmp_path / "arrays.npz", database=database, queries=queries)
+    arguments = map(str, (tmp_path / "arrays.npz", count, tmp_path / "found"))
+    in_a_program(_ON_DEVICES, tmp_path, *arguments, JAX_NUM_CPU_DEVICES=str(count))
+    for name, k in {"some": 20, "tiny": 3, "all": 700}.items():
+        found = np.load(tmp_path / f"found-{name}.npz")
+        expected = retrieval.search(database, queries, k)
+        np.testing.assert_array_equal(found["arr_0"], expected.indices)
+        np.testing.assert_array_equal(found["arr_1"], expected.similarities)
+
+
+_IN_MEMORY = """
+import pathlib, re, sys
+import jax, numpy as np
+from crisalad_jax.retrieval import search
+
+def most():
+    # What getrusage says begins with the memory of the program that started this one.
+    status = pathlib.Path("/proc/self/status").read_text()
+    return int(re.search("VmHWM:\\s*(\\d+) kB", status)[1])
+
+database, queries = (np.load(path, mmap_mode="r") for path in sys.argv[1:])
+search(database[:2048], queries, 5, chunk=512)
+before = most()
+search(database, queries, 5, chunk=512)
+print(most() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's account of memory")
+def test_memory_does_not_grow_with_the_database(tmp_path):
+    """10,000 and 100,000 rows of 1 KiB, of which a program that kept them would have 102 MB."""
+    generator = np.random.default_rng(0)
+    np.save(tmp_path / "queries.npy", _random_unit(1, 16, 256))
+    grown = {}
+    for count in (10_000, 100_000):
+        path = tmp_path / f"{count}.npy"
+        rows = np.lib.format.open_memmap(path, "w+", np.float32, (count, 256))
+        for start in range(0, count, 10_000):
+            part = generator.standard_normal((10_000, 256), np.float32)
+            rows[start : start + 10_000] = _unit(part)
+        del rows
+        said = in_a_program(_IN_MEMORY, tmp_path, str(path), str(tmp_path / "queries.npy"))
+        grown[count] = int(said) * 1024
+    # A chunk is 0.5 MB, the pages around it some MB; what is read in all, 92 MB more.
+    assert grown[100_000] - grown[10_000] < 12e6
+
+
+def test_a_copy_on_write_map_keeps_what_was_written_to_it(tmp_path):
+    """Its pages are never let go: what they hold is nowhere else."""
+    np.save(tmp_path / "database.npy", _random_unit(16, 4000, 16))
+    mapped = np.load(tmp_path / "database.npy", mmap_mode="c")
+    mapped[3000] = np.eye(16)[2]
+    query = np.eye(16, dtype=np.float32)[2:3]
+    for _ in range(2):
+        assert retrieval.search(mapped, query, 1, chunk=64).indices == 3000
+
+
+def test_progress_is_shown_when_asked(capfd):
+    rows = _random_unit(0, 9, 4)
+    retrieval.search(rows, rows, 1)
+    assert capfd.readouterr() == ("", "")
+    retrieval.search(rows, rows, 1, label="looking", quiet=False)
+    shown = capfd.readouterr().err
+    assert "looking" in shown
+    assert "9/9" in shown
+
+
 @pytest.mark.parametrize("name", ["database", "queries"])
 @pytest.mark.parametrize(
     ("value", "found"), [(np.nan, "not finite"), (np.inf, "not finite"), (3, "of length")]
@@ -148,45 +308,3 @@ def test_wrong_shapes_and_numbers_are_named():
             retrieval.search(*arguments)
     with pytest.raises(InputError, match=r"^chunk: found 0"):
         retrieval.search(rows, rows, 1, chunk=0)
-
-
-def test_recall_by_hand():
-    indices = np.array(
-        [
-            [4, 1, 2, 3, 0],  # right at rank 1
-            [4, 1, 2, 3, 0],  # right at ranks 3 and 4
-            [0, 1, 2, 3, 4],  # its positives were not found
-            [0, 1, 2, 3, 4],  # it has none: a miss, and still counted
-            [3, 2, 1, 4, 0],  # right at rank 5
-        ]
-    )
-    positives = [np.array(p, np.int64) for p in ([4], [2, 3], [7, 9], [], [0, 12])]
-    found = retrieval.recalls(indices, positives, ks=(1, 2, 3, 5, 20))
-    assert found == {1: 1 / 5, 2: 1 / 5, 3: 2 / 5, 5: 3 / 5, 20: 3 / 5}
-    assert list(retrieval.recalls(indices, positives)) == [1, 5, 10, 20]
-
-
-@hypothesis.settings(max_examples=50, deadline=None)
-@hypothesis.given(seed=st.integers(0, 2**32 - 1))
-def test_recall_agrees_with_sets_and_never_falls(seed):
-    rng = np.random.default_rng(seed)
-    indices = np.stack([rng.permutation(30)[:12] for _ in range(8)])
-    positives = [rng.permutation(30)[: rng.integers(0, 4)] for _ in range(8)]
-    ks = (1, 2, 5, 12)
-    found = retrieval.recalls(indices, positives, ks)
-    for k in ks:
-        hits = [bool(set(i[:k]) & set(p)) for i, p in zip(indices, positives, strict=True)]
-        assert found[k] == sum(hits) / 8
-    assert sorted(found.values()) == list(found.values())
-
-
-def test_recall_rejects_what_it_cannot_count():
-    indices = np.array([[0, 1]])
-    with pytest.raises(InputError, match=r"^indices: found no queries"):
-        retrieval.recalls(np.zeros((0, 3), np.int64), [])
-    with pytest.raises(InputError, match=r"^positives: found 2 lists, expected 1"):
-        retrieval.recalls(indices, [np.array([0]), np.array([1])])
-    with pytest.raises(InputError, match=r"^positives: query 0 has -1"):
-        retrieval.recalls(indices, [np.array([-1])])
-    with pytest.raises(InputError, match=r"^ks: found 0"):
-        retrieval.recalls(indices, [np.array([0])], ks=(0, 5))

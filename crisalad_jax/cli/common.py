@@ -11,7 +11,7 @@ import rich.console
 
 from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.config import ModelConfig, recipe
-from crisalad_jax.evaluation import GROUPINGS
+from crisalad_jax.groupings import GROUPINGS
 from crisalad_jax.model import Crisalad, init_crisalad
 
 # Into a file or a pipe, wide enough that tables do not wrap.

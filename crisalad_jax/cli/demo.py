@@ -4,7 +4,6 @@ import dataclasses
 import pathlib
 
 from crisalad_jax.cli.common import console, grouping_words
-from crisalad_jax.evaluation import GROUPINGS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +19,7 @@ class Demo:
 
 def run(arguments: Demo) -> None:
     """Run the demo, and print its table."""
-    from crisalad_jax.demo import DemoConfig, run_demo
+    from crisalad_jax.demo import GROUPINGS, DemoConfig, run_demo
     from crisalad_jax.report import recall_table
 
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)

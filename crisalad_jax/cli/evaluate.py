@@ -5,37 +5,62 @@ import pathlib
 from typing import Literal
 
 from crisalad_jax.cli.common import console, grouping_words, model_of
-from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.evaluation import evaluate, same_place_rule
 from crisalad_jax.files import check_target, write_json
+from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
+from crisalad_jax.results import GroupingResult, grouping_table, to_json
 from crisalad_jax.serial import to_plain
+
+_RECALLS = (
+    "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
+    "AP: area under precision and recall of the first retrievals, by similarity. R at 100 % P: of "
+    "the queries with a positive, the share retrieved rightly, above every wrong first retrieval."
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Print Recall@1/5/10/20 of a model on an evaluation set, under each grouping of the images."""
+    """Print Recall@1/5/10/20 of a model on an evaluation set, under each grouping of the images.
+
+    With 95 % intervals, recall at 100 % precision, and what each grouping gives away.
+    """
 
     data: pathlib.Path
-    """Evaluation set: a folder of @UTM names, or VPR-Bench's layout."""
+    """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
+    folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     weights: pathlib.Path | None = None
     """A .safetensors file of this package; none evaluates an untrained model of --preset."""
     preset: str = "b14"
     """Model to start untrained where there are no weights."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of 14; by default the model's."""
-    grouping: str = ",".join(GROUPINGS)
-    """Comma-separated: single, shuffled, sequential."""
+    grouping: str = ",".join(DEFAULT_GROUPINGS)
+    """Comma-separated: single, shuffled, sequential, window (an image with those just before it,
+    --batch-size in all); QUERIES/DATABASE groups the two sides apart."""
     batch_size: int = 16
     """Images that a cross-image encoder sees together (the paper: 16)."""
     split: str | None = None
     """train, val or test, where the set has several."""
-    radius: float = 25.0
-    """Largest distance of a positive in metres, for @UTM names."""
+    layout: str | None = None
+    """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default what DATA looks
+    like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
+    images: pathlib.Path | None = None
+    """Folder of the images that a .mat file or .npy lists name; by default beside them."""
+    radius: float | None = None
+    """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
+    max_heading_difference: float | None = None
+    """Largest difference of compass angles of a positive in degrees, for raw MSLS; by default any
+    (the paper: 40)."""
+    frames: int | None = None
+    """How many frames a positive may be away, for two plain folders of the same moments."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
     seed: int = 0
-    """Draws the shuffled order, and untrained weights."""
+    """Draws the first shuffled order, and untrained weights."""
+    seeds: int = 3
+    """Shuffled orders: their mean and standard deviation are printed."""
     out: pathlib.Path | None = None
     """Folder for a gallery of retrievals and the resolved configuration."""
     json: pathlib.Path | None = None
@@ -46,14 +71,12 @@ class Evaluate:
 
 def run(arguments: Evaluate) -> None:
     """Evaluate, print the table, and write what is asked for."""
-    from crisalad_jax.report import RecallRow, prediction_gallery, recall_table
-
-    groupings = list(dict.fromkeys(arguments.grouping.split(",")))
+    groupings = parse_groupings(arguments.grouping.split(","))
     if arguments.json is not None:
         check_target(arguments.json)
     if arguments.out is not None:
         check_target(arguments.out / "config.json")
-    check_grouping(groupings, arguments.batch_size, arguments.seed)
+    check_grouping((), arguments.batch_size, arguments.seed, arguments.seeds)
     params, config, model_name = model_of(
         arguments.weights,
         preset=arguments.preset,
@@ -61,53 +84,87 @@ def run(arguments: Evaluate) -> None:
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
-    benchmark = open_benchmark(arguments.data, arguments.split, arguments.radius)
+    benchmark = open_benchmark(
+        arguments.data,
+        arguments.split,
+        arguments.radius,
+        images=arguments.images,
+        max_heading_difference=arguments.max_heading_difference,
+        frames=arguments.frames,
+        layout=arguments.layout,
+    )
     console.print(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
-        f"images; positive: {benchmark.rule}",
+        f"images; positive: {benchmark.rule}\n{model_name}",
         soft_wrap=True,
     )
     results = evaluate(
         params,
         config,
         benchmark,
-        groupings=groupings,
+        groupings=list(map(str, groupings)),
         batch_size=arguments.batch_size,
         seed=arguments.seed,
+        seeds=arguments.seeds,
         quiet=arguments.quiet,
     )
-    rows = [RecallRow(benchmark.name, model_name, r.grouping, r.recalls) for r in results]
-    console.print(recall_table(rows))
+    console.print(grouping_table(results))
+    same_place = same_place_rule(benchmark)
+    notes = [_RECALLS]
     if params.encoder is None:
-        console.print("No cross-image encoder: no descriptor depends on its batch.")
+        notes.append("No cross-image encoder: no descriptor depends on its batch.")
     else:
-        console.print(
-            "A descriptor of this model depends on the images in its batch of "
-            f"{arguments.batch_size}: {grouping_words(groupings)}.",
-            soft_wrap=True,
-        )
+        notes += _notes(arguments, groupings, same_place)
+    for note in notes:
+        console.print(note, soft_wrap=True)
     resolved = {
         "weights": None if arguments.weights is None else str(arguments.weights),
         "benchmark": benchmark.name,
         "rule": benchmark.rule,
+        "same_place": same_place,
         "batch_size": arguments.batch_size,
         "seed": arguments.seed,
+        "seeds": arguments.seeds,
         "model": to_plain(config),
     }
     if arguments.json is not None:
         table = [
-            row._asdict() | {"recalls": {f"R@{k}": v for k, v in row.recalls.items()}}
-            for row in rows
+            {"benchmark": benchmark.name, "model": model_name} | to_json(result)
+            for result in results
         ]
         write_json(arguments.json, resolved | {"results": table})
     if arguments.out is not None:
+        _write_galleries(arguments.out, benchmark, model_name, results)
         write_json(arguments.out / "config.json", resolved)
-        for result in results:
-            prediction_gallery(
-                arguments.out / f"gallery_{result.grouping}.png",
-                benchmark.queries,
-                benchmark.database,
-                *result.neighbours,
-                benchmark.positives,
-                title=f"{benchmark.name}, {model_name}, {result.grouping}",
-            )
+
+
+def _notes(arguments: Evaluate, groupings: list[Grouping], same_place: str) -> list[str]:
+    """What the table's groupings are."""
+    kinds = dict.fromkeys(kind for each in groupings for kind in (each.queries, each.database))
+    notes = [
+        "A descriptor of this model depends on the images in its batch of "
+        f"{arguments.batch_size}: {grouping_words(kinds)}. Same place: of the others in sight, "
+        f"those that show the image's own place, told by {same_place}."
+    ]
+    if "shuffled" in kinds and arguments.seeds > 1:
+        notes.append(
+            f"Shuffled: mean of {arguments.seeds} seeds ± their standard deviation; the interval "
+            "is of the mean."
+        )
+    return notes
+
+
+def _write_galleries(
+    out: pathlib.Path, benchmark: Benchmark, model_name: str, results: list[GroupingResult]
+) -> None:
+    from crisalad_jax.report import prediction_gallery
+
+    for result in results:
+        prediction_gallery(
+            out / f"gallery_{result.grouping.replace('/', '-')}.png",
+            benchmark.queries,
+            benchmark.database,
+            *result.neighbours,
+            benchmark.ground_truth(),
+            title=f"{benchmark.name}, {model_name}, {result.grouping}",
+        )

@@ -14,9 +14,11 @@ from crisalad_jax.descriptors import (
     writer_for,
 )
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import GROUPINGS, check_grouping, group, read_tokens
+from crisalad_jax.evaluation import group, read_tokens
 from crisalad_jax.files import check_target, write_json
+from crisalad_jax.groupings import GROUPINGS, check_grouping
 from crisalad_jax.pairs import check_names, nearest_pairs, write_pairs
+from crisalad_jax.pca import load_pca
 from crisalad_jax.serial import to_plain
 
 
@@ -33,7 +35,8 @@ class Extract:
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of 14; by default the model's."""
     grouping: str = "single"
-    """single, shuffled or sequential: a cross-image model's descriptors depend on it."""
+    """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
+    all): a cross-image model's descriptors depend on it."""
     batch_size: int = 16
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
@@ -48,6 +51,8 @@ class Extract:
     """Descriptors, .h5 or .npy, of the images that are paired with these; by default these."""
     k: int = 20
     """Pairs of each image; never with itself."""
+    pca: pathlib.Path | None = None
+    """Components that `crisalad pca` fitted, for shorter descriptors."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
     quiet: bool = False
@@ -67,9 +72,13 @@ def run(arguments: Extract) -> None:
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
+    pca = None if arguments.pca is None else load_pca(arguments.pca)
+    if pca is not None:
+        pca.check(config.descriptor_dim, str(arguments.weights))
     paths = list_images(arguments.images)
     names = _names(arguments, paths)
-    database = _database(arguments, names, config.descriptor_dim)
+    length = config.descriptor_dim if pca is None else len(pca.components)
+    database = _database(arguments, names, length)
     folder = read_tokens(
         params,
         config,
@@ -86,11 +95,14 @@ def run(arguments: Extract) -> None:
         arguments.grouping,
         batch_size=arguments.batch_size,
         seed=arguments.seed,
+        quiet=arguments.quiet,
     )[folder.readable]
     skipped = [name for name, ok in zip(names, folder.readable, strict=True) if not ok]
     kept = [name for name, ok in zip(names, folder.readable, strict=True) if ok]
     if not kept:
         raise InputError(f"{arguments.images}: found {len(paths)} images, none of them readable")
+    if pca is not None:
+        descriptors = pca.apply(descriptors)
     write(arguments.out, descriptors, kept)
     write_json(
         config_of(arguments.out),
@@ -100,6 +112,7 @@ def run(arguments: Extract) -> None:
             "grouping": arguments.grouping,
             "batch_size": arguments.batch_size,
             "seed": arguments.seed,
+            "pca": None if arguments.pca is None else str(arguments.pca),
             "skipped": skipped,
             "model": to_plain(config),
         },
@@ -109,7 +122,7 @@ def run(arguments: Extract) -> None:
         write_pairs(arguments.pairs, pairs)
         console.print(f"{arguments.pairs}: {len(pairs)} pairs", soft_wrap=True)
     console.print(
-        f"{arguments.out}: {len(kept)} descriptors of {config.descriptor_dim} numbers, "
+        f"{arguments.out}: {len(kept)} descriptors of {descriptors.shape[1]} numbers, "
         f"grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]})"
         + (f"; {len(skipped)} unreadable images left out" if skipped else ""),
         soft_wrap=True,
@@ -143,6 +156,6 @@ def _database(
     if descriptors.shape[1] != length:
         raise InputError(
             f"{arguments.database}: found descriptors of {descriptors.shape[1]} numbers, expected "
-            f"{length} as of these weights"
+            f"{length} as of these images"
         )
     return listed, descriptors

@@ -9,7 +9,7 @@ from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.positions import read_positions, utm_positions
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import check_grouping
+from crisalad_jax.groupings import check_grouping
 from crisalad_jax.indexing import index_images
 from crisalad_jax.maps import (
     MapDescription,

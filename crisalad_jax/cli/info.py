@@ -10,8 +10,8 @@ from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.cli.common import console, resized
 from crisalad_jax.config import recipe
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
-from crisalad_jax.evaluation import check_grouping
 from crisalad_jax.files import check_target, write_json
+from crisalad_jax.groupings import check_grouping
 from crisalad_jax.maps import open_map
 from crisalad_jax.model import init_crisalad
 

@@ -17,8 +17,8 @@ from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.cli.common import console
 from crisalad_jax.data.images import list_images
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import check_grouping
 from crisalad_jax.files import atomic_path, check_target
+from crisalad_jax.groupings import check_grouping
 from crisalad_jax.indexing import describe_alone
 from crisalad_jax.maps import Map, check_model, model_hash, open_map, read_description
 from crisalad_jax.model import Crisalad

@@ -1,0 +1,57 @@
+"""`crisalad pca`."""
+
+import dataclasses
+import pathlib
+
+from crisalad_jax.cli.common import console
+from crisalad_jax.descriptors import open_npy
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import check_target
+from crisalad_jax.pca import SAMPLES, PcaConfig, fit_pca, save_pca
+
+
+@dataclasses.dataclass(frozen=True)
+class Pca:
+    """Fit principal components to descriptors, for shorter ones (extract --pca)."""
+
+    descriptors: pathlib.Path
+    """A .npy file, such as `crisalad extract` writes; not of images that are evaluated on."""
+    out: pathlib.Path
+    """A .safetensors file."""
+    dim: int = 512
+    """Components that are kept."""
+    whiten: bool = False
+    """Divide every component by its standard deviation."""
+    renormalise: bool = True
+    """Make the shorter descriptors unit vectors again."""
+    samples: int = SAMPLES
+    """Fit at most so many descriptors, drawn at random."""
+    seed: int = 0
+    """Draws them."""
+    quiet: bool = False
+    """No progress bar."""
+
+
+def run(arguments: Pca) -> None:
+    """Fit, write, and say how much of the variance is kept."""
+    if arguments.out.suffix != ".safetensors":
+        raise InputError(
+            f"{arguments.out}: found the suffix {arguments.out.suffix!r}, expected .safetensors"
+        )
+    check_target(arguments.out)
+    found = open_npy(arguments.descriptors)
+    pca = fit_pca(
+        found,
+        arguments.dim,
+        PcaConfig(arguments.whiten, arguments.renormalise),
+        samples=arguments.samples,
+        seed=arguments.seed,
+        quiet=arguments.quiet,
+    )
+    save_pca(arguments.out, pca)
+    console.print(
+        f"{arguments.out}: {arguments.dim} of {found.shape[1]} components, "
+        f"{100 * pca.kept:.1f} % of the variance of "
+        f"{min(arguments.samples, len(found))} descriptors",
+        soft_wrap=True,
+    )
