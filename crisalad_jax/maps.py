@@ -6,57 +6,32 @@ any moment is the map as it was before the addition or after it. docs/maps.md ha
 """
 
 import contextlib
-import dataclasses
-import datetime
 import hashlib
 import json
 import os
 import pathlib
-import uuid
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import durable_path
-from crisalad_jax.model import Crisalad
-from crisalad_jax.pytree import named_leaves
+from crisalad_jax.map_description import (
+    DESCRIPTION,
+    SEGMENTS,
+    MapDescription,
+    read_description,
+    write_record,
+)
 from crisalad_jax.retrieval import Neighbours
 from crisalad_jax.rows import UNIT_TOLERANCE
-from crisalad_jax.serial import from_plain, to_plain
-from crisalad_jax.stores import Store, open_store, store_name
+from crisalad_jax.serial import to_plain
+from crisalad_jax.stores import Store, open_store
 from crisalad_jax.stores.files import remove_leftovers
 
-FORMAT = 1
-"""Version of the format that this package writes, and the newest that it reads."""
-_DESCRIPTION, _SEGMENTS, _LOCK = "map.json", "segments", ".lock"
-
-
-@dataclasses.dataclass(frozen=True)
-class MapDescription:
-    """What map.json says."""
-
-    model: str
-    """The `model_hash` of the weights that describe its images, and its queries."""
-    weights: str
-    """Where those weights were."""
-    config: ModelConfig
-    """The model, at the image size and in the type in which images are described."""
-    descriptor_length: int
-    store: str = "files"
-    """Where descriptors are; see `stores.store_name`."""
-    dtype: str = "float32"
-    """What descriptors are kept as."""
-    grouping: str = "single"
-    """Every image is described alone: what a map says of a place depends on no neighbour."""
-    collection: str = ""
-    """What Milvus keeps the descriptors under."""
-    created: str = ""
-    format: int = FORMAT
+_LOCK = ".lock"
 
 
 class MapImage(NamedTuple):
@@ -76,100 +51,6 @@ class _Segment(NamedTuple):
     sha256: str
 
 
-def model_hash(params: Crisalad, config: ModelConfig) -> str:
-    """A digest of everything that descriptors are a function of, besides image size and rounding.
-
-    Of parameters by name, type, shape and value, and of the configuration without the image size,
-    the type that is computed in, what is kept for the gradient, and dropout: the same for a file of
-    weights and for its copy in another layout.
-    """
-    plain = to_plain(config)
-    for part, field in (("", "image_size"), ("", "compute_dtype"), ("", "keeps")):
-        (plain[part] if part else plain).pop(field)
-    for part in ("salad", "encoder"):
-        plain[part].pop("dropout")
-    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
-    for name, leaf in sorted(named_leaves(params).items()):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{name} {array.dtype} {array.shape}".encode())
-        digest.update(array.data)
-    return digest.hexdigest()
-
-
-def describe_map(
-    params: Crisalad,
-    config: ModelConfig,
-    weights: pathlib.Path,
-    folder: pathlib.Path,
-    *,
-    store: str = "files",
-    dtype: str = "float32",
-) -> MapDescription:
-    """The description of a new map in `folder`, of images that this model is to describe.
-
-    Raises:
-        InputError: what `store_name` raises.
-    """
-    return MapDescription(
-        model=model_hash(params, config),
-        weights=str(weights.resolve()),
-        config=config,
-        descriptor_length=config.descriptor_dim,
-        store=store_name(store, folder, dtype),
-        dtype=dtype,
-        collection=f"crisalad_{uuid.uuid4().hex}",
-        created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    )
-
-
-def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
-    """What the map in `folder` says of itself; None where a new one can be made.
-
-    Raises:
-        InputError: the folder is a file or holds other things than a map, or the map is damaged or
-            of a newer version of this package.
-    """
-    folder = pathlib.Path(folder)
-    path = folder / _DESCRIPTION
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: found a file, expected a map's folder") from None
-        # Hidden, or empty, is what a process leaves that was killed before it had made the map.
-        others = sorted(p.name for p in folder.glob("[!.]*"))
-        if others != [_SEGMENTS] * len(others) or any((folder / _SEGMENTS).glob("[!.]*")):
-            raise InputError(
-                f"{folder}: found {others[0]} and no {_DESCRIPTION}, expected a map or an empty "
-                "folder"
-            ) from None
-        return None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot read this map: {error}") from error
-    version = value.get("format") if isinstance(value, dict) else None
-    if type(version) is int and version > FORMAT:
-        raise InputError(
-            f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
-            "crisalad-jax"
-        )
-    return from_plain(MapDescription, value, source=str(path))
-
-
-def check_model(
-    description: MapDescription, folder: str | os.PathLike[str], found: str, weights: object
-) -> None:
-    """Check that a map is of the model whose hash is `found`.
-
-    Raises:
-        InputError: it is not; the message has both hashes.
-    """
-    if found != description.model:
-        raise InputError(
-            f"{folder}: found a map made by model {description.model[:12]} "
-            f"({description.weights}), but {weights} is model {found[:12]}"
-        )
-
-
 class Map:
     """An open map; make it by `open_map` or, to append, by `open_for_appending`."""
 
@@ -183,7 +64,7 @@ class Map:
         """What positions are: see `positions.AXES`; None where no image has one."""
         self._store = store
         self._segments: list[_Segment] = []
-        for path in sorted((folder / _SEGMENTS).glob("[0-9]*.json")):
+        for path in sorted((folder / SEGMENTS).glob("[0-9]*.json")):
             self._read_record(path)
         store.check([(first, count) for first, count, _ in self._segments])
 
@@ -197,7 +78,7 @@ class Map:
         return None if number is None else self.images[number]
 
     def _record(self, first: int) -> pathlib.Path:
-        return self.folder / _SEGMENTS / f"{first:010d}.json"
+        return self.folder / SEGMENTS / f"{first:010d}.json"
 
     def _read_record(self, path: pathlib.Path) -> None:
         if path != self._record(len(self)):
@@ -306,7 +187,7 @@ class Map:
             "bytes": list(sizes),
             "positions": [image.position for image in images],
         }
-        _write(self._record(segment.first), record)
+        write_record(self._record(segment.first), record)
         self._take(images, axes, segment)
 
     @property
@@ -368,21 +249,21 @@ def open_for_appending(
     read_description(folder)  # or something else is there, where nothing is to be made
     with contextlib.ExitStack() as stack:
         try:
-            (folder / _SEGMENTS).mkdir(parents=True, exist_ok=True)
+            (folder / SEGMENTS).mkdir(parents=True, exist_ok=True)
             stack.enter_context(_locked(folder))
         except OSError as error:
             raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
         found = read_description(folder)
-        remove_leftovers(folder / _SEGMENTS)
+        remove_leftovers(folder / SEGMENTS)
         if found is None:
-            _write(folder / _DESCRIPTION, to_plain(description), indent=2)
+            write_record(folder / DESCRIPTION, to_plain(description), indent=2)
         elif found != description:
             raise InputError(f"{folder}: found another map than was expected here")
         yield stack.enter_context(contextlib.closing(_opened(folder, description)))
 
 
 def _has_images(folder: pathlib.Path) -> bool:
-    return any((folder / _SEGMENTS).glob("[0-9]*.json"))
+    return any((folder / SEGMENTS).glob("[0-9]*.json"))
 
 
 def _opened(folder: pathlib.Path, description: MapDescription) -> Map:
@@ -414,11 +295,3 @@ def _locked(folder: pathlib.Path) -> Iterator[None]:
                 f"{folder}: another process is appending to this map, expected to be the only one"
             ) from error
         yield
-
-
-def _write(path: pathlib.Path, value: Any, indent: int | None = None) -> None:
-    try:
-        with durable_path(path) as temporary:
-            temporary.write_text(json.dumps(value, indent=indent) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

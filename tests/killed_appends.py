@@ -18,7 +18,8 @@ import numpy as np
 import crisalad_jax.stores.files
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.maps import MapDescription, open_for_appending, open_map, read_description
+from crisalad_jax.map_description import MapDescription, read_description
+from crisalad_jax.maps import open_for_appending, open_map
 
 LENGTH = 48
 

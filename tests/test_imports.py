@@ -23,6 +23,7 @@ LAYERS = (
     ("training", "retrieval", "report", "descriptors", "pca"),
     ("results", "approximate"),
     ("evaluation", "pairs", "stores"),
+    ("map_description",),
     ("maps",),
     ("indexing",),
     ("fit",),

@@ -12,7 +12,8 @@ from crisalad_jax.data.positions import utm_positions
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import group, read_tokens
 from crisalad_jax.indexing import Indexed, describe_alone, index_images
-from crisalad_jax.maps import Map, describe_map, open_for_appending, open_map
+from crisalad_jax.map_description import describe_map
+from crisalad_jax.maps import Map, open_for_appending, open_map
 from tests.conftest import BATCH, MODEL
 
 

@@ -16,14 +16,8 @@ from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import write_json
-from crisalad_jax.maps import (
-    check_model,
-    describe_map,
-    model_hash,
-    open_for_appending,
-    open_map,
-    read_description,
-)
+from crisalad_jax.map_description import check_model, describe_map, model_hash, read_description
+from crisalad_jax.maps import open_for_appending, open_map
 from crisalad_jax.serial import to_plain
 from tests import killed_appends
 from tests.conftest import MODEL, random_params

@@ -11,14 +11,14 @@ from crisalad_jax.data.positions import read_positions, utm_positions
 from crisalad_jax.errors import InputError
 from crisalad_jax.groupings import check_grouping
 from crisalad_jax.indexing import index_images
-from crisalad_jax.maps import (
+from crisalad_jax.map_description import (
     MapDescription,
     check_model,
     describe_map,
     model_hash,
-    open_for_appending,
     read_description,
 )
+from crisalad_jax.maps import open_for_appending
 from crisalad_jax.model import Crisalad
 from crisalad_jax.stores import store_name
 

@@ -20,7 +20,8 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.files import atomic_path, check_target
 from crisalad_jax.groupings import check_grouping
 from crisalad_jax.indexing import describe_alone
-from crisalad_jax.maps import Map, check_model, model_hash, open_map, read_description
+from crisalad_jax.map_description import check_model, model_hash, read_description
+from crisalad_jax.maps import Map, open_map
 from crisalad_jax.model import Crisalad
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.retrieval import Neighbours

@@ -1,0 +1,155 @@
+"""What a map says of itself in map.json: the model, its settings, where descriptors are."""
+
+import dataclasses
+import datetime
+import hashlib
+import json
+import os
+import pathlib
+import uuid
+from typing import Any
+
+import numpy as np
+
+from crisalad_jax.config import ModelConfig
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import durable_path
+from crisalad_jax.model import Crisalad
+from crisalad_jax.pytree import named_leaves
+from crisalad_jax.serial import from_plain, to_plain
+from crisalad_jax.stores import store_name
+
+FORMAT = 1
+"""Version of the format that this package writes, and the newest that it reads."""
+DESCRIPTION, SEGMENTS = "map.json", "segments"
+"""The file, and the folder of what was appended."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MapDescription:
+    """What map.json says."""
+
+    model: str
+    """The `model_hash` of the weights that describe its images, and its queries."""
+    weights: str
+    """Where those weights were."""
+    config: ModelConfig
+    """The model, at the image size and in the type in which images are described."""
+    descriptor_length: int
+    store: str = "files"
+    """Where descriptors are; see `stores.store_name`."""
+    dtype: str = "float32"
+    """What descriptors are kept as."""
+    grouping: str = "single"
+    """Every image is described alone: what a map says of a place depends on no neighbour."""
+    collection: str = ""
+    """What Milvus keeps the descriptors under."""
+    created: str = ""
+    format: int = FORMAT
+
+
+def model_hash(params: Crisalad, config: ModelConfig) -> str:
+    """A digest of everything that descriptors are a function of, besides image size and rounding.
+
+    Of parameters by name, type, shape and value, and of the configuration without the image size,
+    the type that is computed in, what is kept for the gradient, and dropout: the same for a file of
+    weights and for its copy in another layout.
+    """
+    plain = to_plain(config)
+    for part, field in (("", "image_size"), ("", "compute_dtype"), ("", "keeps")):
+        (plain[part] if part else plain).pop(field)
+    for part in ("salad", "encoder"):
+        plain[part].pop("dropout")
+    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name, leaf in sorted(named_leaves(params).items()):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def describe_map(
+    params: Crisalad,
+    config: ModelConfig,
+    weights: pathlib.Path,
+    folder: pathlib.Path,
+    *,
+    store: str = "files",
+    dtype: str = "float32",
+) -> MapDescription:
+    """The description of a new map in `folder`, of images that this model is to describe.
+
+    Raises:
+        InputError: what `store_name` raises.
+    """
+    return MapDescription(
+        model=model_hash(params, config),
+        weights=str(weights.resolve()),
+        config=config,
+        descriptor_length=config.descriptor_dim,
+        store=store_name(store, folder, dtype),
+        dtype=dtype,
+        collection=f"crisalad_{uuid.uuid4().hex}",
+        created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    )
+
+
+def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
+    """What the map in `folder` says of itself; None where a new one can be made.
+
+    Raises:
+        InputError: the folder is a file or holds other things than a map, or the map is damaged or
+            of a newer version of this package.
+    """
+    folder = pathlib.Path(folder)
+    path = folder / DESCRIPTION
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: found a file, expected a map's folder") from None
+        # Hidden, or empty, is what a process leaves that was killed before it had made the map.
+        others = sorted(p.name for p in folder.glob("[!.]*"))
+        if others != [SEGMENTS] * len(others) or any((folder / SEGMENTS).glob("[!.]*")):
+            raise InputError(
+                f"{folder}: found {others[0]} and no {DESCRIPTION}, expected a map or an empty "
+                "folder"
+            ) from None
+        return None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read this map: {error}") from error
+    version = value.get("format") if isinstance(value, dict) else None
+    if type(version) is int and version > FORMAT:
+        raise InputError(
+            f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
+            "crisalad-jax"
+        )
+    return from_plain(MapDescription, value, source=str(path))
+
+
+def check_model(
+    description: MapDescription, folder: str | os.PathLike[str], found: str, weights: object
+) -> None:
+    """Check that a map is of the model whose hash is `found`.
+
+    Raises:
+        InputError: it is not; the message has both hashes.
+    """
+    if found != description.model:
+        raise InputError(
+            f"{folder}: found a map made by model {description.model[:12]} "
+            f"({description.weights}), but {weights} is model {found[:12]}"
+        )
+
+
+def write_record(path: pathlib.Path, value: Any, indent: int | None = None) -> None:
+    """Write JSON, whole or not at all, and to the disk.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written to.
+    """
+    try:
+        with durable_path(path) as temporary:
+            temporary.write_text(json.dumps(value, indent=indent) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
