@@ -101,7 +101,7 @@ def tokenise(
         features = _features(params, images, config)
         return aggregate(params.aggregator, features, grid_of(images[0]), config, key=keys)
 
-    count = len(images)
+    count = images.shape[0]  # which may be symbolic, where `len` is not
     keys = None if key is None else jax.random.split(key, count)
     if micro_batch is None or micro_batch == count:
         return part_of(images, keys)

@@ -19,7 +19,7 @@ LAYERS = (
     ("nn",),
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),
-    ("convert",),
+    ("convert", "export"),
     ("training", "retrieval", "report", "descriptors"),
     ("evaluation",),
     ("fit",),
