@@ -1,7 +1,7 @@
 """Descriptors of whole folders, and Recall@K of a benchmark by how its images are grouped."""
 
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -128,6 +128,12 @@ def group(
     return descriptors
 
 
+Observe = Callable[
+    [str, Float[np.ndarray, "image descriptor"], Float[np.ndarray, "image descriptor"]], None
+]
+"""Takes the name of a grouping, the database's descriptors, and the queries'."""
+
+
 class GroupingResult(NamedTuple):
     """A benchmark under one grouping."""
 
@@ -147,11 +153,13 @@ def evaluate(
     batch_size: int = 16,
     seed: int = 0,
     cache: ImageCache | None = None,
+    observe: Observe | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
     """Recall@1/5/10/20 under each grouping; images are read and tokenised once.
 
     A model without a cross-image encoder has one result, `any`: no descriptor depends on a batch.
+    `observe` is given the descriptors of each grouping while they are there.
 
     Raises:
         InputError: an image cannot be read, or what `check_grouping` raises.
@@ -173,6 +181,8 @@ def evaluate(
             group(params, config, folder, grouping, batch_size=batch_size, seed=seed + side)
             for side, folder in enumerate((database, queries))
         ]
+        if observe is not None:
+            observe(grouping, *sides)
         neighbours = search(*sides, k=min(max(KS), len(benchmark.database)))
         name = "any" if params.encoder is None else grouping
         found = recalls(neighbours.indices, benchmark.positives, KS)

@@ -54,17 +54,7 @@ def search(
     for name, value in (("k", k), ("chunk", chunk)):
         if value < 1:
             raise InputError(f"{name}: found {value}, expected at least 1")
-    for name, array in (("database", database), ("queries", queries)):
-        if array.ndim != 2 or 0 in array.shape:
-            raise InputError(
-                f"{name}: found shape {array.shape}, expected (images, descriptor), neither zero"
-            )
-    if database.shape[1] != queries.shape[1]:
-        raise InputError(
-            f"queries: found descriptors of length {queries.shape[1]}, "
-            f"expected {database.shape[1]} as in the database"
-        )
-
+    _check_sides(database, queries)
     count, k = len(database), min(k, len(database))
     chunk = min(chunk, count)
     indices = np.empty((len(queries), 0), np.int64)
@@ -80,6 +70,56 @@ def search(
         similarities = np.take_along_axis(similarities, order, axis=1)
         indices = np.take_along_axis(indices, order, axis=1)
     return Neighbours(indices, similarities)
+
+
+def similarity_map(
+    database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d"], *, most: int = 400
+) -> Float32[np.ndarray, "rows columns"]:
+    """All similarities of queries (rows) and database (columns), in their order, for a picture.
+
+    Where there are more than `most` of either, a cell is the largest of the images that
+    `cells_of` gives it. Memory depends on the blocks that are compared at a time, not on the sets.
+
+    Raises:
+        InputError: as `search`.
+    """
+    _check_sides(database, queries)
+    rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
+    found = np.full((rows[-1] + 1, columns[-1] + 1), -np.inf, np.float32)
+    size, width = min(_QUERY_CHUNK, len(queries)), min(8192, len(database))
+    for left in range(0, len(database), width):
+        block = jnp.asarray(_block(database, "database", left, width))
+        for top in range(0, len(queries), size):
+            part = jnp.asarray(_block(queries, "queries", top, size))
+            cells = [
+                _filled(ids[start : start + length], length, found.shape[axis])
+                for axis, ids, start, length in ((0, rows, top, size), (1, columns, left, width))
+            ]
+            np.maximum(found, _largest(block, part, *cells, shape=found.shape), out=found)
+    return found
+
+
+def cells_of(count: int, most: int) -> Int64[np.ndarray, " count"]:
+    """Which of at most `most` cells each of `count` images in a row falls into, evenly."""
+    return np.arange(count) * min(count, most) // count
+
+
+def _filled(cells: Int64[np.ndarray, " _"], length: int, none: int) -> Int64[np.ndarray, " length"]:
+    """Rows that only fill a block up belong to no cell."""
+    return np.append(cells, np.full(length - len(cells), none))
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _largest(
+    block: Float32[Array, "chunk d"],
+    queries: Float32[Array, "q d"],
+    rows: Int[Array, " q"],
+    columns: Int[Array, " chunk"],
+    shape: tuple[int, int],
+) -> Float32[Array, "rows columns"]:
+    similarities = jnp.matmul(queries, block.T, precision=jax.lax.Precision.HIGHEST)
+    by_row = jax.ops.segment_max(similarities, rows, shape[0])
+    return jax.ops.segment_max(by_row.T, columns, shape[1]).T
 
 
 def recalls(
@@ -120,6 +160,19 @@ def recalls(
             )
         right[query] = np.isin(indices[query], wanted)
     return {k: float(right[:, :k].any(axis=1).mean()) for k in ks}
+
+
+def _check_sides(database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d2"]) -> None:
+    for name, array in (("database", database), ("queries", queries)):
+        if array.ndim != 2 or 0 in array.shape:
+            raise InputError(
+                f"{name}: found shape {array.shape}, expected (images, descriptor), neither zero"
+            )
+    if database.shape[1] != queries.shape[1]:
+        raise InputError(
+            f"queries: found descriptors of length {queries.shape[1]}, "
+            f"expected {database.shape[1]} as in the database"
+        )
 
 
 def _block(

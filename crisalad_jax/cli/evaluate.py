@@ -4,10 +4,14 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from crisalad_jax.cli.common import console, grouping_words, model_of
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.evaluation import GROUPINGS, check_grouping, evaluate
 from crisalad_jax.files import check_target, write_json
+from crisalad_jax.retrieval import similarity_map
 from crisalad_jax.serial import to_plain
 
 
@@ -38,6 +42,9 @@ class Evaluate:
     """Draws the shuffled order, and untrained weights."""
     out: pathlib.Path | None = None
     """Folder for a gallery of retrievals and the resolved configuration."""
+    report: pathlib.Path | None = None
+    """Folder for a page of all results, index.html, that needs no other file and no network; and
+    its pictures."""
     json: pathlib.Path | None = None
     """File for the table as JSON."""
     quiet: bool = False
@@ -53,6 +60,8 @@ def run(arguments: Evaluate) -> None:
         check_target(arguments.json)
     if arguments.out is not None:
         check_target(arguments.out / "config.json")
+    if arguments.report is not None:
+        check_target(arguments.report / "index.html")
     check_grouping(groupings, arguments.batch_size, arguments.seed)
     params, config, model_name = model_of(
         arguments.weights,
@@ -67,6 +76,7 @@ def run(arguments: Evaluate) -> None:
         f"images; positive: {benchmark.rule}",
         soft_wrap=True,
     )
+    seen = _FirstSimilarities()
     results = evaluate(
         params,
         config,
@@ -74,6 +84,7 @@ def run(arguments: Evaluate) -> None:
         groupings=groupings,
         batch_size=arguments.batch_size,
         seed=arguments.seed,
+        observe=None if arguments.report is None else seen,
         quiet=arguments.quiet,
     )
     rows = [RecallRow(benchmark.name, model_name, r.grouping, r.recalls) for r in results]
@@ -111,3 +122,32 @@ def run(arguments: Evaluate) -> None:
                 benchmark.positives,
                 title=f"{benchmark.name}, {model_name}, {result.grouping}",
             )
+    if arguments.report is not None:
+        from crisalad_jax.report import ReportGrouping, write_report
+
+        page = write_report(
+            arguments.report,
+            benchmark,
+            [ReportGrouping(*result, meaning=GROUPINGS.get(result.grouping)) for result in results],
+            params=params,
+            config=config,
+            model_name=model_name,
+            settings=resolved,
+            similarities=seen.map,
+        )
+        console.print(f"report: {page}", soft_wrap=True)
+
+
+class _FirstSimilarities:
+    """Keeps a picture of the similarities under the first grouping, of which the report is."""
+
+    map: Float[np.ndarray, "rows columns"] | None = None
+
+    def __call__(
+        self,
+        grouping: str,
+        database: Float[np.ndarray, "image descriptor"],
+        queries: Float[np.ndarray, "image descriptor"],
+    ) -> None:
+        if self.map is None:
+            self.map = similarity_map(database, queries)

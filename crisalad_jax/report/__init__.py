@@ -1,14 +1,20 @@
-"""What a run shows: recall tables, recall and training curves, galleries of predictions."""
+"""What a run shows: tables, curves, galleries of predictions, and a page of an evaluation."""
 
-from crisalad_jax.report.curves import recall_curves, training_curves
+from crisalad_jax.report.curves import PrecisionCurve, recall_curves, training_curves
 from crisalad_jax.report.gallery import prediction_gallery
+from crisalad_jax.report.page import ReportGrouping, write_report
+from crisalad_jax.report.sections import Positions
 from crisalad_jax.report.tables import RecallRow, recall_markdown, recall_table
 
 __all__ = [
+    "Positions",
+    "PrecisionCurve",
     "RecallRow",
+    "ReportGrouping",
     "prediction_gallery",
     "recall_curves",
     "recall_markdown",
     "recall_table",
     "training_curves",
+    "write_report",
 ]

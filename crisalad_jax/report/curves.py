@@ -3,15 +3,26 @@
 import os
 import re
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.report.style import COLOURS, INK, fit_width, plain_axes, save
+from crisalad_jax.report.style import (
+    COLOURS,
+    DPI,
+    INK,
+    NARROW,
+    NARROW_DPI,
+    fit_width,
+    plain_axes,
+    save,
+)
 from crisalad_jax.report.tables import check_fractions
 
 _DASHES = ("-", "--", ":")
@@ -25,8 +36,19 @@ _LOSSES = (
 )
 
 
+class PrecisionCurve(NamedTuple):
+    """What accepting retrievals at each threshold of similarity brings, strictest first."""
+
+    precision: Float[np.ndarray, " threshold"]
+    recall: Float[np.ndarray, " threshold"]
+
+
 def recall_curves(
-    path: str | os.PathLike[str], curves: Mapping[str, Mapping[int, float]], title: str
+    path: str | os.PathLike[str],
+    curves: Mapping[str, Mapping[int, float]],
+    title: str,
+    *,
+    narrow: bool = False,
 ) -> None:
     """Write a PNG of Recall@K in percent against K, one named line per curve.
 
@@ -34,6 +56,7 @@ def recall_curves(
         path: the picture to write.
         curves: name -> K -> fraction of the queries, 0 to 1.
         title: stands above the picture.
+        narrow: whether it is for pages that telephones show too.
 
     Raises:
         InputError: no curves, a curve without values, or a recall outside 0 to 1.
@@ -42,13 +65,51 @@ def recall_curves(
         raise InputError("curves: found none, expected at least one")
     for name, curve in curves.items():
         check_fractions(name, curve)
-    figure = _curves_figure(4.5, title)
+    figure = _curves_figure(3.4, title, NARROW) if narrow else _curves_figure(4.5, title)
     axes = figure.add_subplot()
     _draw_curves(axes, curves)
     axes.set_xticks(sorted({k for curve in curves.values() for k in curve}))
     axes.set_xlabel("K, database images retrieved", fontsize=10, color=INK)
     axes.set_ylabel("Recall@K", fontsize=10, color=INK)
-    save(figure, path)
+    save(figure, path, NARROW_DPI if narrow else DPI)
+
+
+def precision_curves(path: str | os.PathLike[str], curves: Mapping[str, PrecisionCurve]) -> None:
+    """Write a narrow PNG of precision against recall in percent, one line per curve.
+
+    Raises:
+        InputError: no curves, a curve of no points or of two lengths, or a value outside 0 to 1.
+    """
+    if not curves:
+        raise InputError("curves: found none, expected at least one")
+    for name, curve in curves.items():
+        if len(curve.precision) != len(curve.recall):
+            raise InputError(
+                f"{name}: found {len(curve.precision)} precisions and {len(curve.recall)} recalls, "
+                "expected as many"
+            )
+        for values in curve:
+            check_fractions(name, dict(enumerate(values.tolist())))
+    figure = _curves_figure(3.4, "", NARROW)
+    axes = figure.add_subplot()
+    plain_axes(axes)
+    for number, (name, curve) in enumerate(curves.items()):
+        axes.plot(
+            100 * curve.recall,
+            100 * curve.precision,
+            color=COLOURS[number % len(COLOURS)],
+            linestyle=_DASHES[number // len(COLOURS) % len(_DASHES)],
+            linewidth=1.8,
+            label=name,
+            clip_on=False,
+        )
+    axes.set(xlim=(0, 100), ylim=(0, 100))
+    axes.xaxis.set_major_formatter("{x:.0f} %")
+    axes.yaxis.set_major_formatter("{x:.0f} %")
+    axes.set_xlabel("recall", fontsize=10, color=INK)
+    axes.set_ylabel("precision", fontsize=10, color=INK)
+    figure.legend(loc="outside upper left", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
+    save(figure, path, NARROW_DPI)
 
 
 def training_curves(
@@ -179,10 +240,10 @@ def _draw_series(axes: Axes, series: Mapping[int, float], noisy: bool) -> None:
     axes.plot(steps, means, color=COLOURS[0], linewidth=1.8)
 
 
-def _curves_figure(height: float, title: str) -> Figure:
+def _curves_figure(height: float, title: str, width: float = 7) -> Figure:
     # Inches around everything, so that no name touches the edge.
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1)
-    figure = Figure(figsize=(7, height), layout=layout)
+    figure = Figure(figsize=(width, height), layout=layout)
     if title:
         fit_width(figure.suptitle(title, fontsize=12, color=INK, x=0.02, ha="left"), figure)
     return figure

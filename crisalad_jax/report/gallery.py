@@ -24,13 +24,15 @@ def prediction_gallery(
     *,
     rows: int = 6,
     columns: int = 4,
+    chosen: Sequence[int] | None = None,
     title: str = "",
 ) -> None:
     """Write a PNG of queries, one a row, with what was retrieved for them, best first.
 
     Retrievals are framed green where right and red where wrong, with rank and similarity below.
-    Half of the rows are queries whose first retrieval is right, half are others, as far as there
-    are both, each half spread evenly over the data set: the same input gives the same picture.
+    Unless they are `chosen`, half of the rows are queries whose first retrieval is right, half are
+    others, as far as there are both, each half spread evenly over the data set: the same input
+    gives the same picture.
 
     Args:
         path: the picture to write.
@@ -39,8 +41,9 @@ def prediction_gallery(
         indices: database indices retrieved for each query, best first.
         similarities: those of `indices`.
         positives: the database indices that are right for each query.
-        rows: queries shown, at most q.
+        rows: queries shown, at most q, where none are chosen.
         columns: retrievals shown for each, at most k.
+        chosen: the queries shown, in their order.
         title: stands above the picture.
 
     Raises:
@@ -53,7 +56,7 @@ def prediction_gallery(
             raise InputError(f"{name}: found {value}, expected at least 1")
     shown = indices[:, :columns]
     right = np.stack([np.isin(row, wanted) for row, wanted in zip(shown, positives, strict=True)])
-    chosen = _choose_queries(right[:, 0], rows)
+    chosen = _choose_queries(right[:, 0], rows) if chosen is None else chosen
 
     # Inches. Frames and captions are drawn into the gaps.
     width, gap, between, margin = 1.7, 0.16, 0.34, 0.25

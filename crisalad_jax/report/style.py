@@ -20,6 +20,8 @@ WRONG = "#c62828"
 # colour-blind.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 DPI = 120
+NARROW, NARROW_DPI = 4.0, 200
+"""Inches and dots of pictures whose letters of 9 points are still read on a telephone."""
 
 
 def fit_width(label: Label, figure: Figure) -> None:
