@@ -17,6 +17,7 @@ from crisalad_jax.errors import InputError
 
 # Queries compared at a time: with 8,192 database rows a block of similarities is 32 MiB.
 _QUERY_CHUNK = 1024
+_MAP_CHUNK = 8192
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 _UNIT_TOLERANCE = 1e-2
 
@@ -86,7 +87,7 @@ def similarity_map(
     _check_sides(database, queries)
     rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
     found = np.full((rows[-1] + 1, columns[-1] + 1), -np.inf, np.float32)
-    size, width = min(_QUERY_CHUNK, len(queries)), min(8192, len(database))
+    size, width = min(_QUERY_CHUNK, len(queries)), min(_MAP_CHUNK, len(database))
     for left in range(0, len(database), width):
         block = jnp.asarray(_block(database, "database", left, width))
         for top in range(0, len(queries), size):

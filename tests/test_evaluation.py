@@ -183,3 +183,29 @@ def test_an_image_that_cannot_be_read_stops_an_evaluation(params, town: pathlib.
 def test_bad_groupings_are_named(groupings, batch_size, seed, words):
     with pytest.raises(InputError, match=words):
         check_grouping(groupings, batch_size, seed)
+
+
+def test_an_observer_sees_the_descriptors_of_each_grouping(
+    benchmark: Benchmark, params, images: np.ndarray
+):
+    seen = {}
+
+    def observe(grouping: str, database: np.ndarray, queries: np.ndarray) -> None:
+        seen[grouping] = database, queries
+
+    results = evaluate(
+        params,
+        MODEL,
+        benchmark,
+        groupings=("single", "sequential"),
+        batch_size=BATCH,
+        observe=observe,
+        quiet=True,
+    )
+    assert list(seen) == ["single", "sequential"]
+    first = describe(params, images[:BATCH], MODEL)
+    np.testing.assert_allclose(seen["sequential"][0][:BATCH], first, rtol=0, atol=TOLERANCE)
+    for result in results:
+        database, queries = seen[result.grouping]
+        best = (queries @ database.T).max(axis=1)
+        np.testing.assert_allclose(result.neighbours.similarities[:, 0], best, atol=TOLERANCE)

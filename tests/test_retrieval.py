@@ -190,3 +190,38 @@ def test_recall_rejects_what_it_cannot_count():
         retrieval.recalls(indices, [np.array([-1])])
     with pytest.raises(InputError, match=r"^ks: found 0"):
         retrieval.recalls(indices, [np.array([0])], ks=(0, 5))
+
+
+@pytest.mark.parametrize("most", [400, 5, 3, 1])
+def test_similarity_map_by_brute_force(most: int, monkeypatch: pytest.MonkeyPatch):
+    """Blocks smaller than the sets, whose last ones are not full."""
+    monkeypatch.setattr(retrieval, "_QUERY_CHUNK", 4)
+    monkeypatch.setattr(retrieval, "_MAP_CHUNK", 6)
+    database, queries = _random_unit(2, 13, 8), _random_unit(3, 7, 8)
+    every = queries @ database.T
+    rows, columns = retrieval.cells_of(7, most), retrieval.cells_of(13, most)
+    expected = np.array(
+        [
+            [every[np.ix_(rows == row, columns == column)].max() for column in np.unique(columns)]
+            for row in np.unique(rows)
+        ]
+    )
+    found = retrieval.similarity_map(database, queries, most=most)
+    assert found.shape == (min(7, most), min(13, most))
+    # Sums of eight products in float32.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+def test_cells_are_even_and_in_order():
+    assert retrieval.cells_of(5, 9).tolist() == [0, 1, 2, 3, 4]
+    cells = retrieval.cells_of(1003, 10)
+    assert (np.diff(cells) >= 0).all()
+    assert set(np.bincount(cells)) == {100, 101}
+
+
+def test_a_similarity_map_checks_what_it_is_given():
+    unit = np.eye(3, dtype=np.float32)
+    with pytest.raises(InputError, match=r"^database: row 0 is of length 2"):
+        retrieval.similarity_map(2 * unit, unit)
+    with pytest.raises(InputError, match=r"^queries: found descriptors of length 2, expected 3"):
+        retrieval.similarity_map(unit, unit[:, :2])

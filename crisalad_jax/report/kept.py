@@ -7,11 +7,10 @@ import matplotlib
 import matplotlib.colors
 import numpy as np
 
-from crisalad_jax.config import ModelConfig
+from crisalad_jax.config import PATCH_SIZE, ModelConfig
 from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.model import Crisalad, transport_masses
 from crisalad_jax.nn.salad import Salad
-from crisalad_jax.nn.vit import grid_of
 from crisalad_jax.report.choice import Shown
 from crisalad_jax.report.embedding import Drawing, drawing
 from crisalad_jax.report.sections import Subject
@@ -103,7 +102,7 @@ def transport_of(
     images = [read_image(path) for path in paths]
     batch = np.stack([resize_image(image, config.image_size) for image in images])
     masses = np.asarray(transport_masses(params, batch, config), np.float32)
-    grid = grid_of(batch[0])
+    grid = tuple(side // PATCH_SIZE for side in config.image_size)
     return [
         Transported(image, mass.reshape(*grid, -1), config.salad.clusters)
         for image, mass in zip(images, masses, strict=True)

@@ -55,7 +55,7 @@ def position_map(
     limits = np.stack([-margin, span + margin], 1)
     ratio = np.ptp(limits[1]) / np.ptp(limits[0])
     layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
-    figure = Figure(figsize=(NARROW, 1.2 + 3.5 * ratio), layout=layout)
+    figure = Figure(figsize=(NARROW, 1.0 + 3.2 * ratio), layout=layout)
     axes = figure.add_subplot()
     axes.set(xlim=limits[0], ylim=limits[1], aspect="equal")
 
@@ -77,14 +77,14 @@ def position_map(
     for label, mask, marks in kinds:
         if mask.any():
             axes.scatter(*queries[mask].T, s=1.4 * size, label=f"{label} ({mask.sum()})", **marks)
-    axes.set_xlabel("metres east of the westernmost image", fontsize=9, color=INK)
-    axes.set_ylabel("metres north", fontsize=9, color=INK)
-    axes.tick_params(colors=GREY, labelcolor=INK, labelsize=8)
+    axes.set_xlabel("metres east of the westernmost image", fontsize=10, color=INK)
+    axes.set_ylabel("metres north", fontsize=10, color=INK)
+    axes.tick_params(colors=GREY, labelcolor=INK, labelsize=9)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.grid(color=PALE, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[:].set_color(PALE)
     where = {"loc": "outside upper left", "ncols": 2, "markerscale": 1.3}
-    figure.legend(frameon=False, fontsize=8.5, labelcolor=INK, **where)
+    figure.legend(frameon=False, fontsize=9, labelcolor=INK, **where)
     save(figure, path, NARROW_DPI)

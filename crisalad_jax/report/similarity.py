@@ -61,7 +61,7 @@ def similarity_matrix(
     rows, columns = similarities.shape
     # A square as far as that leaves room for both sides.
     ratio = min(max(queries / database, 0.3), 1.6)
-    height = 0.7 + 3.2 * ratio
+    height = 0.6 + 2.7 * ratio
     layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
     figure = Figure(figsize=(NARROW, height), layout=layout)
     axes = figure.add_subplot()
@@ -78,7 +78,7 @@ def similarity_matrix(
         LineCollection((_outlines(truth) * scale).tolist(), colors=_TRUTH, linewidths=0.8)
     )
     right = [np.isin(index, wanted) for index, wanted in zip(first, positives, strict=True)]
-    size = float(np.clip(600 / queries, 0.6, 8))
+    size = float(np.clip(600 / queries, 0.6, 30))
     colours = np.where(right, RIGHT, WRONG).tolist()
     axes.scatter(first + 0.5, np.arange(queries) + 0.5, s=size, c=colours, linewidths=0)
     axes.set_xlabel("database image, in file order", fontsize=10, color=INK)

@@ -87,3 +87,35 @@ def test_training_curves_reject_what_they_cannot_draw(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             report.training_curves(tmp_path / "curves.png", records)
+
+
+def test_precision_curves_are_drawn_where_they_are(tmp_path):
+    path = tmp_path / "curves.png"
+    high = report.PrecisionCurve(np.array([1.0, 0.9]), np.array([0.1, 0.9]))
+    low = report.PrecisionCurve(np.array([0.4, 0.2]), np.array([0.1, 0.9]))
+    report.curves.precision_curves(path, {"high": high, "low": low})
+    picture = read_picture(path)
+    lower = picture[len(picture) // 6 :]  # below the legend
+    blue, orange = (np.argwhere(near_colour(lower, colour)) for colour in (BLUE, ORANGE))
+    assert len(blue) > 500
+    assert blue[:, 0].max() < orange[:, 0].min()
+    # Both reach from a recall of 10 to one of 90 %.
+    assert np.ptp(blue[:, 1]) == pytest.approx(np.ptp(orange[:, 1]), abs=15)
+
+
+def test_precision_curves_reject_what_is_none(tmp_path):
+    path = tmp_path / "curves.png"
+    ones = np.ones(2)
+    for curves, message in (
+        ({}, r"^curves: found none"),
+        ({"a": report.PrecisionCurve(ones, np.ones(3))}, r"^a: found 2 precisions and 3 recalls"),
+        ({"a": report.PrecisionCurve(ones, 90 * ones)}, r"^a: found recall 90.0 at 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            report.curves.precision_curves(path, curves)
+    assert not path.exists()
+
+
+def test_narrow_curves_are_for_small_screens(tmp_path):
+    report.recall_curves(tmp_path / "narrow.png", {"a": {1: 0.5, 5: 0.9}}, "", narrow=True)
+    assert read_picture(tmp_path / "narrow.png").shape == (680, 800, 3)  # 4 inches at 200 dots

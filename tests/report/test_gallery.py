@@ -10,18 +10,6 @@ from crisalad_jax.report.gallery import _choose_queries
 from tests.report.pictures import GREEN, RED, boxes_of, is_colour, near_colour, read_picture
 
 
-@pytest.fixture
-def photographs(tmp_path):
-    """Six database pictures and four queries, each of one blue-grey level, 60 x 80."""
-    files = {}
-    for part, count in (("database", 6), ("queries", 4)):
-        files[part] = [tmp_path / part / f"{number}.png" for number in range(count)]
-        (tmp_path / part).mkdir()
-        for number, file in enumerate(files[part]):
-            cv2.imwrite(str(file), np.full((60, 80, 3), (90, 20 * number + 60, 60), np.uint8))
-    return files
-
-
 def _gallery(photographs, path, indices, positives, **options):
     indices = np.array(indices)
     similarities = np.linspace(0.9, 0.1, indices.shape[1])[None].repeat(len(indices), axis=0)
@@ -116,3 +104,16 @@ def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
     with pytest.raises(InputError, match=r"database.1\.png: found an empty file"):
         _gallery(photographs, path, [[0, 1]], [[0]])
     assert not path.exists()
+
+
+def test_gallery_shows_the_queries_chosen_in_their_order(photographs, tmp_path):
+    picture = _gallery(
+        photographs, tmp_path / "gallery.png", [[0], [1], [2], [3]], [[0]] * 4, chosen=[3, 1]
+    )
+    rows = {n: np.argwhere(_is_level(picture, n))[:, 0].mean() for n in (1, 3)}
+    assert rows[3] < rows[1]
+    assert not _is_level(picture, 0).any()
+
+
+def _is_level(picture, number):
+    return is_colour(picture, (60, 20 * number + 60, 90))
