@@ -4,6 +4,9 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from crisalad_jax.cli.common import console, grouping_words, model_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.evaluation import evaluate, same_place_rule
@@ -11,6 +14,7 @@ from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
 from crisalad_jax.results import GroupingResult, grouping_table, to_json
 from crisalad_jax.serial import to_plain
+from crisalad_jax.similarity import similarity_map
 
 _RECALLS = (
     "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "

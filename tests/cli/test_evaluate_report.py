@@ -27,8 +27,13 @@ def test_the_page_holds_the_numbers_of_the_json(
     for result in results:
         for value in result["recalls"].values():
             assert next(cells).startswith(f"{100 * value:.1f}")
+        shares = result["same_place"].values()
+        words = ("\N{EN DASH}" if share is None else f"{100 * share:.1f}" for share in shares)
+        assert next(cells) == " / ".join(words)
+        assert next(cells) == f"{100 * result['recall_at_full_precision']:.1f}"
+    assert next(cells, None) is None
     names = {e["id"] for e in page.all("section")}
-    assert {"recall", "transport", "similarities", "settings"} <= names
+    assert {"recall", "map", "transport", "similarities", "settings"} <= names
     assert json.loads(page.all("pre")[0]["text"])["model"]["image_size"] == [42, 56]
 
 
