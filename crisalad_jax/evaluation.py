@@ -122,6 +122,12 @@ def group(
     return descriptors
 
 
+Observe = Callable[
+    [str, Float[np.ndarray, "image descriptor"], Float[np.ndarray, "image descriptor"]], None
+]
+"""Takes the name of a grouping, the database's descriptors, and the queries'."""
+
+
 def _relate_batch(
     params: Crisalad, config: ModelConfig, folder: FolderTokens, batch: Batches
 ) -> Float[np.ndarray, "image descriptor"]:
@@ -175,6 +181,7 @@ def evaluate(
     seed: int = 0,
     seeds: int = 3,
     cache: ImageCache | None = None,
+    observe: Observe | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
     """Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
@@ -194,6 +201,7 @@ def evaluate(
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
         cache: of decoded images.
+        observe: is given the descriptors of each grouping, of its first seed, while they are there.
         quiet: no progress bars.
 
     Raises:
@@ -218,14 +226,15 @@ def evaluate(
     for grouping in parsed if params.encoder else [Grouping("single", "single")]:
         is_random = "shuffled" in (grouping.queries, grouping.database)
         drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
+        name = str(grouping) if params.encoder else ANY
         sides = (database, grouping.database), (queries, grouping.queries)
         database_share, query_share = (
             _mean_share(side, kind, drawn, batch_size) for side, kind in sides
         )
         results.append(
             summarise(
-                str(grouping) if params.encoder else ANY,
-                _rank(describe, sides, drawn),
+                name,
+                _rank(describe, sides, drawn, observe and functools.partial(observe, name)),
                 positives,
                 KS,
                 query_share=query_share,
@@ -278,8 +287,12 @@ def _rank(
     describe: Callable[..., Float[np.ndarray, "image descriptor"]],
     sides: Sequence[tuple[_Side, str]],
     seeds: Sequence[int],
+    observe: Callable[..., None] | None,
 ) -> dict[int, Neighbours]:
-    """The neighbours by seed. Only a side that is shuffled is described for each anew."""
+    """The neighbours by seed. Only a side that is shuffled is described for each anew.
+
+    `observe` is given the descriptors of the first.
+    """
 
     def descriptors(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
         return describe(side.tokens, kind, seed=seed + side.offset, label=side.name)
@@ -293,6 +306,8 @@ def _rank(
             fixed[side.name] if side.name in fixed else descriptors(side, kind, seed)
             for side, kind in sides
         )
+        if observe is not None and seed == seeds[0]:
+            observe(database, queries)
         return search(database, queries, k=min(max(KS), len(database)))
 
     return {seed: ranking(seed) for seed in seeds}

@@ -342,3 +342,29 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
             for row, wanted in zip(ranking, benchmark.positives, strict=True)
         ]
         assert recall == np.mean(right)
+
+
+def test_an_observer_sees_the_descriptors_of_each_grouping(
+    benchmark: Benchmark, params, images: np.ndarray
+):
+    seen = {}
+
+    def observe(grouping: str, database: np.ndarray, queries: np.ndarray) -> None:
+        seen[grouping] = database, queries
+
+    results = evaluate(
+        params,
+        MODEL,
+        benchmark,
+        groupings=("single", "sequential"),
+        batch_size=BATCH,
+        observe=observe,
+        quiet=True,
+    )
+    assert list(seen) == ["single", "sequential"]
+    first = describe(params, images[:BATCH], MODEL)
+    np.testing.assert_allclose(seen["sequential"][0][:BATCH], first, rtol=0, atol=TOLERANCE)
+    for result in results:
+        database, queries = seen[result.grouping]
+        best = (queries @ database.T).max(axis=1)
+        np.testing.assert_allclose(result.neighbours.similarities[:, 0], best, atol=TOLERANCE)

@@ -13,7 +13,18 @@ from typing import Annotated, Any
 import tyro
 
 from crisalad_jax import platform
-from crisalad_jax.cli import convert, demo, evaluate, extract, index, info, pca, query, train
+from crisalad_jax.cli import (
+    convert,
+    demo,
+    evaluate,
+    export,
+    extract,
+    index,
+    info,
+    pca,
+    query,
+    train,
+)
 from crisalad_jax.config import choose
 from crisalad_jax.errors import InputError, Stopped
 
@@ -27,6 +38,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "extract": (extract.Extract, extract.run),
     "index": (index.Index, index.run),
     "query": (query.Query, query.run),
+    "export": (export.Export, export.run),
     "pca": (pca.Pca, pca.run),
     "info": (info.Info, info.run),
 }

@@ -4,6 +4,9 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from crisalad_jax.cli.common import console, grouping_words, model_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.evaluation import evaluate, same_place_rule
@@ -11,6 +14,7 @@ from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
 from crisalad_jax.results import GroupingResult, grouping_table, to_json
 from crisalad_jax.serial import to_plain
+from crisalad_jax.similarity import similarity_map
 
 _RECALLS = (
     "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
@@ -63,6 +67,9 @@ class Evaluate:
     """Shuffled orders: their mean and standard deviation are printed."""
     out: pathlib.Path | None = None
     """Folder for a gallery of retrievals and the resolved configuration."""
+    report: pathlib.Path | None = None
+    """Folder for a page of all results, index.html, that needs no other file and no network; and
+    its pictures."""
     json: pathlib.Path | None = None
     """File for the table as JSON."""
     quiet: bool = False
@@ -76,6 +83,8 @@ def run(arguments: Evaluate) -> None:
         check_target(arguments.json)
     if arguments.out is not None:
         check_target(arguments.out / "config.json")
+    if arguments.report is not None:
+        check_target(arguments.report / "index.html")
     check_grouping((), arguments.batch_size, arguments.seed, arguments.seeds)
     params, config, model_name = model_of(
         arguments.weights,
@@ -98,6 +107,7 @@ def run(arguments: Evaluate) -> None:
         f"images; positive: {benchmark.rule}\n{model_name}",
         soft_wrap=True,
     )
+    seen = _FirstSimilarities()
     results = evaluate(
         params,
         config,
@@ -106,6 +116,7 @@ def run(arguments: Evaluate) -> None:
         batch_size=arguments.batch_size,
         seed=arguments.seed,
         seeds=arguments.seeds,
+        observe=None if arguments.report is None else seen,
         quiet=arguments.quiet,
     )
     console.print(grouping_table(results))
@@ -136,6 +147,35 @@ def run(arguments: Evaluate) -> None:
     if arguments.out is not None:
         _write_galleries(arguments.out, benchmark, model_name, results)
         write_json(arguments.out / "config.json", resolved)
+    if arguments.report is not None:
+        from crisalad_jax.report import write_report
+
+        page = write_report(
+            arguments.report,
+            benchmark,
+            results,
+            params=params,
+            config=config,
+            model_name=model_name,
+            settings=resolved,
+            similarities=seen.map,
+        )
+        console.print(f"report: {page}", soft_wrap=True)
+
+
+class _FirstSimilarities:
+    """Keeps a picture of the similarities under the first grouping, of which the report is."""
+
+    map: Float[np.ndarray, "rows columns"] | None = None
+
+    def __call__(
+        self,
+        grouping: str,
+        database: Float[np.ndarray, "image descriptor"],
+        queries: Float[np.ndarray, "image descriptor"],
+    ) -> None:
+        if self.map is None:
+            self.map = similarity_map(database, queries)
 
 
 def _notes(arguments: Evaluate, groupings: list[Grouping], same_place: str) -> list[str]:

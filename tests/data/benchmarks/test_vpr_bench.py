@@ -74,6 +74,7 @@ def test_vpr_bench_refuses_a_gap_in_the_numbers(tmp_path):
         ([(0, [0]), (1, [1])], r"found shape \(2, 2\), expected \(3, 2\)"),
         ([(0, [0]), (1, ["a"]), (2, [0])], "row 1: .*expected indices"),
         ([(0, [0]), (1, [0.5]), (2, [0])], "row 1: found values of type float, expected indices"),
+        ([(0, [0]), (1, [True]), (2, [0])], "row 1: found values of type bool, expected indices"),
         ([(0, [0]), (1, [[1], [2, 3]]), (2, [0])], "row 1: .*expected indices"),
         ([(0, [0]), (1, None), (2, [0])], "row 1: .*expected indices"),
     ],
