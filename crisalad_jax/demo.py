@@ -16,7 +16,7 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import KS, evaluate, positives_of
+from crisalad_jax.evaluation import KS, evaluate
 from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.fit import fit
 from crisalad_jax.metrics import read_metrics
@@ -106,7 +106,7 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         benchmark.queries,
         benchmark.database,
         *after[0].neighbours,
-        positives_of(benchmark),
+        benchmark.ground_truth(),
         title="Queries and what the trained model finds, every image described alone",
     )
     with atomic_path(out / "recalls.md") as temporary:
@@ -146,4 +146,4 @@ def _hog_recalls(benchmark: Benchmark) -> dict[int, float]:
         hog_descriptors([read_image(path) for path in paths])
         for paths in (benchmark.database, benchmark.queries)
     ]
-    return recalls(search(*sides, k=max(KS)).indices, positives_of(benchmark), KS)
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)

@@ -15,7 +15,6 @@ from crisalad_jax import platform
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
-from crisalad_jax.errors import InputError
 from crisalad_jax.groupings import (
     DEFAULT_GROUPINGS,
     Batches,
@@ -123,6 +122,12 @@ def group(
     return descriptors
 
 
+Observe = Callable[
+    [str, Float[np.ndarray, "image descriptor"], Float[np.ndarray, "image descriptor"]], None
+]
+"""Takes the name of a grouping, the database's descriptors, and the queries'."""
+
+
 def _relate_batch(
     params: Crisalad, config: ModelConfig, folder: FolderTokens, batch: Batches
 ) -> Float[np.ndarray, "image descriptor"]:
@@ -166,20 +171,6 @@ def _relate_last(
     return jax.vmap(last)(places, masks)
 
 
-def positives_of(benchmark: Benchmark) -> tuple[Int64[np.ndarray, " _"], ...]:
-    """The ground truth.
-
-    Raises:
-        InputError: there is none.
-    """
-    if benchmark.positives is None:
-        raise InputError(
-            f"{benchmark.name}: found no ground truth, expected the right database images of every "
-            "query, to count recalls"
-        )
-    return benchmark.positives
-
-
 def evaluate(
     params: Crisalad,
     config: ModelConfig,
@@ -189,11 +180,14 @@ def evaluate(
     batch_size: int = 16,
     seed: int = 0,
     seeds: int = 3,
-    radius: float = 25.0,
     cache: ImageCache | None = None,
+    observe: Observe | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
     """Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
+
+    Two images of one side show the same place where the benchmark's positions, or where it has none
+    its ground truth, say so (`same_place`).
 
     A model without a cross-image encoder has one result, `any`: no descriptor depends on a batch.
     Beyond the tokens memory holds the descriptors of one grouping and seed at a time.
@@ -206,9 +200,8 @@ def evaluate(
         batch_size: images that look at each other.
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
-        radius: metres within which two images of one side show the same place, where the benchmark
-            has positions; elsewhere its ground truth tells (`same_place.by_truth`).
         cache: of decoded images.
+        observe: is given the descriptors of each grouping, of its first seed, while they are there.
         quiet: no progress bars.
 
     Raises:
@@ -217,7 +210,7 @@ def evaluate(
     """
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
-    positives = positives_of(benchmark)
+    positives = benchmark.ground_truth()
 
     def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
         tokens = read_tokens(
@@ -225,7 +218,7 @@ def evaluate(
         )
         return _Side(name, tokens, same, offset)
 
-    same_queries, same_database = _same_place(benchmark, positives, radius)
+    same_queries, same_database = _same_place(benchmark, positives)
     database = side("database", benchmark.database, same_database, 0)
     queries = side("queries", benchmark.queries, same_queries, 1)
     describe = functools.partial(group, params, config, batch_size=batch_size, quiet=quiet)
@@ -233,14 +226,15 @@ def evaluate(
     for grouping in parsed if params.encoder else [Grouping("single", "single")]:
         is_random = "shuffled" in (grouping.queries, grouping.database)
         drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
+        name = str(grouping) if params.encoder else ANY
         sides = (database, grouping.database), (queries, grouping.queries)
         database_share, query_share = (
             _mean_share(side, kind, drawn, batch_size) for side, kind in sides
         )
         results.append(
             summarise(
-                str(grouping) if params.encoder else ANY,
-                _rank(describe, sides, drawn),
+                name,
+                _rank(describe, sides, drawn, observe and functools.partial(observe, name)),
                 positives,
                 KS,
                 query_share=query_share,
@@ -261,19 +255,20 @@ class _Side(NamedTuple):
     """From a shuffle's seed to that of this side: two sides are never shuffled alike."""
 
 
-def same_place_rule(benchmark: Benchmark, radius: float) -> str:
+def same_place_rule(benchmark: Benchmark) -> str:
     """By what `evaluate` tells whether two images of one side show the same place, in words."""
     if benchmark.query_positions is None or benchmark.database_positions is None:
         return "a common positive"
-    return f"a distance of at most {radius:g} m"
+    return f"a distance of at most {benchmark.radius:g} m"
 
 
 def _same_place(
-    benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]], radius: float
+    benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]]
 ) -> tuple[SamePlace, SamePlace]:
     """Of the queries and of the database: by positions, or where there are none by ground truth."""
     if benchmark.query_positions is None or benchmark.database_positions is None:
         return by_truth(positives, len(benchmark.database))
+    radius = benchmark.radius
     return near(benchmark.query_positions, radius), near(benchmark.database_positions, radius)
 
 
@@ -292,8 +287,12 @@ def _rank(
     describe: Callable[..., Float[np.ndarray, "image descriptor"]],
     sides: Sequence[tuple[_Side, str]],
     seeds: Sequence[int],
+    observe: Callable[..., None] | None,
 ) -> dict[int, Neighbours]:
-    """The neighbours by seed. Only a side that is shuffled is described for each anew."""
+    """The neighbours by seed. Only a side that is shuffled is described for each anew.
+
+    `observe` is given the descriptors of the first.
+    """
 
     def descriptors(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
         return describe(side.tokens, kind, seed=seed + side.offset, label=side.name)
@@ -307,6 +306,8 @@ def _rank(
             fixed[side.name] if side.name in fixed else descriptors(side, kind, seed)
             for side, kind in sides
         )
+        if observe is not None and seed == seeds[0]:
+            observe(database, queries)
         return search(database, queries, k=min(max(KS), len(database)))
 
     return {seed: ranking(seed) for seed in seeds}

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import pathlib
+import shutil
 import uuid
 from collections.abc import Iterator
 from typing import Any
@@ -73,6 +74,39 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """Yield a temporary folder beside `path`; rename it to `path` on success, else remove it.
+
+    Raises:
+        InputError: what `check_new_folder` raises, or the parent folder cannot be made.
+    """
+    path = pathlib.Path(path)
+    check_new_folder(path)
+    temporary = path.with_name(f".{uuid.uuid4().hex[:12]}")
+    try:
+        temporary.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot make this folder: {error.strerror}") from error
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_new_folder(path: str | os.PathLike[str]) -> None:
+    """Check that a folder can be made at `path`, where there may be an empty one.
+
+    Raises:
+        InputError: there is a file, or a folder that holds something; or as `check_target`.
+    """
+    path = pathlib.Path(path)
+    check_target(path / "any")
+    if path.is_dir() and any(path.iterdir()):
+        raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:

@@ -31,7 +31,7 @@ from crisalad_jax.data.loader import (
 )
 from crisalad_jax.data.places import Places, epoch_batches
 from crisalad_jax.errors import InputError, Stopped
-from crisalad_jax.evaluation import evaluate, positives_of
+from crisalad_jax.evaluation import evaluate
 from crisalad_jax.files import write_json
 from crisalad_jax.metrics import MetricsLog
 from crisalad_jax.model import Crisalad, init_crisalad, tokenise
@@ -134,14 +134,17 @@ def fit(
         quiet: no progress bar.
 
     Raises:
-        InputError: an argument is out of range; `out` holds something else, or a run of another
-            configuration or start; an image cannot be read; there are too few places or images; the
-            loss is no longer finite (the state before that step is saved); or a file cannot be
-            written.
+        InputError: an argument is out of range; the validation has no ground truth; `out` holds
+            something else, or a run of another configuration or start; an image cannot be read;
+            there are too few places or images; the loss is no longer finite (the state before that
+            step is saved); or a file cannot be written.
         Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
     if workers < 0:
         raise InputError(f"workers: found {workers}, expected at least 0")
+    if validation is not None:
+        # Asked for now, not after the first epoch.
+        validation.ground_truth()
     try:
         run = _Run(config, places, out, initial, validation, split_state=split_state)
         with contextlib.closing(run):
@@ -202,8 +205,6 @@ class _Run:
         split_state: bool = False,
     ) -> None:
         # What does not fit raises before claim_run writes the first file, in all processes.
-        if validation is not None:
-            positives_of(validation)
         checksums = {
             "configuration": zlib.crc32(json.dumps(to_plain(config)).encode()),
             "places": _checksum([_text(places.files), places.place_start]),

@@ -16,6 +16,7 @@ from crisalad_jax.nn.aggregators import Aggregator, aggregate, init_aggregator, 
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.layers import Keys, split_key
 from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.nn.salad import Salad, transport
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.nn.vit import Features, ViT, grid_of, init_vit, vit
 from crisalad_jax.pytree import params
@@ -101,7 +102,7 @@ def tokenise(
         features = _features(params, images, config)
         return aggregate(params.aggregator, features, grid_of(images[0]), config, key=keys)
 
-    count = len(images)
+    count = images.shape[0]  # which may be symbolic, where `len` is not
     keys = None if key is None else jax.random.split(key, count)
     if micro_batch is None or micro_batch == count:
         return part_of(images, keys)
@@ -152,6 +153,23 @@ def relate(
         sequence = cross_image_encoder(params.encoder, sequence, config.encoder, mask=mask, key=key)
         tokens = jax.vmap(leave)(sequence.astype(tokens.local.dtype), tokens)
     return jax.vmap(functools.partial(join, config=config))(tokens)
+
+
+@functools.partial(platform.jit, static_argnames="config")
+def transport_masses(
+    params: Crisalad, images: Images, config: ModelConfig
+) -> Float[Array, "image patch column"]:
+    """What SALAD's transport sends from each patch, in row order, to each cluster.
+
+    A patch has a mass of 1 to send. Where there is a dustbin, what it takes is the last column.
+
+    Raises:
+        InputError: the model has no SALAD, or as `describe`.
+    """
+    if not isinstance(params.aggregator, Salad):
+        raise InputError(f"aggregator: found {config.aggregator}, expected salad, which transports")
+    features = _features(params, images, config)
+    return jnp.exp(transport(params.aggregator, features.patches, config.salad, key=None).log_plan)
 
 
 def alone(count: int) -> Bool[Array, "image image"]:

@@ -1,12 +1,13 @@
 """What differs by platform: the compiler's options, virtual devices of a CPU, the compile cache."""
 
 import contextlib
+import contextvars
 import functools
 import math
 import os
 import pathlib
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -41,6 +42,7 @@ _SMALL = 2**23
 SPLIT_FROM = 2**14
 """Arrays of fewer numbers are never split over devices: to gather them would take longer."""
 _Tree = TypeVar("_Tree")
+_PORTABLE = contextvars.ContextVar("portable", default=False)
 
 
 @functools.cache
@@ -63,9 +65,23 @@ def compiler_options(library: str, *, least_memory: bool = False) -> dict[str, b
     return known
 
 
-@functools.cache
+@contextlib.contextmanager
+def portable() -> Iterator[None]:
+    """What is traced in here is for any platform: no choice is made by the one that traces."""
+    token = _PORTABLE.set(True)
+    try:
+        yield
+    finally:
+        _PORTABLE.reset(token)
+
+
 def has_fused_attention() -> bool:
     """Whether cuDNN's attention, which never writes the scores to memory, can be compiled here."""
+    return not _PORTABLE.get() and _compiles_fused_attention()
+
+
+@functools.cache
+def _compiles_fused_attention() -> bool:
     if jax.default_backend() != "gpu":
         return False
     token = jax.ShapeDtypeStruct((1, 64, 1, 64), jnp.bfloat16)
@@ -83,7 +99,8 @@ def product_dtype(dtype: Any) -> Any:
     On a CPU only products that stay in float32 run in its units for bfloat16; a GPU rounds as it
     writes.
     """
-    return jnp.promote_types(dtype, jnp.float32) if jax.default_backend() == "cpu" else dtype
+    widens = _PORTABLE.get() or jax.default_backend() == "cpu"
+    return jnp.promote_types(dtype, jnp.float32) if widens else dtype
 
 
 def jit(
@@ -117,6 +134,8 @@ def jit(
         leaves = jax.tree.leaves((args, kwargs))
         # What is made inside of a trace is traced, whatever the arguments are.
         traced = any(isinstance(leaf, Tracer) for leaf in (*leaves, jax.lax.full((), 0)))
+        if traced and _PORTABLE.get():
+            return function(*args, **kwargs)  # what `inner` has traced before may not be portable
         return (inner if traced else outermost(leaves))(*args, **kwargs)
 
     def lower(*args: Any, **kwargs: Any) -> Any:

@@ -19,7 +19,7 @@ from crisalad_jax.data.baselines import hog_descriptors
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
-from crisalad_jax.evaluation import KS, evaluate, positives_of
+from crisalad_jax.evaluation import KS, evaluate
 from crisalad_jax.files import atomic_path, write_json
 from crisalad_jax.fit import fit
 from crisalad_jax.model import Crisalad, init_crisalad
@@ -65,7 +65,7 @@ def hog_recalls(benchmark: Benchmark) -> dict[int, float]:
         hog_descriptors([read_image(path) for path in paths])
         for paths in (benchmark.database, benchmark.queries)
     ]
-    return recalls(search(*sides, k=max(KS)).indices, positives_of(benchmark), KS)
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)
 
 
 def main() -> None:

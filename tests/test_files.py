@@ -7,7 +7,13 @@ import pathlib
 import pytest
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_target, write_json
+from crisalad_jax.files import (
+    atomic_folder,
+    atomic_path,
+    check_new_folder,
+    check_target,
+    write_json,
+)
 
 
 def test_the_file_appears_when_it_is_whole(tmp_path: pathlib.Path):
@@ -71,3 +77,37 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: pathlib.Path):
         write_json(path, {"a": object()})
     assert json.loads(path.read_text()) == {"a": [1, 2.5, None]}
     assert os.listdir(tmp_path) == ["x.json"]
+
+
+def test_a_folder_appears_when_it_is_whole(tmp_path: pathlib.Path):
+    path = tmp_path / "new" / "export"
+    with atomic_folder(path) as temporary:
+        assert temporary.parent == path.parent
+        (temporary / "a").write_text("1")
+        assert not path.exists()
+    assert [p.name for p in path.iterdir()] == ["a"]
+    assert os.listdir(path.parent) == ["export"]
+
+
+def test_an_error_leaves_no_folder(tmp_path: pathlib.Path):
+    path = tmp_path / "export"
+
+    def fail() -> None:
+        with atomic_folder(path) as temporary:
+            (temporary / "a").write_text("half")
+            raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        fail()
+    assert os.listdir(tmp_path) == []
+
+
+def test_only_an_empty_folder_is_replaced(tmp_path: pathlib.Path):
+    (tmp_path / "empty").mkdir()
+    with atomic_folder(tmp_path / "empty") as temporary:
+        (temporary / "a").write_text("1")
+    assert os.listdir(tmp_path / "empty") == ["a"]
+    (tmp_path / "file").write_text("")
+    for name, found in (("empty", "a folder with files in it"), ("file", "cannot be made: found")):
+        with pytest.raises(InputError, match=f"^{tmp_path / name}.*{found}"):
+            check_new_folder(tmp_path / name)

@@ -19,10 +19,10 @@ LAYERS = (
     ("nn", "same_place"),
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),
-    ("convert",),
-    ("training", "retrieval", "report", "descriptors", "pca"),
-    ("results", "approximate"),
-    ("evaluation",),
+    ("convert", "export"),
+    ("training", "retrieval", "descriptors", "pca"),
+    ("results", "approximate", "similarity"),
+    ("evaluation", "report"),
     ("fit",),
     ("demo",),
     ("cli",),
@@ -149,4 +149,4 @@ def test_what_describes_starts_without_what_trains():
 
 def test_pictures_need_no_jax():
     statement = f"import {PACKAGE}.data.images, {PACKAGE}.data.places, {PACKAGE}.data.benchmarks"
-    assert loaded_after(statement, {"jax", "torch", "cv2"}) == {"cv2"}
+    assert loaded_after(statement, {"jax", "torch", "cv2", "scipy"}) == {"cv2"}

@@ -10,8 +10,17 @@ import pytest
 from crisalad_jax import platform
 from crisalad_jax.config import PRESETS, AdapterConfig, CrossImageConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.model import alone, among, describe, init_crisalad, relate, tokenise
+from crisalad_jax.model import (
+    alone,
+    among,
+    describe,
+    init_crisalad,
+    relate,
+    tokenise,
+    transport_masses,
+)
 from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.nn.vit import vit
 from crisalad_jax.pytree import named_leaves
 from tests.conftest import MODEL as CONFIG
 
@@ -217,3 +226,39 @@ def test_images_that_do_not_fit_raise_while_tracing(params, shape, message: str)
     images = jax.ShapeDtypeStruct(shape, jnp.uint8)
     with pytest.raises(InputError, match=message):
         jax.eval_shape(lambda p, x: describe(p, x, CONFIG), params, images)
+
+
+def test_transport_masses_by_scaling_a_matrix_in_float64(params):
+    """Sinkhorn's algorithm as it is usually written: columns, then rows, three times."""
+    images = pictures(2)
+    pixels = jax.vmap(lambda image: normalise(image, "imagenet"))(images)
+    patches = np.asarray(vit(params.backbone, pixels, CONFIG.backbone).patches, np.float64)
+    network = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params.aggregator.score)
+    hidden = np.maximum(patches @ network.fc1.weight + network.fc1.bias, 0)
+    scores = hidden @ network.fc2.weight + network.fc2.bias
+    dustbin = np.full((*scores.shape[:-1], 1), float(params.aggregator.dust_bin))
+    kernel = np.exp(np.concatenate([scores, dustbin], axis=-1))
+    patch_count, clusters = scores.shape[1:]
+    wanted = np.append(np.ones(clusters), patch_count - clusters)
+    rows = np.ones((2, patch_count))
+    for _ in range(CONFIG.salad.sinkhorn.iterations):
+        columns = wanted / np.einsum("bn,bnm->bm", rows, kernel)
+        rows = 1 / np.einsum("bnm,bm->bn", kernel, columns)
+    expected = rows[..., None] * kernel * columns[:, None]
+
+    found = transport_masses(params, images, CONFIG)
+    # Float32 against float64, features of order 1 after two blocks.
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-6)
+    # What the dustbin takes and what is kept make the patch's mass.
+    np.testing.assert_allclose(found.sum(axis=-1), 1, rtol=1e-5)
+
+
+def test_a_model_without_salad_transports_nothing(params):
+    config = dataclasses.replace(
+        CONFIG,
+        aggregator="class-token",
+        encoder=dataclasses.replace(CONFIG.encoder, layers=0),
+    )
+    bare = dataclasses.replace(params, aggregator=None, encoder=None)
+    with pytest.raises(InputError, match=r"^aggregator: found class-token, expected salad"):
+        transport_masses(bare, pictures(2), config)

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from crisalad_jax import platform
-from crisalad_jax.cli import convert, demo, evaluate, extract, info, pca, train
+from crisalad_jax.cli import convert, demo, evaluate, export, extract, info, pca, train
 from crisalad_jax.config import choose
 from crisalad_jax.errors import InputError, Stopped
 
@@ -25,6 +25,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "convert": (convert.Convert, convert.run),
     "evaluate": (evaluate.Evaluate, evaluate.run),
     "extract": (extract.Extract, extract.run),
+    "export": (export.Export, export.run),
     "pca": (pca.Pca, pca.run),
     "info": (info.Info, info.run),
 }

@@ -4,13 +4,17 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from crisalad_jax.cli.common import console, grouping_words, model_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.evaluation import evaluate, positives_of, same_place_rule
+from crisalad_jax.evaluation import evaluate, same_place_rule
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
 from crisalad_jax.results import GroupingResult, grouping_table, to_json
 from crisalad_jax.serial import to_plain
+from crisalad_jax.similarity import similarity_map
 
 _RECALLS = (
     "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
@@ -27,7 +31,8 @@ class Evaluate:
     """
 
     data: pathlib.Path
-    """Evaluation set: a folder of @UTM names, or VPR-Bench's layout."""
+    """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
+    folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     weights: pathlib.Path | None = None
     """A .safetensors file of this package; none evaluates an untrained model of --preset."""
     preset: str = "b14"
@@ -41,9 +46,18 @@ class Evaluate:
     """Images that a cross-image encoder sees together (the paper: 16)."""
     split: str | None = None
     """train, val or test, where the set has several."""
-    radius: float = 25.0
-    """Largest distance of a positive in metres, for @UTM names; and of two images of one side that
-    show the same place."""
+    layout: str | None = None
+    """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default what DATA looks
+    like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
+    images: pathlib.Path | None = None
+    """Folder of the images that a .mat file or .npy lists name; by default beside them."""
+    radius: float | None = None
+    """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
+    max_heading_difference: float | None = None
+    """Largest difference of compass angles of a positive in degrees, for raw MSLS; by default any
+    (the paper: 40)."""
+    frames: int | None = None
+    """How many frames a positive may be away, for two plain folders of the same moments."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -53,6 +67,9 @@ class Evaluate:
     """Shuffled orders: their mean and standard deviation are printed."""
     out: pathlib.Path | None = None
     """Folder for a gallery of retrievals and the resolved configuration."""
+    report: pathlib.Path | None = None
+    """Folder for a page of all results, index.html, that needs no other file and no network; and
+    its pictures."""
     json: pathlib.Path | None = None
     """File for the table as JSON."""
     quiet: bool = False
@@ -66,6 +83,8 @@ def run(arguments: Evaluate) -> None:
         check_target(arguments.json)
     if arguments.out is not None:
         check_target(arguments.out / "config.json")
+    if arguments.report is not None:
+        check_target(arguments.report / "index.html")
     check_grouping((), arguments.batch_size, arguments.seed, arguments.seeds)
     params, config, model_name = model_of(
         arguments.weights,
@@ -74,12 +93,21 @@ def run(arguments: Evaluate) -> None:
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
-    benchmark = open_benchmark(arguments.data, arguments.split, arguments.radius)
+    benchmark = open_benchmark(
+        arguments.data,
+        arguments.split,
+        arguments.radius,
+        images=arguments.images,
+        max_heading_difference=arguments.max_heading_difference,
+        frames=arguments.frames,
+        layout=arguments.layout,
+    )
     console.print(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
         f"images; positive: {benchmark.rule}\n{model_name}",
         soft_wrap=True,
     )
+    seen = _FirstSimilarities()
     results = evaluate(
         params,
         config,
@@ -88,11 +116,11 @@ def run(arguments: Evaluate) -> None:
         batch_size=arguments.batch_size,
         seed=arguments.seed,
         seeds=arguments.seeds,
-        radius=arguments.radius,
+        observe=None if arguments.report is None else seen,
         quiet=arguments.quiet,
     )
     console.print(grouping_table(results))
-    same_place = same_place_rule(benchmark, arguments.radius)
+    same_place = same_place_rule(benchmark)
     notes = [_RECALLS]
     if params.encoder is None:
         notes.append("No cross-image encoder: no descriptor depends on its batch.")
@@ -119,6 +147,35 @@ def run(arguments: Evaluate) -> None:
     if arguments.out is not None:
         _write_galleries(arguments.out, benchmark, model_name, results)
         write_json(arguments.out / "config.json", resolved)
+    if arguments.report is not None:
+        from crisalad_jax.report import write_report
+
+        page = write_report(
+            arguments.report,
+            benchmark,
+            results,
+            params=params,
+            config=config,
+            model_name=model_name,
+            settings=resolved,
+            similarities=seen.map,
+        )
+        console.print(f"report: {page}", soft_wrap=True)
+
+
+class _FirstSimilarities:
+    """Keeps a picture of the similarities under the first grouping, of which the report is."""
+
+    map: Float[np.ndarray, "rows columns"] | None = None
+
+    def __call__(
+        self,
+        grouping: str,
+        database: Float[np.ndarray, "image descriptor"],
+        queries: Float[np.ndarray, "image descriptor"],
+    ) -> None:
+        if self.map is None:
+            self.map = similarity_map(database, queries)
 
 
 def _notes(arguments: Evaluate, groupings: list[Grouping], same_place: str) -> list[str]:
@@ -148,6 +205,6 @@ def _write_galleries(
             benchmark.queries,
             benchmark.database,
             *result.neighbours,
-            positives_of(benchmark),
+            benchmark.ground_truth(),
             title=f"{benchmark.name}, {model_name}, {result.grouping}",
         )

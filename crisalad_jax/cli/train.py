@@ -29,6 +29,8 @@ class Train:
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     val: pathlib.Path | None = None
     """Evaluation set for early stopping, in any layout that `evaluate` reads."""
+    val_images: pathlib.Path | None = None
+    """Folder of the images that a .mat file or .npy lists at --val name; by default beside them."""
     weights: pathlib.Path | None = None
     """Weights of a whole model to start from; none starts from random ones."""
     backbone: pathlib.Path | None = None
@@ -122,8 +124,15 @@ def _read(
         config = dataclasses.replace(config, model=model)
     initial = _start(arguments, config)
     places = read_places(arguments.data, cities=config.cities, min_images=config.min_images)
-    validation = None if arguments.val is None else open_benchmark(arguments.val)
-    return config, initial, places, validation
+    return config, initial, places, _validation(arguments)
+
+
+def _validation(arguments: Train) -> Benchmark | None:
+    if arguments.val is None:
+        if arguments.val_images is not None:
+            raise InputError("--val-images: found no --val, expected it beside --val")
+        return None
+    return open_benchmark(arguments.val, images=arguments.val_images)
 
 
 def _start(arguments: Train, config: TrainConfig) -> Crisalad | None:

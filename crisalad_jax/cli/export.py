@@ -1,0 +1,60 @@
+"""`crisalad export`."""
+
+import dataclasses
+import pathlib
+from typing import Literal
+
+from crisalad_jax.cli.common import console, model_of
+from crisalad_jax.files import check_new_folder
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a model as a StableHLO program that scripts without this package can run."""
+
+    weights: pathlib.Path
+    """A .safetensors file of this package."""
+    out: pathlib.Path
+    """New folder for the program, its manifest.json and its weights."""
+    image_size: tuple[int, int] | None = None
+    """Height and width, multiples of 14; by default the model's."""
+    batch_size: int | Literal["symbolic"] = "symbolic"
+    """Images in a call, or symbolic: any number."""
+    grouping: Literal["single", "batch"] = "single"
+    """Every image described alone, or the images of a call looking at each other."""
+    weights_inside: bool = False
+    """The weights as constants of the program, and no file of them beside it."""
+    platforms: str = "cpu,cuda"
+    """Comma-separated: cpu, cuda, rocm, tpu."""
+    compute_dtype: Literal["float32", "bfloat16"] | None = None
+    """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
+    gains and loses."""
+
+
+def run(arguments: Export) -> None:
+    """Export, and say what was written."""
+    from crisalad_jax.export import ExportConfig, write_export
+
+    check_new_folder(arguments.out)
+    how = ExportConfig(
+        grouping=arguments.grouping,
+        batch_size=None if arguments.batch_size == "symbolic" else arguments.batch_size,
+        weights_inside=arguments.weights_inside,
+        platforms=tuple(dict.fromkeys(arguments.platforms.split(","))),
+    )
+    params, config, _ = model_of(
+        arguments.weights,
+        image_size=arguments.image_size,
+        compute_dtype=arguments.compute_dtype,
+    )
+    manifest = write_export(arguments.out, params, config, how)
+    shapes = (
+        f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"
+        for name in ("images", "descriptors")
+    )
+    console.print(
+        f"{arguments.out}: images {' -> descriptors '.join(shapes)}; "
+        f"{manifest['grouping_means']}; weights {'inside' if how.weights_inside else 'beside'}; "
+        f"for {', '.join(manifest['platforms'])}",
+        soft_wrap=True,
+    )

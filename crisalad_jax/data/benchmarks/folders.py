@@ -1,0 +1,150 @@
+"""Two plain folders, `database/` and `queries/`: with a table of matches, frames, or nothing."""
+
+import csv
+import os
+import pathlib
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Int64
+
+from crisalad_jax.data.benchmarks.benchmark import Benchmark
+from crisalad_jax.data.benchmarks.disk import find_split, list_part
+from crisalad_jax.errors import InputError
+
+TRUTH = "ground_truth.csv"
+_HEADER = ["query", "database"]
+
+
+def read_folders(
+    root: str | os.PathLike[str], split: str | None = None, *, frames: int | None = None
+) -> Benchmark:
+    """Read `database/` and `queries/`, whatever their images are called.
+
+    Which database images are right for a query is told by `ground_truth.csv` beside them: lines of
+    `query,database`, paths relative to the two folders, as many lines for a query as it has
+    matches; `query,` alone where it has none. Every query has a line. Or by `frames`. Or nothing
+    tells, and the set has no ground truth.
+
+    Args:
+        root: the folder that holds the two, or one with `images/{test,val,train}` that do.
+        split: None takes `test`, else `val`.
+        frames: the i-th query matches the database images i - frames to i + frames, where both
+            folders hold a frame of the same moments. Frames are in the order of the numbers in
+            their names, so that frame 10 follows frame 9.
+
+    Raises:
+        InputError: a folder is missing or without images; a table that names an image that is not
+            there, leaves one out, or contradicts itself; a negative number of frames, folders of
+            different counts, or `frames` beside a table.
+    """
+    root = pathlib.Path(root)
+    folder, name = find_split(root, split)
+    database, queries = (list_part(folder / part) for part in ("database", "queries"))
+    table = folder / TRUTH
+    if frames is not None:
+        if table.exists():
+            raise InputError(f"frames: found {frames} beside {table}, expected one of the two")
+        return _by_frames(root, name, database, queries, frames)
+    if table.exists():
+        positives = _by_table(table, _numbers(folder, database), _numbers(folder, queries))
+        name, rule = f"{name} (two folders, {TRUTH})", f"the database images that {TRUTH} lists"
+    else:
+        positives = None
+        name, rule = f"{name} (two folders, no ground truth)", "none: there is no ground truth"
+    return Benchmark(name, root, database, queries, positives, rule)
+
+
+def _by_frames(
+    root: pathlib.Path,
+    name: str,
+    database: tuple[pathlib.Path, ...],
+    queries: tuple[pathlib.Path, ...],
+    frames: int,
+) -> Benchmark:
+    if frames < 0:
+        raise InputError(f"frames: found {frames}, expected a number from 0")
+    if len(database) != len(queries):
+        raise InputError(
+            f"frames: found {len(database)} database images and {len(queries)} queries in {root}, "
+            "expected as many: a frame matches those of the same moment"
+        )
+    count = len(queries)
+    title, rule = f"{name} (two folders", f"at most {frames} frames apart"
+    if (count, frames) == (3450, 2):
+        title = "Nordland-test (SelaVPR: 3450 + 3450 images"
+        rule += "; by its number of images it is SelaVPR's Nordland-test"
+    return Benchmark(
+        name=f"{title}, +-{frames} frame{'s' * (frames != 1)})",
+        root=root,
+        database=tuple(sorted(database, key=_in_numbers)),
+        queries=tuple(sorted(queries, key=_in_numbers)),
+        positives=tuple(
+            np.arange(max(0, i - frames), min(count, i + frames + 1)) for i in range(count)
+        ),
+        rule=rule,
+    )
+
+
+def _in_numbers(path: pathlib.Path) -> list[str | int]:
+    """Sorts the numbers in a path by their value. Odd parts are numbers, so like meets like."""
+    parts = re.split(r"(\d+)", path.as_posix())
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)]
+
+
+def _numbers(folder: pathlib.Path, paths: tuple[pathlib.Path, ...]) -> dict[str, int]:
+    """By the path below database/ or queries/."""
+    depth = len(folder.parts) + 1
+    return {"/".join(path.parts[depth:]): number for number, path in enumerate(paths)}
+
+
+def _by_table(
+    table: pathlib.Path, database: dict[str, int], queries: dict[str, int]
+) -> tuple[Int64[np.ndarray, " _"], ...]:
+    found: dict[str, set[int]] = {}
+    without: set[str] = set()
+    for line, query, match in _rows(table):
+        for side, name, numbers in (("query", query, queries), ("database", match, database)):
+            if name not in numbers and (name or side == "query"):
+                folder = "queries" if side == "query" else "database"
+                raise InputError(
+                    f"{table}: line {line}: found {side} {name!r}, expected the path of an image "
+                    f"below {table.parent / folder}"
+                )
+        found.setdefault(query, set())
+        if match:
+            found[query].add(database[match])
+        else:
+            without.add(query)
+        if query in without and found[query]:
+            raise InputError(
+                f"{table}: line {line}: found {query!r} with a match and without, expected either"
+            )
+    missing = queries.keys() - found.keys()
+    if missing:
+        raise InputError(
+            f"{table}: found {len(missing)} of {len(queries)} queries without a line, expected all "
+            f"('{min(missing)},' where there is no match)"
+        )
+    return tuple(np.array(sorted(found[query]), np.int64) for query in queries)
+
+
+def _rows(table: pathlib.Path) -> Iterator[tuple[int, str, str]]:
+    """Line number, query and match, of every row that is not blank."""
+    try:
+        # utf-8-sig: a spreadsheet's byte order mark would spoil the first name.
+        with table.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            for number, row in enumerate(reader):
+                row = [field.strip() for field in row]
+                if not row or (number == 0 and row == _HEADER):
+                    continue
+                if len(row) != 2:
+                    raise InputError(
+                        f"{table}: line {reader.line_num}: found {len(row)} fields, expected "
+                        "query,database"
+                    )
+                yield reader.line_num, row[0], row[1]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{table}: cannot be read as UTF-8 CSV: {error}") from error

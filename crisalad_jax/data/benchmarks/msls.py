@@ -1,0 +1,260 @@
+"""Mapillary Street-Level Sequences as published (Warburg et al., CVPR 2020).
+
+`train_val/{city}/{query,database}/` with `images/KEY.jpg` and tables whose rows are in the same
+order: `raw.csv` (key, lon, lat, ca, captured_at, pano), `postprocessed.csv` (key, easting,
+northing, ...) and `subtask_index.csv` (all, ...). `ca` is the compass angle in degrees.
+"""
+
+import csv
+import os
+import pathlib
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+
+from crisalad_jax.data.benchmarks.benchmark import Benchmark
+from crisalad_jax.data.benchmarks.disk import find_images, listing, shown
+from crisalad_jax.data.benchmarks.positives import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.errors import InputError
+
+MSLS_CITIES = {
+    "val": ("cph", "sf"),
+    "train": (
+        *("amman", "amsterdam", "austin", "bangkok", "berlin", "boston", "budapest", "goa"),
+        *("helsinki", "london", "manila", "melbourne", "moscow", "nairobi", "ottawa", "paris"),
+        *("phoenix", "saopaulo", "tokyo", "toronto", "trondheim", "zurich"),
+    ),
+}
+"""The cities whose positions are published."""
+
+
+def msls_title(cities: Collection[str]) -> str:
+    """What images of these cities are: "MSLS val", "MSLS train", or MSLS of the cities by name."""
+    for split, expected in MSLS_CITIES.items():
+        if set(cities) == set(expected):
+            return f"MSLS {split}"
+    return f"MSLS of {', '.join(sorted(cities))}"
+
+
+def read_msls(
+    root: str | os.PathLike[str],
+    split: str | None = None,
+    radius: float = DEFAULT_RADIUS,
+    *,
+    max_heading_difference: float | None = None,
+) -> Benchmark:
+    """Read raw MSLS: all images but panoramas; a query without a match counts as a miss.
+
+    That is what VPR-datasets-downloader takes: about 11,000 queries of val.
+
+    Args:
+        root: the folder with `train_val/`, or that one.
+        split: `val` (the default) or `train`; those of its cities that are there.
+        radius: in metres, inclusive. Images of different cities never match.
+        max_heading_difference: largest difference of two compass angles in degrees, inclusive, for
+            a match (the CriSALAD paper says 40); None lets any match, as the official code does.
+
+    Raises:
+        InputError: no such city, a table that is missing, without a column or of another length, a
+            field that is no number, images that are missing, a negative radius, an angle that is
+            not from 0 to 180.
+    """
+    return _read(root, split, radius, max_heading_difference, subtask=False)
+
+
+def read_msls_subtask(
+    root: str | os.PathLike[str],
+    split: str | None = None,
+    radius: float = DEFAULT_RADIUS,
+    *,
+    max_heading_difference: float | None = None,
+) -> Benchmark:
+    """Read raw MSLS as the official code does for val: the list of 740 queries.
+
+    Of the images that `subtask_index.csv` marks as `all`, and are no panoramas, the queries with an
+    image of the database within `radius`. (By distance alone: with a largest difference of headings
+    the queries remain the same, and those without a match count as misses.)
+
+    Arguments and errors are those of `read_msls`.
+    """
+    return _read(root, split, radius, max_heading_difference, subtask=True)
+
+
+class _Side(NamedTuple):
+    """The database or the queries of a city."""
+
+    images: tuple[pathlib.Path, ...]
+    positions: Float64[np.ndarray, "images 2"]
+    headings: Float64[np.ndarray, " images"]
+
+    def only(self, chosen: Int64[np.ndarray, " _"]) -> "_Side":
+        images = tuple(self.images[i] for i in chosen)
+        return _Side(images, self.positions[chosen], self.headings[chosen])
+
+
+def _read(
+    root: str | os.PathLike[str],
+    split: str | None,
+    radius: float,
+    max_heading_difference: float | None,
+    *,
+    subtask: bool,
+) -> Benchmark:
+    root = pathlib.Path(root)
+    check_radius(radius)
+    turned = max_heading_difference is not None
+    if turned and not 0 <= max_heading_difference <= 180:
+        raise InputError(
+            f"max heading difference: found {max_heading_difference}, expected degrees from 0 to "
+            "180"
+        )
+    database: list[_Side] = []
+    queries: list[_Side] = []
+    positives: list[Int64[np.ndarray, " _"]] = []
+    folders = _city_folders(root, split or "val")
+    start = 0
+    for folder in folders:
+        there, asked = (
+            _read_side(folder / part, headings=turned, subtask=subtask)
+            for part in ("database", "query")
+        )
+        near = within(there.positions, asked.positions, radius)
+        if subtask:
+            chosen = np.array([i for i, found in enumerate(near) if found.size], np.int64)
+            asked, near = asked.only(chosen), tuple(near[i] for i in chosen)
+        if max_heading_difference is not None:
+            near = tuple(
+                found[heading_difference(there.headings[found], heading) <= max_heading_difference]
+                for found, heading in zip(near, asked.headings, strict=True)
+            )
+        positives += [found + start for found in near]
+        database.append(there)
+        queries.append(asked)
+        start += len(there.images)
+    if not positives:
+        raise InputError(f"{root}: found no query within {radius:g} m of the database")
+
+    angle = f" and {max_heading_difference:g} degrees" if turned else ""
+    title = msls_title([folder.name for folder in folders])
+    kind = ", subtask all" if subtask else ""
+    rule = f"UTM distance of at most {radius:g} m"
+    if turned:
+        rule += f" and compass angles at most {max_heading_difference:g} degrees apart"
+    if subtask:
+        rule += "; queries of the subtask all with a database image in that distance"
+    return Benchmark(
+        name=f"{title}, raw{kind}, {len(positives)} queries, {radius:g} m{angle}",
+        root=root,
+        database=tuple(path for side in database for path in side.images),
+        queries=tuple(path for side in queries for path in side.images),
+        positives=tuple(positives),
+        rule=f"{rule}; no panoramas",
+        database_positions=np.concatenate([side.positions for side in database]),
+        query_positions=np.concatenate([side.positions for side in queries]),
+        radius=radius,
+    )
+
+
+def heading_difference(
+    first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"] | float
+) -> Float64[np.ndarray, " n"]:
+    """The angle between two compass angles, all in degrees: from 0 to 180."""
+    turn = np.abs(np.subtract(first, second, dtype=np.float64)) % 360
+    return np.minimum(turn, 360 - turn)
+
+
+def is_msls(root: pathlib.Path) -> bool:
+    """Whether a folder is raw MSLS: has train_val/, or is it."""
+    return (root / "train_val").is_dir() or root.resolve().name == "train_val"
+
+
+def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
+    """Those of the cities of a split that are there."""
+    if split not in MSLS_CITIES:
+        raise InputError(
+            f"split: found {split!r}, expected val or train: no other part of MSLS has positions"
+        )
+    parent = root / "train_val" if (root / "train_val").is_dir() else root
+    found = [parent / city for city in MSLS_CITIES[split] if (parent / city).is_dir()]
+    if not found:
+        raise InputError(
+            f"{parent}: found {listing(parent)}, expected some of "
+            f"{shown(f'{city}/' for city in MSLS_CITIES[split])} for {split}"
+        )
+    return found
+
+
+def _read_side(folder: pathlib.Path, *, headings: bool, subtask: bool) -> _Side:
+    """The images of a folder that are no panoramas, in the order of the tables."""
+    raw = _read_table(folder / "raw.csv", ("key", "pano", *(["ca"] if headings else [])))
+    columns = ("key", "easting", "northing")
+    tables = {"postprocessed.csv": _read_table(folder / "postprocessed.csv", columns)}
+    if subtask:
+        tables["subtask_index.csv"] = _read_table(folder / "subtask_index.csv", ("all",))
+    for name, table in tables.items():
+        keys = [row.get("key", first["key"]) for first, row in zip(raw, table, strict=False)]
+        if len(table) != len(raw) or keys != [row["key"] for row in raw]:
+            raise InputError(
+                f"{folder / name}: found {len(table)} rows, expected the same {len(raw)} images as "
+                "in raw.csv, in the same order"
+            )
+    kept = []
+    for row, first in enumerate(raw):
+        marked = not subtask or _truth(
+            folder / "subtask_index.csv", row, "all", tables["subtask_index.csv"]
+        )
+        if marked and not _truth(folder / "raw.csv", row, "pano", raw):
+            kept.append((row, first["key"]))
+    if not kept:
+        raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
+    names = [f"{key}.jpg" for _, key in kept]
+    path = folder / "postprocessed.csv"
+    positions = [
+        [_number(path, row, name, tables[path.name]) for name in ("easting", "northing")]
+        for row, _ in kept
+    ]
+    angles = [_number(folder / "raw.csv", row, "ca", raw) if headings else 0.0 for row, _ in kept]
+    return _Side(
+        images=find_images(folder / "raw.csv", folder / "images", names),
+        positions=np.array(positions),
+        headings=np.array(angles),
+    )
+
+
+_Table = list[dict[str, str]]
+
+
+def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> _Table:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, restval="")
+            header = reader.fieldnames or []
+            missing = [name for name in columns if name not in header]
+            if missing:
+                raise InputError(
+                    f"{path}: found columns {', '.join(header) or 'none'}; missing "
+                    f"{', '.join(missing)}"
+                )
+            return list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
+
+
+def _truth(path: pathlib.Path, row: int, column: str, table: _Table) -> bool:
+    text = table[row][column]
+    if text not in ("True", "False"):
+        raise InputError(f"{path}: row {row + 1}: {column}: found {text!r}, expected True or False")
+    return text == "True"
+
+
+def _number(path: pathlib.Path, row: int, column: str, table: _Table) -> float:
+    text = table[row][column]
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(f"{path}: row {row + 1}: {column}: found {text!r}, expected a number")
+    return value

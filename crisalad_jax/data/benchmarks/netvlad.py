@@ -1,0 +1,139 @@
+"""NetVLAD's `.mat` files (Arandjelovic et al., CVPR 2016): Pitts30k, Pitts250k, Tokyo.
+
+A struct `dbStruct` with the fields whichSet, dbImage, utmDb (2 x N), qImage, utmQ, numDb, numQ,
+posDistThr, and others that are not needed here.
+"""
+
+import os
+import pathlib
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from crisalad_jax.data.benchmarks.benchmark import Benchmark
+from crisalad_jax.data.benchmarks.disk import find_image_root, find_images
+from crisalad_jax.data.benchmarks.positives import check_radius, within
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import check_source
+
+_FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
+_DATABASE_FOLDERS = (".", "images")
+# The folders of queries first: names in them may be those of database images, too.
+_QUERY_FOLDERS = ("queries_real", "queries", "query", ".")
+
+
+def read_netvlad(
+    path: str | os.PathLike[str],
+    radius: float | None = None,
+    *,
+    images: str | os.PathLike[str] | None = None,
+) -> Benchmark:
+    """Read a `.mat` file of NetVLAD; a positive is at most `radius` metres away.
+
+    Args:
+        path: for instance `pitts30k_test.mat`.
+        radius: in metres, inclusive; None takes the file's posDistThr.
+        images: the folder with `000/...` (or `images/000/...`) and with the queries in
+            `queries_real/`, `queries/` or `query/`; None looks beside the file and one folder
+            further up.
+
+    Raises:
+        InputError: no such file, no dbStruct in it, counts that differ from its arrays, images that
+            are missing, a negative radius.
+    """
+    path = pathlib.Path(path)
+    struct = _read_struct(path)
+    radius = _number(path, struct, "posDistThr") if radius is None else radius
+    check_radius(radius)
+    sides = []
+    for names, utm, count, folders in (
+        ("dbImage", "utmDb", "numDb", _DATABASE_FOLDERS),
+        ("qImage", "utmQ", "numQ", _QUERY_FOLDERS),
+    ):
+        listed = _names(path, struct, names)
+        expected = int(_number(path, struct, count))
+        if len(listed) != expected or not listed:
+            raise InputError(
+                f"{path}: {names}: found {len(listed)} images, expected {count}, {expected}, and "
+                "at least one"
+            )
+        positions = _positions(path, struct, utm, len(listed))
+        root = find_image_root(path, images, listed[0], folders)
+        sides.append((find_images(path, root, listed), positions))
+    (database, places), (queries, asked) = sides
+    return Benchmark(
+        name=f"{path.stem} (NetVLAD .mat, {_text(path, struct, 'whichSet')} set, {radius:g} m)",
+        root=path,
+        database=database,
+        queries=queries,
+        positives=within(places, asked, radius),
+        rule=f"UTM distance of at most {radius:g} m",
+        database_positions=places,
+        query_positions=asked,
+        radius=radius,
+    )
+
+
+def _read_struct(path: pathlib.Path) -> np.void:
+    # Half a second to import, for this layout alone.
+    import scipy.io
+
+    check_source(path, "a .mat file with dbStruct")
+    try:
+        contents = scipy.io.loadmat(path)
+    except NotImplementedError as error:
+        raise InputError(
+            f"{path}: found MATLAB's format 7.3, expected 7 or older (save it with '-v7')"
+        ) from error
+    except Exception as error:  # a damaged file can raise anything at all
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: cannot be read as a .mat file: {reason}") from error
+    struct = contents.get("dbStruct")
+    if struct is None or struct.size != 1 or struct.dtype.names is None:
+        variables = ", ".join(name for name in contents if not name.startswith("__"))
+        raise InputError(f"{path}: found {variables or 'nothing'}, expected a struct dbStruct")
+    missing = [name for name in _FIELDS if name not in struct.dtype.names]
+    if missing:
+        raise InputError(f"{path}: dbStruct: found no {', '.join(missing)}")
+    return struct.reshape(-1)[0]
+
+
+def _text(path: pathlib.Path, struct: np.void, field: str) -> str:
+    value = struct[field]
+    if value.dtype.kind != "U" or value.size != 1:
+        raise InputError(f"{path}: {field}: found {_found(value)}, expected text")
+    return str(value.item())
+
+
+def _number(path: pathlib.Path, struct: np.void, field: str) -> float:
+    value = struct[field]
+    if value.dtype.kind not in "iuf" or value.size != 1:
+        raise InputError(f"{path}: {field}: found {_found(value)}, expected a number")
+    return float(value.item())
+
+
+def _names(path: pathlib.Path, struct: np.void, field: str) -> list[str]:
+    cells = struct[field].reshape(-1)
+    if any(not isinstance(cell, np.ndarray) or cell.dtype.kind != "U" for cell in cells) or any(
+        cell.size != 1 for cell in cells
+    ):
+        raise InputError(f"{path}: {field}: found {_found(cells)}, expected names of images")
+    return [str(cell.item()) for cell in cells]
+
+
+def _positions(
+    path: pathlib.Path, struct: np.void, field: str, count: int
+) -> Float64[np.ndarray, "images 2"]:
+    value = struct[field]
+    right = value.dtype.kind in "iuf" and value.shape == (2, count)
+    if not right or not np.isfinite(value).all():
+        raise InputError(
+            f"{path}: {field}: found {_found(value)}, expected 2 x {count} numbers, one pair for "
+            "each image"
+        )
+    return np.ascontiguousarray(value.T, dtype=np.float64)
+
+
+def _found(value: Any) -> str:
+    return f"an array of {value.shape} of {value.dtype}"

@@ -1,0 +1,155 @@
+"""`@UTM` file names, as VPR-datasets-downloader and the tools around it write them.
+
+The fields of a name, between @: east, north, zone number, zone letter, latitude, longitude,
+panorama, tile, heading, pitch, roll, height, time, note, suffix. Those of no use are empty.
+"""
+
+import os
+import pathlib
+import re
+
+import numpy as np
+from jaxtyping import Float64
+
+from crisalad_jax.data.benchmarks.benchmark import Benchmark
+from crisalad_jax.data.benchmarks.disk import find_split, list_part
+from crisalad_jax.data.benchmarks.msls import msls_title
+from crisalad_jax.data.benchmarks.positives import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.errors import InputError
+
+_PLACE_METRES = 1000.0
+_PAIRED = {607: "SPED", 1231: "AmsterTime"}
+"""Sets whose places have an image on each side, and no coordinates, by how many they are."""
+_NORDLANDS = {
+    25 / 10.5: "Nordland, Patch-NetVLAD split (summer database, winter queries)",
+    25 / 1.5: "Nordland subset of VPR-datasets-downloader (summer database, winter queries)",
+}
+"""By the metres that a frame stands for."""
+# Names have one decimal, cut off.
+_NAME_METRES = 0.1
+_MSLS_NOTE = re.compile(r"(?:day|night)_[a-z]+_([a-z]+)")
+
+
+def read_utm(
+    root: str | os.PathLike[str], split: str | None = None, radius: float = DEFAULT_RADIUS
+) -> Benchmark:
+    """Read `@UTM_east@UTM_north@...` images; a positive is at most `radius` metres away.
+
+    Where the coordinates are placeholders of VPR-datasets-downloader (Nordland: easting 0, frames
+    25 / 10.5 m apart; SPED and AmsterTime: easting 0, places 1 km apart), name and rule say what
+    they stand for. So does the name of MSLS, which is told by the notes in the names.
+
+    Args:
+        root: a folder with `images/{test,val,train}`, or one that itself holds `database/` and
+            `queries/`.
+        split: None takes `test`, else `val`.
+        radius: in metres, inclusive.
+
+    Raises:
+        InputError: no such split or folder, a folder without images, a name without coordinates, a
+            negative radius.
+    """
+    root = pathlib.Path(root)
+    check_radius(radius)
+    folder, name = find_split(root, split)
+    database, queries = (list_part(folder / part) for part in ("database", "queries"))
+    places, asked = _coordinates(database), _coordinates(queries)
+
+    nordland = _nordland(places, asked)
+    if nordland is not None:
+        metres, there, here = nordland
+        # Whole frames, because the names' cut decimals would blur the radius.
+        frames = int(radius / metres + 1e-9)
+        words = f"{frames} frame{'s' * (frames != 1)}"
+        return Benchmark(
+            name=f"{_NORDLANDS[metres]}, +-{words}",
+            root=root,
+            database=database,
+            queries=queries,
+            positives=within(there, here, frames),
+            rule=f"at most {words} apart ({radius:g} m); it is Nordland by eastings of 0 and "
+            f"northings of {metres:.4g} m a frame",
+        )
+
+    positives = within(places, asked, radius)
+    if radius < _PLACE_METRES and _are_placeholders(places, asked):
+        known = _PAIRED.get(len(database)) if len(database) == len(queries) else None
+        return Benchmark(
+            name=f"{known or name} (@UTM placeholders 1 km apart: a place matches itself only)",
+            root=root,
+            database=database,
+            queries=queries,
+            positives=positives,
+            rule="the same place; by eastings of 0 and northings of whole kilometres the "
+            "coordinates are placeholders"
+            + (f", and by {len(database)} places it is {known}" if known else ""),
+        )
+
+    rule = f"UTM distance of at most {radius:g} m"
+    cities = _msls_cities(database + queries)
+    if cities is None:
+        name = f"{name} (@UTM, {radius:g} m)"
+    else:
+        name = f"{msls_title(cities)}, downloader style, {len(queries)} queries, {radius:g} m"
+        rule += f"; by the notes in the names it is MSLS of {', '.join(sorted(cities))}"
+    return Benchmark(name, root, database, queries, positives, rule, places, asked, radius)
+
+
+def has_utm_names(folder: pathlib.Path) -> bool:
+    """Whether any image under database/ or queries/ has a name that begins with @."""
+    parts = (list_part(folder / part) for part in ("database", "queries"))
+    return any(path.name.startswith("@") for paths in parts for path in paths)
+
+
+def _coordinates(paths: tuple[pathlib.Path, ...]) -> Float64[np.ndarray, "images 2"]:
+    """East and north in metres."""
+    coordinates = np.empty((len(paths), 2))
+    for row, path in zip(coordinates, paths, strict=True):
+        fields = path.name.split("@")
+        try:
+            row[:] = float(fields[1]), float(fields[2])
+        except (IndexError, ValueError):
+            row[:] = np.nan
+        if not np.isfinite(row).all():
+            raise InputError(
+                f"{path}: found no coordinates, expected a name @UTM_east@UTM_north@..."
+            )
+    return coordinates
+
+
+def _nordland(
+    database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"]
+) -> tuple[float, Float64[np.ndarray, "images 2"], Float64[np.ndarray, "q 2"]] | None:
+    """One of `_NORDLANDS`, and (0, frame) for every image; None where it is none of them."""
+    for metres in _NORDLANDS:
+        sides = [np.round(side / metres) for side in (database, queries)]
+        off = [np.abs(f * metres - c) for f, c in zip(sides, (database, queries), strict=True)]
+        # The last digits of the product are no more than 1e-9 m wrong.
+        if max(side.max() for side in off) > _NAME_METRES + 1e-6:
+            continue
+        line = np.stack([np.zeros(len(database)), np.arange(len(database))], axis=1)
+        in_order = np.array_equal(np.unique(sides[0], axis=0), line) and len(line) > 1
+        if in_order and not sides[1][:, 0].any() and np.isin(sides[1][:, 1], line[:, 1]).all():
+            return metres, sides[0], sides[1]
+    return None
+
+
+def _are_placeholders(
+    database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"]
+) -> bool:
+    """Whether northings are whole kilometres at easting 0, one database image each."""
+    both = np.concatenate([database, queries])
+    whole = not both[:, 0].any() and not (both[:, 1] % _PLACE_METRES).any()
+    return whole and len(np.unique(database[:, 1])) == len(database) > 1
+
+
+def _msls_cities(paths: tuple[pathlib.Path, ...]) -> frozenset[str] | None:
+    """The cities in the notes, where all names have MSLS's."""
+    cities = set()
+    for path in paths:
+        fields = path.name.split("@")
+        note = _MSLS_NOTE.fullmatch(fields[14]) if len(fields) > 14 else None
+        if note is None:
+            return None
+        cities.add(note[1])
+    return frozenset(cities)

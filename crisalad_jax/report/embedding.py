@@ -1,0 +1,38 @@
+"""Pictures as a page holds them: drawings are PNGs, photographs, of which there are many, WebP."""
+
+import base64
+import pathlib
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+_WEBP_QUALITY = 78
+
+
+class Drawing(NamedTuple):
+    """A PNG beside the page, and in it."""
+
+    file: str
+    uri: str
+    width: int
+    height: int
+    alt: str
+
+
+def drawing(path: pathlib.Path, alt: str) -> Drawing:
+    """A PNG that was written; its sides are in its first chunk (W3C PNG specification, 11.2.2)."""
+    data = path.read_bytes()
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    return Drawing(path.name, _uri("png", data), width, height, alt)
+
+
+def webp(image: UInt8[np.ndarray, "h w 3"]) -> str:
+    """RGB pixels as a data URI of a few kilobytes."""
+    _, data = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
+    return _uri("webp", data.tobytes())
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

@@ -1,0 +1,162 @@
+"""Galleries of queries and what was retrieved for them."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.errors import InputError
+from crisalad_jax.report.style import DPI, GREY, INK, RIGHT, WRONG, fit_width, save
+
+
+def prediction_gallery(
+    path: str | os.PathLike[str],
+    queries: Sequence[Path],
+    database: Sequence[Path],
+    indices: Int[np.ndarray, "q k"],
+    similarities: Float[np.ndarray, "q k"],
+    positives: Sequence[Int[np.ndarray, " _"]],
+    *,
+    rows: int = 6,
+    columns: int = 4,
+    chosen: Sequence[int] | None = None,
+    title: str = "",
+) -> None:
+    """Write a PNG of queries, one a row, with what was retrieved for them, best first.
+
+    Retrievals are framed green where right and red where wrong, with rank and similarity below.
+    Unless they are `chosen`, half of the rows are queries whose first retrieval is right, half are
+    others, as far as there are both, each half spread evenly over the data set: the same input
+    gives the same picture.
+
+    Args:
+        path: the picture to write.
+        queries: image files of the q queries.
+        database: image files that `indices` count.
+        indices: database indices retrieved for each query, best first.
+        similarities: those of `indices`.
+        positives: the database indices that are right for each query.
+        rows: queries shown, at most q, where none are chosen.
+        columns: retrievals shown for each, at most k.
+        chosen: the queries shown, in their order.
+        title: stands above the picture.
+
+    Raises:
+        InputError: no queries or retrievals, numbers of rows that differ, an index beyond the
+            database, rows or columns below 1, or an image that cannot be read.
+    """
+    _check_gallery(queries, database, indices, similarities, positives)
+    for name, value in (("rows", rows), ("columns", columns)):
+        if value < 1:
+            raise InputError(f"{name}: found {value}, expected at least 1")
+    shown = indices[:, :columns]
+    right = np.stack([np.isin(row, wanted) for row, wanted in zip(shown, positives, strict=True)])
+    chosen = _choose_queries(right[:, 0], rows) if chosen is None else chosen
+
+    # Inches. Frames and captions are drawn into the gaps.
+    width, gap, between, margin = 1.7, 0.16, 0.34, 0.25
+    head = 0.85 if title else 0.55
+    thumbnails = {
+        file: thumbnail(read_image(file), round(width * DPI))
+        for query in chosen
+        for file in (queries[query], *(database[index] for index in shown[query]))
+    }
+    aspect = float(np.median([image.shape[0] / image.shape[1] for image in thumbnails.values()]))
+    height = width * min(max(aspect, 0.5), 1.5)
+    count = 1 + shown.shape[1]
+    # One more gap sets the queries apart.
+    size = (
+        2 * margin + count * width + count * gap,
+        margin + head + len(chosen) * (height + between),
+    )
+    figure = Figure(figsize=size)
+
+    def place(row: int, column: int, image: UInt8[np.ndarray, "h w 3"]) -> Axes:
+        left = margin + column * (width + gap) + gap * (column > 0)
+        top = head + row * (height + between)
+        axes = figure.add_axes(
+            (left / size[0], 1 - (top + height) / size[1], width / size[0], height / size[1])
+        )
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[], anchor="NW")
+        return axes
+
+    for row, query in enumerate(chosen):
+        axes = place(row, 0, thumbnails[queries[query]])
+        note = "" if np.size(positives[query]) else ", no positive exists"
+        _caption(axes, f"query {query}{note}", INK)
+        axes.spines[:].set(color=GREY, linewidth=0.5)
+        for rank, index in enumerate(shown[query]):
+            axes = place(row, rank + 1, thumbnails[database[index]])
+            good = right[query, rank]
+            colour = RIGHT if good else WRONG
+            axes.spines[:].set(color=colour, linewidth=3)
+            # A sign too, for those who cannot tell green from red.
+            sign = "\N{CHECK MARK}" if good else "\N{BALLOT X}"
+            _caption(axes, f"{rank + 1}   {similarities[query, rank]:.3f}   {sign}", colour)
+
+    left = margin / size[0]
+    top = 1 - 0.2 / size[1]
+    if title:
+        fit_width(figure.text(left, top, title, fontsize=13, color=INK, va="top"), figure)
+        top -= 0.3 / size[1]
+    legend = "query, then retrievals: rank, similarity, "
+    parts = ((legend, GREY), ("\N{CHECK MARK} right   ", RIGHT), ("\N{BALLOT X} wrong", WRONG))
+    for text, colour in parts:
+        drawn = figure.text(left, top, text, fontsize=9, color=colour, va="top")
+        left += drawn.get_window_extent().width / figure.bbox.width
+    save(figure, path)
+
+
+def _check_gallery(
+    queries: Sequence[Path],
+    database: Sequence[Path],
+    indices: Int[np.ndarray, "q k"],
+    similarities: Float[np.ndarray, "q2 k2"],
+    positives: Sequence[Int[np.ndarray, " _"]],
+) -> None:
+    if not indices.size:
+        raise InputError(f"indices: found shape {indices.shape}, expected queries and retrievals")
+    if similarities.shape != indices.shape:
+        raise InputError(
+            f"similarities: found shape {similarities.shape}, expected {indices.shape} "
+            "as of the indices"
+        )
+    for name, found in (("queries", queries), ("positives", positives)):
+        if len(found) != len(indices):
+            raise InputError(f"{name}: found {len(found)}, expected {len(indices)} as of indices")
+    if indices.min() < 0 or indices.max() >= len(database):
+        raise InputError(
+            f"indices: found {indices.min()} to {indices.max()}, expected 0 to "
+            f"{len(database) - 1}, positions in the database"
+        )
+
+
+def _choose_queries(right: Bool[np.ndarray, " q"], rows: int) -> list[int]:
+    """Right queries, then wrong ones: half each, or more of one where the other is short."""
+    good, bad = np.flatnonzero(right), np.flatnonzero(~right)
+    good_count = min(len(good), max(rows - rows // 2, rows - len(bad)))
+    bad_count = min(len(bad), rows - good_count)
+    return [
+        int(group[place])
+        for group, count in ((good, good_count), (bad, bad_count))
+        for place in np.linspace(0, len(group) - 1, count).round().astype(int)
+    ]
+
+
+def thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Shrunk to at most `side` pixels either way, so that a page of photographs fits in memory."""
+    factor = side / max(image.shape)
+    if factor >= 1:
+        return image
+    height, width = (max(1, round(factor * length)) for length in image.shape[:2])
+    return resize_image(image, (height, width))
+
+
+def _caption(axes: Axes, text: str, colour: str) -> None:
+    axes.set_xlabel(text, fontsize=9, color=colour, loc="left", labelpad=4)

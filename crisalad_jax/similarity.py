@@ -1,0 +1,57 @@
+"""The similarities of all queries and all of a database, as large as a picture."""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+
+from crisalad_jax.errors import InputError
+from crisalad_jax.rows import WIDE, Block, aligned, as_rows, blocks
+
+# Queries and database rows compared at a time: their similarities are 32 MiB.
+_QUERY_CHUNK, _DATABASE_CHUNK = 1024, 8192
+
+
+def similarity_map(
+    database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d"], *, most: int = 400
+) -> Float32[np.ndarray, "rows columns"]:
+    """All similarities of queries (rows) and database (columns), in their order, for a picture.
+
+    Where there are more than `most` of either, a cell is the largest of the images that `cells_of`
+    gives it. Memory depends on the blocks that are compared at a time, not on the sets.
+
+    Raises:
+        InputError: as `retrieval.search`.
+    """
+    database, queries = as_rows(database, "database"), as_rows(queries, "queries")
+    if database.shape[1] != queries.shape[1]:
+        raise InputError(
+            f"queries: found descriptors of length {queries.shape[1]}, "
+            f"expected {database.shape[1]} as in the database"
+        )
+    rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
+    found = np.full((rows[-1] + 1, columns[-1] + 1), -np.inf, np.float32)
+    sizes = min(_DATABASE_CHUNK, len(database)), min(_QUERY_CHUNK, len(queries))
+    there, asked = (itertools.repeat(aligned((size, database.shape[1]), WIDE)) for size in sizes)
+    for block in blocks(database, "database", there):
+        for part in blocks(queries, "queries", asked):
+            products = part.rows[: part.valid] @ block.rows[: block.valid].T
+            row, tops = _cells(rows, part)
+            column, lefts = _cells(columns, block)
+            products = np.maximum.reduceat(products, tops, axis=0)
+            products = np.maximum.reduceat(products, lefts, axis=1)
+            cells = np.ix_(row, column)
+            found[cells] = np.maximum(found[cells], products)
+    return found
+
+
+def cells_of(count: int, most: int) -> Int64[np.ndarray, " count"]:
+    """Which of at most `most` cells each of `count` images in a row falls into, evenly."""
+    return np.arange(count) * min(count, most) // count
+
+
+def _cells(
+    cells: Int64[np.ndarray, " count"], block: Block
+) -> tuple[Int64[np.ndarray, " cell"], Int64[np.ndarray, " cell"]]:
+    """The cells that a block's images fall into, and the first image of each."""
+    return np.unique(cells[block.start : block.start + block.valid], return_index=True)

@@ -1,0 +1,94 @@
+"""Describe a folder of images by what `crisalad export` wrote, without crisalad_jax.
+
+    python scripts/run_exported.py EXPORT --images FOLDER --out descriptors.npy [--batch-size 16]
+
+Needs jax, flatbuffers, numpy, Pillow, and safetensors where the weights lie beside the program. Row
+i of the array is the image of line i of the file of names beside it (.names.txt). All that it needs
+to know is in EXPORT/manifest.json: take from here what a program of your own needs.
+"""
+
+import argparse
+import hashlib
+import json
+import pathlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax.export
+import numpy as np
+import PIL.Image
+import PIL.ImageOps
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+
+
+def read_whole(folder: pathlib.Path, entry: dict[str, Any]) -> bytes:
+    """A file of the export, which must be the one that its manifest tells of."""
+    data = (folder / entry["file"]).read_bytes()
+    if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+        raise SystemExit(f"{folder / entry['file']}: found other bytes than manifest.json says")
+    return data
+
+
+def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
+    """The function of images (batch, height, width, 3), uint8, to descriptors."""
+    program = jax.export.deserialize(bytearray(read_whole(folder, manifest["program"])))
+    if manifest["weights"] is None:
+        return lambda images: np.asarray(program.call(images))
+    import safetensors.numpy
+
+    weights = safetensors.numpy.load(read_whole(folder, manifest["weights"]))
+    weights = jax.device_put(weights)
+    return lambda images: np.asarray(program.call(weights, images))
+
+
+def read_image(path: pathlib.Path, height: int, width: int) -> np.ndarray:
+    """8-bit RGB pixels, upright, resized as the manifest says."""
+    with PIL.Image.open(path) as image:
+        upright = PIL.ImageOps.exif_transpose(image).convert("RGB")
+        return np.asarray(upright.resize((width, height), PIL.Image.Resampling.BILINEAR))
+
+
+def batches(
+    paths: list[pathlib.Path], manifest: dict[str, Any], batch_size: int
+) -> Iterator[tuple[np.ndarray, int]]:
+    """Images of so many files at a time, and how many of them count."""
+    fixed, height, width, _ = manifest["images"]["shape"]
+    size = fixed if isinstance(fixed, int) else batch_size
+    if size == fixed and manifest["grouping"] == "batch" and len(paths) % size:
+        raise SystemExit(
+            f"found {len(paths)} images, expected a multiple of {size}: this program takes so many "
+            "at a time, and lets them look at each other"
+        )
+    for start in range(0, len(paths), size):
+        images = np.stack([read_image(p, height, width) for p in paths[start : start + size]])
+        count = len(images)
+        if size == fixed:
+            images = np.resize(images, (size, *images.shape[1:]))
+        yield images, count
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("export", type=pathlib.Path)
+    parser.add_argument("--images", type=pathlib.Path, required=True)
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    parser.add_argument("--batch-size", type=int, default=16)
+    given = parser.parse_args()
+
+    manifest = json.loads((given.export / "manifest.json").read_text(encoding="utf-8"))
+    files = {p.relative_to(given.images).as_posix(): p for p in given.images.rglob("*")}
+    names = sorted(name for name in files if name.lower().endswith(SUFFIXES))
+    if not names:
+        raise SystemExit(f"{given.images}: found no image")
+    paths = [files[name] for name in names]
+    describe = load(given.export, manifest)
+    parts = [describe(images)[:n] for images, n in batches(paths, manifest, given.batch_size)]
+    np.save(given.out, np.concatenate(parts))
+    listed = "".join(f"{name}\n" for name in names)
+    given.out.with_suffix(".names.txt").write_text(listed, encoding="utf-8")
+    print(f"{given.out}: {len(names)} descriptors of {parts[0].shape[1]} numbers")
+
+
+if __name__ == "__main__":
+    main()

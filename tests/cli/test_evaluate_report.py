@@ -1,0 +1,46 @@
+"""`crisalad evaluate --report`: the page holds what the command found."""
+
+import json
+import pathlib
+
+import pytest
+
+from tests.conftest import BATCH
+from tests.report.test_page import Page
+from tests.test_cli import fails, succeeds
+
+
+def test_the_page_holds_the_numbers_of_the_json(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+):
+    said = succeeds(
+        capfd,
+        *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
+        *("--batch-size", BATCH, "--grouping", "single,sequential", "--quiet"),
+        *("--report", tmp_path / "page", "--json", tmp_path / "found.json"),
+    )
+    assert f"report: {tmp_path}/page/index.html" in said
+    page = Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
+    results = json.loads((tmp_path / "found.json").read_text())["results"]
+    assert [e["text"] for e in page.all("th", scope="row")] == ["single", "sequential"]
+    cells = iter(e["text"] for e in page.all("td"))
+    for result in results:
+        for value in result["recalls"].values():
+            assert next(cells).startswith(f"{100 * value:.1f}")
+        shares = result["same_place"].values()
+        words = ("\N{EN DASH}" if share is None else f"{100 * share:.1f}" for share in shares)
+        assert next(cells) == " / ".join(words)
+        assert next(cells) == f"{100 * result['recall_at_full_precision']:.1f}"
+    assert next(cells, None) is None
+    names = {e["id"] for e in page.all("section")}
+    assert {"recall", "map", "transport", "similarities", "settings"} <= names
+    assert json.loads(page.all("pre")[0]["text"])["model"]["image_size"] == [42, 56]
+
+
+def test_a_folder_that_cannot_be_is_found_before_the_work(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+):
+    (tmp_path / "file").write_text("")
+    given = ("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors")
+    words = (f"{tmp_path}/file", "cannot be made")
+    fails(capfd, *given, "--report", tmp_path / "file", words=words)

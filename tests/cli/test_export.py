@@ -1,0 +1,63 @@
+"""`crisalad export`: what it writes and says, and for every bad input one line."""
+
+import json
+import pathlib
+
+import pytest
+
+from tests.test_cli import fails, succeeds
+
+
+def test_flags_become_the_manifest(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "export"
+    said = succeeds(
+        capfd,
+        *("export", "--weights", shared / "weights.safetensors", "--out", out),
+        *("--image-size", "56", "42", "--batch-size", "2", "--grouping", "batch"),
+        *("--weights-inside", "--platforms", "cpu"),
+    )
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["images"]["shape"] == [2, 56, 42, 3]
+    assert manifest["model"]["image_size"] == [56, 42]
+    assert manifest["grouping"] == "batch"
+    assert manifest["weights"] is None
+    assert manifest["platforms"] == ["cpu"]
+    assert said == (
+        f"{out}: images uint8 (2, 56, 42, 3) -> descriptors float32 (2, 48); "
+        "the images of a call look at each other; weights inside; for cpu"
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--platforms", "cpu,metal"), ("platform: found 'metal'", "cpu, cuda, rocm, tpu")),
+        (("--image-size", "42", "50"), ("42 x 50", "multiples of 14")),
+        (("--image-size", "28", "28"), ("4 patches for 4 clusters",)),
+        (("--batch-size", "0"), ("batch size: found 0",)),
+        (("--batch-size", "some"), ("batch-size", "some")),
+        (("--weights", "none.safetensors"), ("none.safetensors: found no such file",)),
+    ],
+)
+def test_bad_input_is_one_line(
+    shared: pathlib.Path,
+    tmp_path: pathlib.Path,
+    capfd: pytest.CaptureFixture[str],
+    flags: tuple[str, ...],
+    words: tuple[str, ...],
+):
+    weights = () if "--weights" in flags else ("--weights", shared / "weights.safetensors")
+    fails(capfd, "export", *weights, "--out", tmp_path / "out", *flags, words=words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_there_is_not_overwritten(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+):
+    (tmp_path / "file").write_text("mine")
+    weights = shared / "weights.safetensors"
+    for out in (tmp_path, tmp_path / "file"):
+        fails(capfd, "export", "--weights", weights, "--out", out, words=(out,))
+    assert (tmp_path / "file").read_text() == "mine"

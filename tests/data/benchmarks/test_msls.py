@@ -1,0 +1,261 @@
+"""Raw MSLS: positives, headings and panoramas against brute force."""
+
+import csv
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crisalad_jax.data.benchmarks import read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks.msls import heading_difference
+from crisalad_jax.errors import InputError
+from tests.data.benchmarks.trees import lists_of, touch
+
+
+class Image(NamedTuple):
+    key: str
+    east: float
+    north: float
+    heading: float
+    pano: bool = False
+    all: bool = True
+
+
+def write_table(path: Path, columns: list[str], rows: list[list[object]]) -> None:
+    """As pandas writes them: numbered, the numbers without a name."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["", *columns])
+        writer.writerows([i, *row] for i, row in enumerate(rows))
+
+
+def write_side(folder: Path, images: list[Image]) -> None:
+    for image in images:
+        touch(folder / "images" / f"{image.key}.jpg")
+    columns = ["key", "lon", "lat", "ca", "captured_at", "pano"]
+    rows = [[i.key, 12.5, 55.6, i.heading, "2017-05-01", i.pano] for i in images]
+    write_table(folder / "raw.csv", columns, rows)
+    columns = ["key", "easting", "northing", "unique_cluster", "control_panel", "night"]
+    rows = [[i.key, i.east, i.north, 3, False, False, "Forward"] for i in images]
+    write_table(folder / "postprocessed.csv", [*columns, "view_direction"], rows)
+    rows = [[i.key, "seq", number] for number, i in enumerate(images)]
+    write_table(folder / "seq_info.csv", ["key", "sequence_key", "frame_number"], rows)
+    columns = ["key", "all", "s2w", "w2s", "o2n", "n2o", "d2n", "n2d"]
+    rows = [[i.key, i.all, *[False] * 6] for i in images]
+    write_table(folder / "subtask_index.csv", columns, rows)
+
+
+def some_images(seed: int, count: int) -> list[Image]:
+    """On a few streets; headings that go past 360 and below 0 too."""
+    draw = np.random.default_rng(seed)
+    return [
+        Image(
+            f"{'ab'[seed % 2]}{seed}_{i}",
+            *(draw.integers(0, 160_000, 2) / 1000 + [345000, 6174000]).tolist(),
+            float(draw.integers(-100, 500)),
+            pano=bool(draw.random() < 0.2),
+            all=bool(draw.random() < 0.6),
+        )
+        for i in range(count)
+    ]
+
+
+CITIES = {
+    # The same coordinates in both: they are of different zones.
+    city: {"database": some_images(seed, 30), "query": some_images(seed + 1, 20)}
+    for city, seed in (("sf", 2), ("cph", 4))
+}
+
+
+def write_msls(root: Path, cities: dict[str, dict[str, list[Image]]] = CITIES) -> Path:
+    for city, sides in cities.items():
+        for part, images in sides.items():
+            write_side(root / "train_val" / city / part, images)
+    return root
+
+
+def distance(first: Image, second: Image) -> float:
+    return math.hypot(first.east - second.east, first.north - second.north)
+
+
+def turn(first: float, second: float) -> float:
+    """The angle between two directions, by their dot product."""
+    cosine = math.cos(math.radians(first - second))
+    return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+
+
+def keys(paths) -> list[str]:
+    return [path.stem for path in paths]
+
+
+def brute_force(*, radius: float = 25, degrees: float | None = None, subtask: bool = False):
+    """Keys of the database, of the queries, and of the matches of each."""
+    kept = {
+        (city, part): [i for i in images if not i.pano and (i.all or not subtask)]
+        for city in ("cph", "sf")
+        for part, images in CITIES[city].items()
+    }
+    database, queries, matches = [], [], []
+    for city in ("cph", "sf"):
+        there = kept[city, "database"]
+        database += [image.key for image in there]
+        for query in kept[city, "query"]:
+            near = [image for image in there if distance(image, query) <= radius]
+            if subtask and not near:
+                continue
+            queries.append(query.key)
+            # No angle of these whole numbers lies within rounding of a limit but on it.
+            limit = 180 if degrees is None else degrees
+            matches.append([i.key for i in near if turn(i.heading, query.heading) <= limit + 1e-6])
+    return database, queries, matches
+
+
+@pytest.mark.parametrize("subtask", [False, True])
+@pytest.mark.parametrize("degrees", [None, 40.0, 0.0, 180.0])
+@pytest.mark.parametrize("radius", [25.0, 12.0])
+def test_positives_equal_brute_force(tmp_path, radius, degrees, subtask):
+    read = read_msls_subtask if subtask else read_msls
+    root = write_msls(tmp_path)
+    benchmark = read(root, radius=radius, max_heading_difference=degrees)
+    database, queries, matches = brute_force(radius=radius, degrees=degrees, subtask=subtask)
+    assert keys(benchmark.database) == database
+    assert keys(benchmark.queries) == queries
+    assert all(path.is_file() for path in (*benchmark.database, *benchmark.queries))
+    found = [[database[i] for i in positives] for positives in lists_of(benchmark.positives)]
+    assert found == matches
+    angle = "" if degrees is None else f" and {degrees:g} degrees"
+    kind = "raw, subtask all" if subtask else "raw"
+    assert benchmark.name == f"MSLS val, {kind}, {len(queries)} queries, {radius:g} m{angle}"
+    assert ("compass angles" in benchmark.rule) == (degrees is not None)
+    assert "no panoramas" in benchmark.rule
+    assert ("subtask all" in benchmark.rule) == subtask
+    everything = [i for sides in CITIES.values() for images in sides.values() for i in images]
+    places = {image.key: (image.east, image.north) for image in everything}
+    assert benchmark.database_positions is not None
+    assert benchmark.query_positions is not None
+    assert [tuple(row) for row in benchmark.database_positions] == [places[k] for k in database]
+    assert [tuple(row) for row in benchmark.query_positions] == [places[k] for k in queries]
+
+
+def test_the_cases_that_the_brute_force_is_for():
+    """Queries without a match, matches of every heading, those that 40 degrees take away."""
+    *_, any_heading = brute_force()
+    *_, forty = brute_force(degrees=40)
+    assert [] in any_heading
+    assert max(map(len, any_heading)) > 2
+    assert sum(map(len, forty)) < sum(map(len, any_heading))
+    assert any(forty)
+    assert len(brute_force(subtask=True)[1]) < len(brute_force()[1])
+
+
+@given(first=st.floats(-720, 720, allow_nan=False), second=st.floats(-720, 720, allow_nan=False))
+def test_headings_wrap_around(first, second):
+    found = heading_difference(np.array([first, second]), second)
+    # The arc cosine loses half of the digits near 0 and 180 degrees: 1e-8 radians.
+    assert found[0] == pytest.approx(turn(first, second), abs=5e-6)
+    assert found[1] == 0
+    assert 0 <= found[0] <= 180
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [(359, 1, 2), (1, 359, 2), (0, 180, 180), (350, -10, 0), (10, 370, 0), (90, 271, 179)],
+)
+def test_heading_differences_by_hand(first, second, expected):
+    assert heading_difference(np.array([first]), second).tolist() == [expected]
+
+
+def test_the_heading_limit_is_inclusive(tmp_path):
+    images = [Image(f"d{i}", 0, 0, angle) for i, angle in enumerate((40, 320, 41, 319.5))]
+    sides = {"database": images, "query": [Image("q", 0, 0, 0)]}
+    root = write_msls(tmp_path, {"sf": sides})
+    benchmark = read_msls(root, max_heading_difference=40)
+    assert benchmark.name == "MSLS of sf, raw, 1 queries, 25 m and 40 degrees"
+    assert lists_of(benchmark.positives) == [[0, 1]]
+
+
+def test_other_splits(tmp_path):
+    images = {"database": [Image("d", 1, 2, 3)], "query": [Image("q", 1, 2, 3)]}
+    root = write_msls(tmp_path, {"tokyo": images, "goa": images})
+    assert read_msls(root, "train").name == "MSLS of goa, tokyo, raw, 2 queries, 25 m"
+    assert lists_of(read_msls(root / "train_val", "train").positives) == [[0], [1]]
+    with pytest.raises(InputError, match="found goa/, tokyo/, expected some of cph/, sf/ for val"):
+        read_msls(root)
+    with pytest.raises(InputError, match="split: found 'test', expected val or train"):
+        read_msls(root, "test")
+
+
+def edit(path: Path, old: str, new: str, count: int = 1) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+@pytest.mark.parametrize("degrees", [-1.0, 181.0, float("nan")])
+def test_bad_angles(tmp_path, degrees):
+    with pytest.raises(InputError, match=f"max heading difference: found {degrees}, expected"):
+        read_msls(write_msls(tmp_path), max_heading_difference=degrees)
+
+
+SIDE = {"database": [Image("a", 1.5, 2.5, 30), Image("b", 1, 2, 3)], "query": [Image("q", 1, 2, 3)]}
+
+
+@pytest.mark.parametrize(
+    ("table", "old", "new", "message"),
+    [
+        ("raw.csv", "pano", "panorama", r"raw.csv: found columns .*; missing pano"),
+        ("raw.csv", "False", "maybe", r"raw.csv: row 1: pano: found 'maybe', expected True or Fal"),
+        ("raw.csv", ",30,", ",north,", r"raw.csv: row 1: ca: found 'north', expected a number"),
+        ("postprocessed.csv", "1.5", "", r"postprocessed.csv: row 1: easting: found ''"),
+        ("postprocessed.csv", "2.5", "inf", r"postprocessed.csv: row 1: northing: found 'inf'"),
+        ("postprocessed.csv", "1,b", "1,c", r"postprocessed.csv: found 2 rows, .*the same 2 imag"),
+        ("subtask_index.csv", "1,b,True", "1,b,", r"subtask_index.csv: row 2: all: found ''"),
+        ("subtask_index.csv", "all", "any", r"subtask_index.csv: found columns .*; missing all"),
+    ],
+)
+def test_bad_tables(tmp_path, table, old, new, message):
+    root = write_msls(tmp_path, {"cph": SIDE})
+    edit(root / "train_val" / "cph" / "database" / table, old, new)
+    with pytest.raises(InputError, match=message) as caught:
+        read_msls_subtask(root, max_heading_difference=40)
+    assert "\n" not in str(caught.value)
+
+
+def test_tables_of_other_lengths_and_missing_files(tmp_path):
+    root = write_msls(tmp_path, {"cph": SIDE})
+    folder = root / "train_val" / "cph" / "database"
+    (folder / "images" / "b.jpg").unlink()
+    with pytest.raises(InputError, match=r"raw.csv: found 1 of 2 images missing.*b.jpg"):
+        read_msls(root)
+    table = folder / "postprocessed.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
+    with pytest.raises(InputError, match=r"postprocessed.csv: found 1 rows, expected the same 2"):
+        read_msls(root)
+    table.unlink()
+    with pytest.raises(InputError, match=r"postprocessed.csv: cannot be read"):
+        read_msls(root)
+
+
+def test_a_subtask_without_keys_goes_by_its_rows(tmp_path):
+    root = write_msls(tmp_path, {"cph": SIDE})
+    table = root / "train_val" / "cph" / "database" / "subtask_index.csv"
+    table.write_text(",all\n0,False\n1,True\n")
+    assert keys(read_msls_subtask(root).database) == ["b"]
+
+
+def test_panoramas_alone_are_nothing(tmp_path):
+    side = SIDE | {"query": [Image("q", 1, 2, 3, pano=True)]}
+    with pytest.raises(InputError, match="query: found 1 images, expected some that are no pano"):
+        read_msls(write_msls(tmp_path, {"cph": side}))
+
+
+def test_a_subtask_without_matches_is_nothing(tmp_path):
+    side = SIDE | {"query": [Image("q", 100, 2, 3)]}
+    root = write_msls(tmp_path, {"cph": side})
+    assert lists_of(read_msls(root).positives) == [[]]
+    with pytest.raises(InputError, match="found no query within 25 m of the database"):
+        read_msls_subtask(root)

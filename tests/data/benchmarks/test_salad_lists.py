@@ -1,0 +1,187 @@
+"""The .npy lists of GSV-Cities and SALAD."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crisalad_jax.data.benchmarks import read_salad_lists
+from crisalad_jax.errors import InputError
+from tests.data.benchmarks.trees import every_tenth, lists_of, ragged, touch
+
+DATABASE = [f"00{i}/{i:06d}_pitch1_yaw1.jpg" for i in range(5)]
+QUERIES = [f"00{i}/{i:06d}_pitch1_yaw2.jpg" for i in range(3)]
+TRUTH = ragged(np.array([4, 1]), np.array([0]), np.array([2, 3, 1]))
+POSITIVES = [[1, 4], [0], [1, 2, 3]]
+
+
+def write_lists(folder: Path, prefix: str, **arrays: object) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, array in arrays.items():
+        np.save(folder / f"{prefix}{kind}.npy", np.asarray(array), allow_pickle=True)
+    return folder
+
+
+def write_images(root: Path, names: list[str]) -> Path:
+    for name in names:
+        touch(root / name)
+    return root
+
+
+@pytest.mark.parametrize("queries_in", ["", "queries_real/"])
+@pytest.mark.parametrize("named_in", ["", "queries_real/"])
+def test_pittsburgh(tmp_path, queries_in, named_in):
+    """Queries in their own folder, which the list may name or leave out."""
+    names = [named_in + name for name in QUERIES]
+    lists = write_lists(
+        tmp_path / "lists", "pitts30k_test_", dbImages=DATABASE, qImages=names, gt=TRUTH
+    )
+    stored = [queries_in + name for name in QUERIES]
+    images = write_images(tmp_path / "photos", DATABASE + stored)
+    if named_in and not queries_in:
+        with pytest.raises(InputError, match=r"qImages.npy: found no image queries_real/"):
+            read_salad_lists(lists, images=images)
+        return
+    benchmark = read_salad_lists(lists, images=images)
+    assert benchmark.name == "pitts30k_test (SALAD's lists)"
+    assert benchmark.rule == "the database images that pitts30k_test_gt.npy lists"
+    assert [path.relative_to(images).as_posix() for path in benchmark.database] == DATABASE
+    assert [path.relative_to(images).as_posix() for path in benchmark.queries] == stored
+    assert lists_of(benchmark.positives) == POSITIVES
+    assert benchmark.database_positions is None
+
+
+def test_queries_with_the_names_of_database_images_are_not_taken_for_these(tmp_path):
+    write_images(tmp_path, DATABASE + [f"queries_real/{name}" for name in DATABASE[:3]])
+    write_lists(tmp_path, "a_", dbImages=DATABASE, qImages=DATABASE[:3], gt=TRUTH)
+    expected = tuple(tmp_path / "queries_real" / name for name in DATABASE[:3])
+    assert read_salad_lists(tmp_path).queries == expected
+
+
+def msls_names(part: str, count: int) -> list[str]:
+    return [
+        f"train_val/{'cph' if i < count // 2 else 'sf'}/{part}/images/{part[0]}{i}.jpg"
+        for i in range(count)
+    ]
+
+
+def test_msls_asks_the_queries_of_its_index(tmp_path):
+    images = write_images(tmp_path, msls_names("database", 6) + msls_names("query", 8))
+    lists = write_lists(
+        tmp_path / "msls_val",
+        "msls_val_",
+        dbImages=msls_names("database", 6),
+        qImages=msls_names("query", 8),
+        qIdx=np.array([6, 0, 3]),
+        pIdx=ragged(np.array([5, 4]), np.array([0]), np.array([2, 1])),
+    )
+    for given in ({}, {"images": images}):
+        benchmark = read_salad_lists(lists, **given)
+        assert benchmark.name == "MSLS val, 3 queries (SALAD's list)"
+        assert [path.name for path in benchmark.queries] == ["q6.jpg", "q0.jpg", "q3.jpg"]
+        assert lists_of(benchmark.positives) == [[4, 5], [0], [1, 2]]
+        assert all(path.is_file() for path in (*benchmark.database, *benchmark.queries))
+
+
+def test_msls_of_one_city_is_called_so(tmp_path):
+    names = [f"train_val/cph/{part}/images/a.jpg" for part in ("database", "query")]
+    write_images(tmp_path, names)
+    write_lists(tmp_path, "", dbImages=names[:1], qImages=names[1:], gt=ragged([0]))
+    assert read_salad_lists(tmp_path).name == "MSLS of cph, 1 queries (SALAD's list)"
+
+
+def test_without_a_prefix_the_folder_gives_the_name(tmp_path):
+    write_images(tmp_path / "hall", DATABASE + QUERIES)
+    lists = write_lists(tmp_path / "hall", "", dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
+    assert read_salad_lists(lists).name == "hall (SALAD's lists)"
+    assert lists_of(read_salad_lists(lists / "gt.npy").positives) == POSITIVES
+
+
+def test_ground_truths_of_one_match_each_are_plain_arrays(tmp_path):
+    """What numpy makes of lists of the same length."""
+    write_images(tmp_path, DATABASE + QUERIES)
+    for truth in (np.array([[4], [0], [-1]]), np.array([4, 0, -1])):
+        write_lists(tmp_path, "SPED_", dbImages=DATABASE, qImages=QUERIES, gt=truth)
+        assert lists_of(read_salad_lists(tmp_path).positives) == [[4], [0], []]
+
+
+def test_without_ground_truth_there_is_none(tmp_path):
+    write_images(tmp_path, DATABASE + QUERIES)
+    write_lists(tmp_path, "msls_test_", dbImages=DATABASE, qImages=QUERIES)
+    benchmark = read_salad_lists(tmp_path)
+    assert benchmark.positives is None
+    assert "no ground truth" in benchmark.rule
+    with pytest.raises(InputError, match="no ground truth, nothing to score; see `crisalad query`"):
+        benchmark.ground_truth()
+
+
+def test_nordland_star(tmp_path):
+    database = [f"ref/{i:07d}.jpg" for i in range(42)]
+    queries = [f"query/{i:07d}.jpg" for i in range(5)]
+    write_images(tmp_path, database + queries)
+    truth = ragged(*(np.array(found) for found in every_tenth(5, 42)))
+    write_lists(tmp_path, "Nordland_", dbImages=database, qImages=queries, gt=truth)
+    benchmark = read_salad_lists(tmp_path)
+    assert benchmark.name == "Nordland*, winter database, summer queries (SALAD's lists)"
+    assert lists_of(benchmark.positives) == every_tenth(5, 42)
+
+
+def test_a_folder_of_several_sets(tmp_path):
+    write_images(tmp_path, DATABASE + QUERIES)
+    for prefix in ("pitts30k_val_", "pitts30k_test_"):
+        write_lists(tmp_path, prefix, dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
+    # As in SALAD's repository, queries alone.
+    write_lists(tmp_path, "pitts250k_test_", qImages=QUERIES)
+    with pytest.raises(InputError, match="found lists of pitts30k_test, pitts30k_val, expected"):
+        read_salad_lists(tmp_path)
+    assert read_salad_lists(tmp_path, "val").name == "pitts30k_val (SALAD's lists)"
+    chosen = read_salad_lists(tmp_path / "pitts30k_test_dbImages.npy")
+    assert chosen.name == "pitts30k_test (SALAD's lists)"
+    with pytest.raises(InputError, match="and split 'train', expected those of one"):
+        read_salad_lists(tmp_path, "train")
+    with pytest.raises(InputError, match="found lists of no set, expected"):
+        read_salad_lists(tmp_path / "pitts250k_test_qImages.npy")
+
+
+class Payload:
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.target),)
+
+
+def test_no_code_is_run(tmp_path):
+    write_images(tmp_path, DATABASE + QUERIES)
+    truth = ragged([0], Payload(tmp_path / "ran"), [1])
+    write_lists(tmp_path, "a_", dbImages=DATABASE, qImages=QUERIES, gt=truth)
+    with pytest.raises(InputError, match=r"a_gt.npy: cannot be read as .* asks for"):
+        read_salad_lists(tmp_path)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gt": ragged([0], [1])}, r"a_gt.npy: found shape \(2,\), expected a row for each of 3"),
+        ({"gt": ragged([0], [5], [1])}, "a_gt.npy: row 1: found reference indices 5 to 5"),
+        ({"gt": ragged([0], ["x"], [1])}, "a_gt.npy: row 1: found values of type str"),
+        ({"gt": np.zeros(3)}, "a_gt.npy: row 0: found values of type float64"),
+        ({"qIdx": np.array([0, 3, 1])}, "a_qIdx.npy: found 3 indices, expected some from 0 to 2"),
+        ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found 3 indices, .*each once"),
+        ({"qIdx": np.array([], int)}, "a_qIdx.npy: found 0 indices"),
+        ({"qIdx": np.array([0.0])}, "a_qIdx.npy: found values of type float64, expected indices"),
+        ({"pIdx": TRUTH}, "a_gt.npy, a_pIdx.npy, .*expected a_qImages.npy, and one of"),
+        ({"dbImages": np.arange(5)}, "a_dbImages.npy: found an array of .*, expected names"),
+        ({"dbImages": np.empty(0, "<U3")}, "a_dbImages.npy: (found|cannot)"),
+        ({"qImages": [*QUERIES[:2], "000/none.jpg"]}, "found 1 of 3 images missing.*none.jpg"),
+    ],
+)
+def test_bad_lists(tmp_path, changes, message):
+    write_images(tmp_path, DATABASE + QUERIES)
+    arrays = {"dbImages": DATABASE, "qImages": QUERIES, "gt": TRUTH} | changes
+    write_lists(tmp_path, "a_", **arrays)
+    with pytest.raises(InputError, match=message) as caught:
+        read_salad_lists(tmp_path)
+    assert "\n" not in str(caught.value)
