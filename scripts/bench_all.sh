@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # Sets up what is missing, then times descriptors and training beside torch, a folder of photographs
 # from end to end, the start of a program, and bfloat16 beside float32, and says where our time goes;
-# then what training at the paper's size takes. Writes the tables and pictures of docs/performance.md
-# and docs/training.md. For figures that mean something, on a machine with nothing else to do. Flags
-# go to the first two, such as
+# then what training at the paper's size takes, and search. Writes the tables and pictures of
+# docs/performance.md, docs/training.md and docs/search.md. For figures that mean something, on a
+# machine with nothing else to do. Flags go to the first two, such as
 #     --presets b14 --batches 256 --dtype bfloat16
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -20,3 +20,5 @@ python scripts/bench_index.py "${page[@]}"
 python scripts/bench_loader.py "${page[@]}"
 python scripts/bench_overlap.py "${page[@]}"
 python scripts/bench_memory.py "${page[@]}" --take
+# A million descriptors take 34 GB of the folder for temporary files.
+python scripts/bench_search.py --page docs/search.md

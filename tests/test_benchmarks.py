@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import itertools
+import json
 import pathlib
 import sys
 from types import ModuleType
@@ -16,6 +17,7 @@ from crisalad_jax.config import RandAugmentConfig, recipe
 from crisalad_jax.costs import part_costs
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
+from crisalad_jax.descriptors import open_npy
 from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN
 
 
@@ -179,6 +181,47 @@ def test_both_loaders_give_the_same_images(
         np.testing.assert_allclose(pixels.transpose(1, 2, 0), image, atol=3)
 
 
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_descriptors_are_written_as_numpy_reads_them(
+    scripts: Any, tmp_path: pathlib.Path, dtype: str
+) -> None:
+    path = tmp_path / "rows.npy"
+    scripts("bench_search").write_descriptors(path, 70_000, 256, dtype)  # in two parts
+    rows = open_npy(path)
+    assert (rows.shape, rows.dtype) == ((70_000, 256), np.dtype(dtype))
+    lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
+    # bfloat16 rounds each number by up to 2^-9 of itself.
+    np.testing.assert_allclose(lengths, 1, atol=2e-3 if dtype == "bfloat16" else 1e-6)
+    assert len(np.unique(rows[:, 0].astype(np.float32))) > 500
+
+
+@pytest.mark.slow
+def test_the_search_is_measured(
+    scripts: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All three studies at a small size: what is found, not how fast."""
+    flags = (
+        f"bench_search --out {tmp_path} --rows 2000 --lengths 32 --queries 20 --rounds 1 "
+        f"--memory-rows 1000 4000 --memory-length 64 --folder {tmp_path} "
+        "--approximate-rows 10000 --approximate-length 16"
+    )
+    monkeypatch.setattr(sys, "argv", flags.split())
+    scripts("bench_search").main()
+    assert not list(tmp_path.glob("search-*"))  # the databases are gone
+    speed, memory, approximate = (
+        json.loads((tmp_path / f"{name}.json").read_text())
+        for name in ("bench_search", "search_memory", "search_approximate")
+    )
+    # Two distances that FAISS rounds to one may stand the other way round.
+    assert all(value["alike"] > 0.99 for value in speed)
+    assert [value["rows"] for value in memory] == [1000, 4000]
+    assert all(value["memory"] > 2e7 for value in memory)  # an interpreter, at least
+    recalls = {value["contender"]: value["recall"] for value in approximate}
+    assert recalls["exact"] == 1
+    assert recalls["hnsw, default"] > 0.95
+    assert recalls["ivf-pq, default"] > 0.5
+
+
 @pytest.mark.parametrize(
     ("name", "flags", "words"),
     [
@@ -195,6 +238,9 @@ def test_both_loaders_give_the_same_images(
         ("bench_loader", "--batch 6", "found 960 images in batches of 6, expected a multiple of"),
         ("bench_memory", "--images 190", "found 190 images, expected a multiple of 4"),
         ("bench_overlap", "--steps 4", "found 4 steps of 48 images, expected more than 4 steps"),
+        ("bench_search", "--dtype int8", "argument --dtype: invalid choice: 'int8'"),
+        ("bench_search", "nothing", "found nothing, expected of bench_search, search_memory"),
+        ("bench_search", "--memory-rows 9000000000", "GB free, expected 304128.0 GB"),
         ("bench_sinkhorn", "--calls -1", "argument --calls: found '-1'"),
     ],
 )

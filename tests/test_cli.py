@@ -684,6 +684,7 @@ def test_extract_writes_descriptors_names_and_configuration(capfd, tmp_path, sha
         "grouping": "single",
         "batch_size": BATCH,
         "seed": 0,
+        "pca": None,
         "skipped": [],
         "model": to_plain(MODEL),
     }

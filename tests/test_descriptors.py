@@ -3,10 +3,11 @@
 import pathlib
 
 import h5py
+import ml_dtypes
 import numpy as np
 import pytest
 
-from crisalad_jax.descriptors import read_descriptors, writer_for
+from crisalad_jax.descriptors import open_npy, read_descriptors, writer_for
 from crisalad_jax.errors import InputError
 
 NAMES = ["a.jpg", "summer/a.jpg", "summer/noon/with space.jpg", "Straße.jpg"]
@@ -139,3 +140,29 @@ def test_an_npy_without_its_names_is_one_line(tmp_path, names, array, words):
         path.with_suffix(".names.txt").write_text("\n".join(names))
     with pytest.raises(InputError, match=words):
         read_descriptors(path)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16, np.float64, ml_dtypes.bfloat16])
+def test_a_npy_file_is_mapped_with_its_type(tmp_path, kind):
+    path = tmp_path / "map.npy"
+    np.save(path, DESCRIPTORS.astype(kind))
+    found = open_npy(path)
+    assert isinstance(found, np.memmap)
+    assert found.dtype == kind
+    np.testing.assert_array_equal(found, DESCRIPTORS.astype(kind))
+
+
+def test_files_that_are_no_descriptors_are_named(tmp_path):
+    path = tmp_path / "map.npy"
+    with path.open("wb") as file:
+        np.savez(file, DESCRIPTORS)
+    with pytest.raises(InputError, match=r"map\.npy: found an archive, expected an array of float"):
+        open_npy(path)
+    for array, words in (
+        (DESCRIPTORS[0], r"map\.npy: found shape \(6,\), expected \(images, descriptor\)"),
+        (DESCRIPTORS[:0], r"map\.npy: found shape \(0, 6\), expected"),
+        (np.array(["a"]), r"map\.npy: found <U1, expected an array of floating-point numbers"),
+    ):
+        np.save(path, array)
+        with pytest.raises(InputError, match=words):
+            open_npy(path)

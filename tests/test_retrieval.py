@@ -190,6 +190,17 @@ def test_random_descriptors_with_copies_are_found_as_faiss_does():
     np.testing.assert_array_equal(found.indices, indices)
 
 
+def test_rows_that_float32_products_cannot_tell_apart_are_ranked_exactly():
+    """Their products differ by less than a float32 product errs: a device names the wrong ones."""
+    generator = np.random.default_rng(3)
+    queries = _random_unit(17, 5, 4000)
+    noise = 1e-7 * generator.standard_normal((900, 4000))
+    database = (queries[0] + noise).astype(np.float32)
+    wanted = (queries.astype(np.float64) @ database.astype(np.float64).T).astype(np.float32)
+    found = retrieval.search(database, queries, 20, chunk=450)
+    np.testing.assert_array_equal(found.indices, np.argsort(-wanted, axis=1, kind="stable")[:, :20])
+
+
 def test_all_rows_alike_are_ranked_by_index():
     """As from a network that has collapsed: every row of every chunk may be among the best."""
     database = _unit(np.ones((500, 33)) + 1e-9).astype(np.float32)

@@ -1,0 +1,78 @@
+"""`crisalad pca`, and `extract --pca`."""
+
+import json
+
+import ml_dtypes
+import numpy as np
+import pytest
+
+from crisalad_jax.pca import PcaConfig, fit_pca, load_pca, save_pca
+from tests.test_cli import extract, fails, succeeds
+
+DESCRIPTORS = np.random.default_rng(0).standard_normal((60, 48)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16, ml_dtypes.bfloat16])
+def test_what_is_fitted_is_written(capfd, tmp_path, kind):
+    rows = DESCRIPTORS.astype(kind)
+    np.save(tmp_path / "d.npy", rows)
+    path = tmp_path / "new" / "pca.safetensors"
+    out = succeeds(
+        capfd,
+        *("pca", "--descriptors", tmp_path / "d.npy", "--dim", 7, "--out", path, "--whiten"),
+        *("--no-renormalise", "--samples", 50, "--seed", 4, "--quiet"),
+    )
+    expected = fit_pca(rows, 7, PcaConfig(whiten=True, renormalise=False), samples=50, seed=4)
+    found = load_pca(path)
+    assert found.config == expected.config
+    for a, b in zip(found[:4], expected[:4], strict=True):
+        np.testing.assert_array_equal(a, b)
+    share = f"{100 * expected.kept:.1f} %"
+    assert out == f"{path}: 7 of 48 components, {share} of the variance of 50 descriptors"
+
+
+def test_extract_writes_shorter_descriptors(capfd, tmp_path, shared):
+    town, components = shared / "town", tmp_path / "pca.safetensors"
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
+    whole = np.load(tmp_path / "d.npy")
+    fitted = fit_pca(whole, 5)
+    save_pca(components, fitted)
+    out = succeeds(capfd, *extract(shared, town, tmp_path / "s.npy", "--pca", components))
+    assert "12 descriptors of 5 numbers" in out
+    np.testing.assert_array_equal(np.load(tmp_path / "s.npy"), fitted.apply(whole))
+    config = json.loads((tmp_path / "s.config.json").read_text())
+    assert config["pca"] == str(components)
+
+
+def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
+    save_pca(tmp_path / "long.safetensors", fit_pca(np.pad(DESCRIPTORS, ((0, 0), (0, 2))), 5))
+    weights = shared / "weights.safetensors"
+    for components, words in (
+        (tmp_path / "none", (f"{tmp_path / 'none'}: found no such file",)),
+        (weights, (f"{weights}: found arrays", "as `crisalad pca` writes it")),
+        (tmp_path / "long.safetensors", (f"{weights}: found descriptors of length 48", "50")),
+    ):
+        start = extract(shared, shared / "no-folder", tmp_path / "d.npy", "--pca", components)
+        fails(capfd, *start, words=words)
+
+    np.save(tmp_path / "d.npy", DESCRIPTORS)
+    np.save(tmp_path / "i.npy", DESCRIPTORS.astype(np.int8))
+    np.save(tmp_path / "o.npy", np.array([None]), allow_pickle=True)
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "d.npy").read_bytes()[:500])
+    (tmp_path / "t.npy").write_text("nothing")
+    for name, more, words in (
+        ("d.npy", ("--dim", 49), ("dim: found 49, expected 1 to 48",)),
+        ("d.npy", ("--out", "pca.npy"), ("pca.npy: found the suffix '.npy', expected .safe",)),
+        ("none.npy", (), ("none.npy: found no such file, expected a .npy file",)),
+        ("i.npy", (), ("i.npy: found int8, expected an array of floating-point numbers",)),
+        ("o.npy", (), ("o.npy: not a whole .npy file",)),
+        ("cut.npy", (), ("cut.npy: not a whole .npy file",)),
+        ("t.npy", (), ("t.npy: not a whole .npy file",)),
+    ):
+        fails(
+            capfd,
+            *("pca", "--descriptors", tmp_path / name, "--out", tmp_path / "p.safetensors"),
+            *("--dim", 5, *more),
+            words=words,
+        )
+    assert not (tmp_path / "p.safetensors").exists()
