@@ -4,7 +4,7 @@ import functools
 import pathlib
 import statistics
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from crisalad_jax import platform
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
+from crisalad_jax.errors import InputError
 from crisalad_jax.groupings import (
     DEFAULT_GROUPINGS,
     Batches,
@@ -25,6 +26,7 @@ from crisalad_jax.groupings import (
 )
 from crisalad_jax.model import Crisalad, relate, tokenise
 from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.pca import Pca
 from crisalad_jax.platform import devices_for
 from crisalad_jax.progress import progress_bar
 from crisalad_jax.results import ANY, GroupingResult, summarise
@@ -180,6 +182,7 @@ def evaluate(
     batch_size: int = 16,
     seed: int = 0,
     seeds: int = 3,
+    pca: Pca | None = None,
     cache: ImageCache | None = None,
     observe: Observe | None = None,
     quiet: bool = False,
@@ -200,16 +203,24 @@ def evaluate(
         batch_size: images that look at each other.
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
+        pca: shortens the descriptors, fitted to images of other places.
         cache: of decoded images.
         observe: is given the descriptors of each grouping, of its first seed, while they are there.
         quiet: no progress bars.
 
     Raises:
-        InputError: no ground truth, an image cannot be read, or what `parse_groupings` and
-            `check_grouping` raise.
+        InputError: no ground truth, an image cannot be read, components that are not for this model
+            or make no unit vectors, or what `parse_groupings` and `check_grouping` raise.
     """
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
+    if pca is not None:
+        pca.check(config.descriptor_dim, "model")
+        if not pca.config.renormalise:
+            raise InputError(
+                "pca: found components that leave lengths as they are, expected some that make unit "
+                "vectors, which are ranked by cosine"
+            )
     positives = benchmark.ground_truth()
 
     def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
@@ -221,7 +232,11 @@ def evaluate(
     same_queries, same_database = _same_place(benchmark, positives)
     database = side("database", benchmark.database, same_database, 0)
     queries = side("queries", benchmark.queries, same_queries, 1)
-    describe = functools.partial(group, params, config, batch_size=batch_size, quiet=quiet)
+
+    def describe(*side: Any, **options: Any) -> Float[np.ndarray, "image descriptor"]:
+        full = group(params, config, *side, batch_size=batch_size, quiet=quiet, **options)
+        return full if pca is None else pca.apply(full)
+
     results = []
     for grouping in parsed if params.encoder else [Grouping("single", "single")]:
         is_random = "shuffled" in (grouping.queries, grouping.database)

@@ -12,6 +12,7 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.evaluation import evaluate, same_place_rule
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
+from crisalad_jax.pca import load_pca
 from crisalad_jax.results import GroupingResult, grouping_table, to_json
 from crisalad_jax.serial import to_plain
 from crisalad_jax.similarity import similarity_map
@@ -25,10 +26,7 @@ _RECALLS = (
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Print Recall@1/5/10/20 of a model on an evaluation set, under each grouping of the images.
-
-    With 95 % intervals, recall at 100 % precision, and what each grouping gives away.
-    """
+    """Print what a model recalls of an evaluation set under each grouping, and what these leak."""
 
     data: pathlib.Path
     """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
@@ -58,6 +56,8 @@ class Evaluate:
     (the paper: 40)."""
     frames: int | None = None
     """How many frames a positive may be away, for two plain folders of the same moments."""
+    pca: pathlib.Path | None = None
+    """Components that `crisalad pca` fitted, for shorter descriptors."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -93,6 +93,7 @@ def run(arguments: Evaluate) -> None:
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
+    pca = None if arguments.pca is None else load_pca(arguments.pca)
     benchmark = open_benchmark(
         arguments.data,
         arguments.split,
@@ -116,6 +117,7 @@ def run(arguments: Evaluate) -> None:
         batch_size=arguments.batch_size,
         seed=arguments.seed,
         seeds=arguments.seeds,
+        pca=pca,
         observe=None if arguments.report is None else seen,
         quiet=arguments.quiet,
     )
@@ -136,6 +138,7 @@ def run(arguments: Evaluate) -> None:
         "batch_size": arguments.batch_size,
         "seed": arguments.seed,
         "seeds": arguments.seeds,
+        "pca": None if arguments.pca is None else str(arguments.pca),
         "model": to_plain(config),
     }
     if arguments.json is not None:

@@ -44,6 +44,28 @@ def test_extract_writes_shorter_descriptors(capfd, tmp_path, shared):
     assert config["pca"] == str(components)
 
 
+def test_evaluate_ranks_shorter_descriptors(capfd, tmp_path, shared, benchmark):
+    town, weights = shared / "town", shared / "weights.safetensors"
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
+    whole, names = np.load(tmp_path / "d.npy"), (tmp_path / "d.names.txt").read_text().split()
+    fitted, components = fit_pca(whole, 3), tmp_path / "pca.safetensors"
+    save_pca(components, fitted)
+    start = ("evaluate", "--data", town, "--weights", weights, "--grouping", "single", "--quiet")
+    succeeds(capfd, *start, "--pca", components, "--json", tmp_path / "found.json")
+    (result,) = json.loads((tmp_path / "found.json").read_text())["results"]
+    rows = dict(zip(names, fitted.apply(whole), strict=True))
+    database, queries = (
+        np.stack([rows[path.relative_to(town).as_posix()] for path in paths])
+        for paths in (benchmark.database, benchmark.queries)
+    )
+    best = (queries @ database.T).argmax(axis=1)
+    right = [index in wanted for index, wanted in zip(best, benchmark.positives, strict=True)]
+    assert result["recalls"]["R@1"] == np.mean(right)
+
+    save_pca(components, fit_pca(whole, 3, PcaConfig(renormalise=False)))
+    fails(capfd, *start, "--pca", components, words=("pca: found components that leave lengths",))
+
+
 def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
     save_pca(tmp_path / "long.safetensors", fit_pca(np.pad(DESCRIPTORS, ((0, 0), (0, 2))), 5))
     weights = shared / "weights.safetensors"
