@@ -218,8 +218,8 @@ def evaluate(
         pca.check(config.descriptor_dim, "model")
         if not pca.config.renormalise:
             raise InputError(
-                "pca: found components that leave lengths as they are, expected some that make unit "
-                "vectors, which are ranked by cosine"
+                "pca: found components that leave lengths as they are, expected some that make "
+                "unit vectors, which are ranked by cosine"
             )
     positives = benchmark.ground_truth()
 
