@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 import json
 import os
 import pathlib
@@ -150,3 +151,23 @@ def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path)
         raise InputError(f"{path}: weights do not fit: {'; '.join(sorted(problems))}")
     leaves = [jnp.asarray(found[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+def model_hash(params: Crisalad, config: ModelConfig) -> str:
+    """A digest of everything that descriptors are a function of, besides image size and rounding.
+
+    Of parameters by name, type, shape and value, and of the configuration without the image size,
+    the type that is computed in, what is kept for the gradient, and dropout: the same for a file of
+    weights and for its copy in another layout.
+    """
+    plain = to_plain(config)
+    for part, field in (("", "image_size"), ("", "compute_dtype"), ("", "keeps")):
+        (plain[part] if part else plain).pop(field)
+    for part in ("salad", "encoder"):
+        plain[part].pop("dropout")
+    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name, leaf in sorted(named_leaves(params).items()):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()

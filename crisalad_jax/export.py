@@ -6,19 +6,17 @@ comes out, and `weights.safetensors` lies beside them unless the weights are in 
 
 import dataclasses
 import hashlib
-import json
 import os
 import pathlib
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import export
 from jaxtyping import Array, Float, UInt8
 
 from crisalad_jax import platform
-from crisalad_jax.checkpoint import save_weights
+from crisalad_jax.checkpoint import model_hash, save_weights
 from crisalad_jax.config import ModelConfig, choose
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import atomic_folder, check_new_folder, write_json
@@ -168,7 +166,7 @@ def _manifest(
         "platforms": list(exported.platforms),
         "calling_convention_version": exported.calling_convention_version,
         "jax_version": jax.__version__,
-        "model_sha256": model_sha256(params, config),
+        "model_sha256": model_hash(params, config),
         "model": to_plain(config),
     }
 
@@ -181,13 +179,3 @@ def _file(path: pathlib.Path) -> dict[str, Any]:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}
-
-
-def model_sha256(params: Crisalad, config: ModelConfig) -> str:
-    """A model's identity, whatever file it is in: of its configuration and all its parameters."""
-    digest = hashlib.sha256(json.dumps(to_plain(config), sort_keys=True).encode())
-    for name, leaf in sorted(named_leaves(params).items()):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"\0{name}\0{array.dtype.str}\0{array.shape}\0".encode())
-        digest.update(array.data)
-    return digest.hexdigest()

@@ -2,21 +2,18 @@
 
 import dataclasses
 import datetime
-import hashlib
 import json
 import os
 import pathlib
 import uuid
 from typing import Any
 
-import numpy as np
-
+from crisalad_jax.checkpoint import model_hash
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import durable_path
 from crisalad_jax.model import Crisalad
-from crisalad_jax.pytree import named_leaves
-from crisalad_jax.serial import from_plain, to_plain
+from crisalad_jax.serial import from_plain
 from crisalad_jax.stores import store_name
 
 FORMAT = 1
@@ -46,26 +43,6 @@ class MapDescription:
     """What Milvus keeps the descriptors under."""
     created: str = ""
     format: int = FORMAT
-
-
-def model_hash(params: Crisalad, config: ModelConfig) -> str:
-    """A digest of everything that descriptors are a function of, besides image size and rounding.
-
-    Of parameters by name, type, shape and value, and of the configuration without the image size,
-    the type that is computed in, what is kept for the gradient, and dropout: the same for a file of
-    weights and for its copy in another layout.
-    """
-    plain = to_plain(config)
-    for part, field in (("", "image_size"), ("", "compute_dtype"), ("", "keeps")):
-        (plain[part] if part else plain).pop(field)
-    for part in ("salad", "encoder"):
-        plain[part].pop("dropout")
-    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
-    for name, leaf in sorted(named_leaves(params).items()):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{name} {array.dtype} {array.shape}".encode())
-        digest.update(array.data)
-    return digest.hexdigest()
 
 
 def describe_map(

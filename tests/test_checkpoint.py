@@ -6,12 +6,13 @@ import os
 import pathlib
 import struct
 
+import jax
 import numpy as np
 import pytest
 import safetensors.numpy
 
 import crisalad_jax
-from crisalad_jax.checkpoint import load_weights, save_weights
+from crisalad_jax.checkpoint import load_weights, model_hash, save_weights
 from crisalad_jax.config import PRESETS
 from crisalad_jax.errors import InputError
 from crisalad_jax.pytree import named_leaves
@@ -152,3 +153,24 @@ def test_no_file_or_another_one_is_refused(tmp_path):
     (tmp_path / "w.safetensors").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
     with pytest.raises(InputError, match=r"w\.safetensors: not a whole safetensors file"):
         load_weights(tmp_path / "w.safetensors")
+
+
+def test_the_hash_is_of_what_descriptors_are_a_function_of(shared):
+    params, config = load_weights(shared / "weights.safetensors")
+    found = model_hash(params, config)
+    assert len(found) == 64
+    assert model_hash(random_params(MODEL), MODEL) == found
+    free = dataclasses.replace(
+        config, image_size=(56, 56), compute_dtype="bfloat16", keeps="blocks"
+    )
+    free = dataclasses.replace(free, salad=dataclasses.replace(free.salad, dropout=0.0))
+    assert model_hash(params, free) == found
+    leaves, structure = jax.tree.flatten(params)
+    for number in (0, len(leaves) // 2, len(leaves) - 1):
+        changed = np.array(leaves[number])
+        changed.flat[-1] = np.nextafter(changed.flat[-1], 2)
+        others = jax.tree.unflatten(structure, [*leaves[:number], changed, *leaves[number + 1 :]])
+        assert model_hash(others, config) != found
+    sinkhorn = dataclasses.replace(config.salad.sinkhorn, iterations=4)
+    salad = dataclasses.replace(config.salad, sinkhorn=sinkhorn)
+    assert model_hash(params, dataclasses.replace(config, salad=salad)) != found

@@ -7,16 +7,14 @@ import pathlib
 import subprocess
 import sys
 
-import jax
 import numpy as np
 import pymilvus
 import pytest
 
-from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import write_json
-from crisalad_jax.map_description import check_model, describe_map, model_hash, read_description
+from crisalad_jax.map_description import check_model, describe_map, read_description
 from crisalad_jax.maps import open_for_appending, open_map
 from crisalad_jax.serial import to_plain
 from tests import killed_appends
@@ -131,27 +129,6 @@ def test_verify_names_the_descriptors_that_changed(folder):
 
 
 # The model
-
-
-def test_the_hash_is_of_what_descriptors_are_a_function_of(shared):
-    params, config = load_weights(shared / "weights.safetensors")
-    found = model_hash(params, config)
-    assert len(found) == 64
-    assert model_hash(random_params(MODEL), MODEL) == found
-    free = dataclasses.replace(
-        config, image_size=(56, 56), compute_dtype="bfloat16", keeps="blocks"
-    )
-    free = dataclasses.replace(free, salad=dataclasses.replace(free.salad, dropout=0.0))
-    assert model_hash(params, free) == found
-    leaves, structure = jax.tree.flatten(params)
-    for number in (0, len(leaves) // 2, len(leaves) - 1):
-        changed = np.array(leaves[number])
-        changed.flat[-1] = np.nextafter(changed.flat[-1], 2)
-        others = jax.tree.unflatten(structure, [*leaves[:number], changed, *leaves[number + 1 :]])
-        assert model_hash(others, config) != found
-    sinkhorn = dataclasses.replace(config.salad.sinkhorn, iterations=4)
-    salad = dataclasses.replace(config.salad, sinkhorn=sinkhorn)
-    assert model_hash(params, dataclasses.replace(config, salad=salad)) != found
 
 
 def test_a_description_is_read_as_it_was_written(tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from crisalad_jax.checkpoint import model_hash
 from crisalad_jax.cli.common import console, model_of
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.images import list_images
@@ -15,7 +16,6 @@ from crisalad_jax.map_description import (
     MapDescription,
     check_model,
     describe_map,
-    model_hash,
     read_description,
 )
 from crisalad_jax.maps import open_for_appending

@@ -13,14 +13,14 @@ import rich.table
 import rich.text
 import tyro
 
-from crisalad_jax.checkpoint import load_weights
+from crisalad_jax.checkpoint import load_weights, model_hash
 from crisalad_jax.cli.common import console
 from crisalad_jax.data.images import list_images
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import atomic_path, check_target
 from crisalad_jax.groupings import check_grouping
 from crisalad_jax.indexing import describe_alone
-from crisalad_jax.map_description import check_model, model_hash, read_description
+from crisalad_jax.map_description import check_model, read_description
 from crisalad_jax.maps import Map, open_map
 from crisalad_jax.model import Crisalad
 from crisalad_jax.progress import progress_bar
