@@ -142,6 +142,8 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
     """
     path = pathlib.Path(path)
     check_target(path / "any")
+    if path.is_dir() and path.samefile(os.curdir):
+        raise InputError(f"{path}: found the folder that this runs in, expected another")
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
 

@@ -281,6 +281,7 @@ def test_a_fault_of_bfloat16_shows_beside_float64_alone(
 RUN = parity.cases.run
 
 
+@pytest.mark.slow
 def test_a_frozen_parameter_that_moves_misses(monkeypatch: Patch) -> None:
     def fault(merge_params: Any) -> Any:
         def wrong(trainable: Any, frozen: Any) -> Any:
@@ -294,6 +295,7 @@ def test_a_frozen_parameter_that_moves_misses(monkeypatch: Patch) -> None:
     assert missed("training CriSALAD's adapters and head") == {"frozen"}
 
 
+@pytest.mark.slow
 def test_padding_that_counts_misses(monkeypatch: Patch) -> None:
     def fault(train_step: Any) -> Any:
         def wrong(state: Any, frozen: Any, images: Any, labels: Any, valid: Any, *rest: Any) -> Any:

@@ -77,7 +77,7 @@ def main() -> None:
     given = parser.parse_args()
 
     manifest = json.loads((given.export / "manifest.json").read_text(encoding="utf-8"))
-    files = {p.relative_to(given.images).as_posix(): p for p in given.images.rglob("*")}
+    files = {p.relative_to(given.images).as_posix(): p for p in given.images.rglob("[!.]*")}
     names = sorted(name for name in files if name.lower().endswith(SUFFIXES))
     if not names:
         raise SystemExit(f"{given.images}: found no image")

@@ -520,6 +520,7 @@ def test_convert_refuses_in_one_line(capfd, tmp_path, public):
     assert files_in(tmp_path) == {"dinov2.pth"}
 
 
+@pytest.mark.slow
 def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
     model = dataclasses.replace(
         RECIPE.model, backbone=dataclasses.replace(BACKBONE.backbone, adapter=AdapterConfig())
@@ -661,7 +662,7 @@ def test_what_the_disk_refuses_is_one_line(capfd, tmp_path, shared, monkeypatch)
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "d.npy")
 
-    monkeypatch.setattr(np, "save", full)
+    monkeypatch.setattr(np.lib.format, "write_array_header_1_0", full)
     start = extract(shared, shared / "town", tmp_path / "d.npy")
     fails(capfd, *start, words=("No space left on device: 'd.npy'",))
 

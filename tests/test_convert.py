@@ -104,6 +104,7 @@ def test_full_size(tmp_path: pathlib.Path, name: str, width: int) -> None:
     there_and_back(tmp_path, source, width)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dinov2_vitg14", "dinov2_vitg14_reg4"])
 def test_full_width_of_the_largest(tmp_path: pathlib.Path, name: str) -> None:
     """Two of its forty blocks: all of them take 4.5 GB a copy."""

@@ -61,6 +61,7 @@ def test_the_papers_descriptor_has_8448_numbers() -> None:
     assert config.descriptor_dim == 8448
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="how much memory a CPU's program takes")
 def test_memory_is_what_attention_needs_at_once() -> None:
     """Scores; queries, keys and values as made; the first two as multiplied; the tokens.

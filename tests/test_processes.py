@@ -39,7 +39,8 @@ from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
 from tests.test_processes import CONFIG
 
-shared, out = map(pathlib.Path, sys.argv[1:])
+shared, out = map(pathlib.Path, sys.argv[1:3])
+part = sys.argv[3]
 places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
 devices, step, seen = jax.devices(), module.train_step, set()
 compiled, after_step = [], []
@@ -67,9 +68,11 @@ def run(name, config, count, **options):
     print(name, spread, split, len(trained.backbone.blocks.ls1.sharding.device_set))
     seen.clear()
 
-for count in (1, 2, 4, 8):
-    # A validation owes nothing to the devices of the steps: that of the processes is compared.
-    run(str(count), CONFIG, count, validation=town if count == 1 else None)
+if part == "counts":
+    for count in (1, 2, 4, 8):
+        # A validation owes nothing to the devices of the steps: that of the processes is compared.
+        run(str(count), CONFIG, count, validation=town if count == 1 else None)
+    sys.exit()
 platform.SPLIT_FROM = 64  # numbers: this model has no larger arrays
 after_step.clear()
 run("split", CONFIG, 8, split_state=True)
@@ -80,24 +83,23 @@ run("all", dataclasses.replace(CONFIG, trains="all", epochs=1), 8)
 
 @pytest.fixture(scope="module")
 def by_devices(shared: pathlib.Path, tmp_path_factory) -> pathlib.Path:
-    """A run on each number of devices, in folders named by it; what comes back is on one.
-
-    Where all trains a CPU's devices do not share it: see `spreads_images`.
-    """
+    """A run on each number of devices, in folders named by it; what comes back is on one."""
     out = tmp_path_factory.mktemp("devices")
+    said = run_by_devices(shared, out, "counts")
+    assert said == ["1 1 False 1", "2 2 False 1", "4 4 False 1", "8 8 False 1"]
+    return out
+
+
+def run_by_devices(shared: pathlib.Path, out: pathlib.Path, part: str) -> list[str]:
     done = subprocess.run(
-        [sys.executable, "-c", DEVICES, str(shared), str(out)],
+        [sys.executable, "-c", DEVICES, str(shared), str(out), part],
         cwd=ROOT,
         env={**COMPILED_SOON, "JAX_NUM_CPU_DEVICES": "8"},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == [
-        *("1 1 False 1", "2 2 False 1", "4 4 False 1", "8 8 False 1"),
-        *("split 8 True 1", "compiled after the first step of ten: 0", "all 1 False 1"),
-    ]
-    return out
+    return done.stdout.splitlines()
 
 
 def free_port() -> int:
@@ -195,9 +197,18 @@ def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert error <= 1e-5 * np.linalg.norm(theirs[name]), name
 
 
-@pytest.mark.parametrize("name", ["2", "4", "8", "split"])
+@pytest.mark.parametrize("name", ["2", "4", "8"])
 def test_devices_do_not_change_a_run(by_devices: pathlib.Path, name: str):
     assert_same_run(by_devices / name, by_devices / "1")
+
+
+@pytest.mark.slow
+def test_a_split_state_does_not_change_a_run(shared, by_devices, tmp_path):
+    """Nor is anything compiled once it runs. Where all trains a CPU's devices do not share it."""
+    assert run_by_devices(shared, tmp_path, "split") == [
+        *("split 8 True 1", "compiled after the first step of ten: 0", "all 1 False 1"),
+    ]
+    assert_same_run(tmp_path / "split", by_devices / "1")
 
 
 def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):

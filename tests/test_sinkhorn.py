@@ -445,7 +445,7 @@ def test_a_plan_owes_nothing_to_its_batch(fields: Any) -> None:
 @pytest.mark.parametrize(
     "config",
     [
-        SinkhornConfig(),
+        pytest.param(SinkhornConfig(), marks=SLOW),
         implicit(),
         pytest.param(implicit(gradient="optimistix"), marks=SLOW),
         pytest.param(SinkhornConfig(domain="log", anderson=3), marks=SLOW),
@@ -633,6 +633,7 @@ print("agreed")
 """
 
 
+@pytest.mark.slow
 def test_eight_devices_give_the_same_plans() -> None:
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
@@ -724,6 +725,7 @@ def test_never_nan(mode: str, pattern: str, scale: float, seed: int) -> None:
 @given(**SCORES)
 @example(pattern="random", scale=1e4, seed=0)
 @settings(max_examples=8, deadline=None)
+@pytest.mark.slow
 def test_never_nan_under_vmap(mode: str, pattern: str, scale: float, seed: int) -> None:
     """Which computes both of what the guard chooses from."""
     assert_finite(mode, pattern, scale, seed, rows=24, mapped=True)

@@ -189,7 +189,14 @@ def assert_close(ours: Inputs, expected: Inputs, relative: float) -> None:
 # Converged
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+# A solver of each kind; their combinations take minutes.
+QUICK = {"scaling", "log", "newton", "fixed", "optimistix", "relaxed"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SOLVERS],
+)
 def test_plan_and_gradient_of_every_solver(name: str) -> None:
     """The plans of ott-jax and of POT, and the gradient of 3000 iterations."""
     config, solver = SOLVERS[name]
@@ -253,6 +260,7 @@ def test_potentials_are_centred_and_make_the_plan() -> None:
 # Gradients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [
@@ -283,6 +291,7 @@ def test_unrolled_gradient_is_that_of_so_many_iterations(domain: Any) -> None:
         assert_close(ours, long_gradient(count=count), 1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["sinkhorn", "newton"])
 def test_stopped_gradient_takes_potentials_for_constants(method: Any) -> None:
     config = SinkhornConfig(method=method, gradient="stop")
@@ -297,6 +306,7 @@ def test_stopped_gradient_takes_potentials_for_constants(method: Any) -> None:
     np.testing.assert_array_equal(ours.log_nu, 0)
 
 
+@pytest.mark.slow
 def test_a_batch_has_the_gradients_of_its_members() -> None:
     at = inputs(3)
 
@@ -358,6 +368,7 @@ def test_a_step_of_ones_own(config: SinkhornConfig) -> None:
         assert_close(gradient, long_gradient(), 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("domain", ["scaling", "log"])
 def test_a_step_may_read_the_kernel(domain: Any) -> None:
     """In the scaling domain too, where the built-in step reads exponentials of it."""
@@ -374,6 +385,7 @@ def test_a_step_may_read_the_kernel(domain: Any) -> None:
 # Second order and forward mode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [
@@ -398,6 +410,7 @@ def test_gradient_of_the_gradient(config: SinkhornConfig) -> None:
     assert_close(jax.jit(jax.grad(slope))(inputs()), differences(slope, inputs()), 1e-6)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_gradient_where_scaling_does_not_do() -> None:
     at, direction = inputs(), inputs(seed=5)
     far = SCALING_RANGE * at.epsilon + jnp.ptp(at.scores)
@@ -411,6 +424,7 @@ def test_gradient_of_the_gradient_where_scaling_does_not_do() -> None:
     assert_close(jax.jit(jax.grad(slope))(at), differences(slope, at), 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [to_rest(gradient="optimistix"), SinkhornConfig(gradient="stop")],

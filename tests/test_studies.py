@@ -250,6 +250,7 @@ def snippets() -> list[str]:
     return re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 
 
+@pytest.mark.slow
 def test_the_dead_dustbin_snippet_shows_what_the_page_says() -> None:
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         exec(snippets()[0], {})
@@ -326,6 +327,7 @@ def test_unequal_contenders_are_not_timed(bench: ModuleType) -> None:
         bench.check([reference, blind])
 
 
+@pytest.mark.slow
 def test_the_benchmark_asks_for_the_loosest_tolerance_that_will_do(
     bench: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,6 +61,7 @@ def fresh(params):
     return jax.tree.map(jnp.copy, params)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trains", ["adapters+head", "last-1-blocks+head", "all"])
 def test_batch_norm_statistics_never_train(trains: str) -> None:
     adapter = AdapterConfig(kind="multi-resolution")
@@ -123,7 +124,11 @@ def test_unknown_parts_raise(params, trains: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "trains", ["adapters+head", "last-1-blocks+head", pytest.param("all", marks=pytest.mark.slow)]
+    "trains",
+    [
+        "adapters+head",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("last-1-blocks+head", "all")),
+    ],
 )
 def test_a_step_changes_what_trains_and_nothing_else(params, trains: str) -> None:
     state, frozen = init_state(fresh(params), trains, STEP)
@@ -180,6 +185,7 @@ def test_frozen_parameters_get_no_gradient_buffers(params) -> None:
     assert shape in made(program.jaxpr)  # so the search above can find one
 
 
+@pytest.mark.slow
 def test_the_step_is_adamw_on_the_losss_gradient(params) -> None:
     """Loss and update recomputed outside the step, the update by torch.optim.AdamW."""
     images = pictures(6)
@@ -513,6 +519,7 @@ VARIANTS: list[dict] = [
 QUICK = ({"dustbin": "mass"}, CONVERGED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fields",
     [

@@ -14,8 +14,10 @@ from crisalad_jax.config import ModelConfig, recipe
 from crisalad_jax.groupings import GROUPINGS
 from crisalad_jax.model import Crisalad, init_crisalad
 
-# Into a file or a pipe, wide enough that tables do not wrap.
-console = rich.console.Console(width=None if sys.stdout.isatty() else 120)
+# Into a file or a pipe, wide enough that tables do not wrap. Brackets and colons in names are text.
+console = rich.console.Console(
+    width=None if sys.stdout.isatty() else 120, markup=False, emoji=False
+)
 
 
 def model_of(

@@ -5,7 +5,7 @@ import pathlib
 from typing import Literal
 
 from crisalad_jax.cli.common import console, model_of
-from crisalad_jax.data.images import list_images
+from crisalad_jax.data.images import list_images, names_in
 from crisalad_jax.descriptors import (
     Descriptors,
     config_of,
@@ -64,6 +64,8 @@ def run(arguments: Extract) -> None:
     write = writer_for(arguments.out)
     for target in (*targets(arguments.out), *([arguments.pairs] if arguments.pairs else [])):
         check_target(target)
+    if arguments.pairs in targets(arguments.out):
+        raise InputError(f"--pairs: found {arguments.pairs}, which --out writes, expected another")
     if arguments.database is not None and arguments.pairs is None:
         raise InputError("--database: found without --pairs, expected both")
     check_grouping([arguments.grouping], arguments.batch_size, arguments.seed)
@@ -75,6 +77,11 @@ def run(arguments: Extract) -> None:
     pca = None if arguments.pca is None else load_pca(arguments.pca)
     if pca is not None:
         pca.check(config.descriptor_dim, str(arguments.weights))
+        if arguments.pairs is not None and not pca.config.renormalise:
+            raise InputError(
+                f"--pairs: found {arguments.pca}, which leaves lengths as they are, expected "
+                "components that make unit vectors, which are paired by cosine"
+            )
     paths = list_images(arguments.images)
     names = _names(arguments, paths)
     length = config.descriptor_dim if pca is None else len(pca.components)
@@ -137,7 +144,7 @@ def _names(arguments: Extract, paths: list[pathlib.Path]) -> list[str]:
         if not images.is_relative_to(root):
             raise InputError(f"--root: found {root}, expected a folder that holds {images}")
         folder = images.relative_to(root)
-    return [(folder / path.relative_to(arguments.images)).as_posix() for path in paths]
+    return [(folder / name).as_posix() for name in names_in(arguments.images, paths)]
 
 
 def _database(

@@ -10,6 +10,7 @@ from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.cli.common import console, resized
 from crisalad_jax.config import recipe
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
+from crisalad_jax.errors import InputError
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import check_grouping
 from crisalad_jax.maps import open_map
@@ -43,6 +44,8 @@ def run(arguments: Info) -> None:
     from crisalad_jax.training import split_params
 
     check_grouping((), arguments.batch_size, seed=0)
+    if arguments.verify and arguments.map is None:
+        raise InputError("--verify: found without --map, expected both")
     if arguments.json is not None:
         check_target(arguments.json)
     if arguments.map is not None:

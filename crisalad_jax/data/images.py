@@ -8,7 +8,7 @@ import os
 import pathlib
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -255,6 +255,21 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
             f"{folder}: found no image, expected files that end in {' '.join(IMAGE_SUFFIXES)}"
         )
     return sorted(images, key=lambda image: image.relative_to(folder).as_posix())
+
+
+def names_in(folder: pathlib.PurePath, images: Sequence[pathlib.PurePath]) -> list[str]:
+    """Posix paths of images relative to a folder that holds them, each fit to be a line of text.
+
+    Raises:
+        InputError: a name has a line break in it, or bytes that are no UTF-8.
+    """
+    names = [image.relative_to(folder).as_posix() for image in images]
+    for name in names:
+        if len(name.splitlines()) != 1:
+            raise InputError(f"{folder}: found a line break in the name {name!r}, expected none")
+        if not name.isprintable() and any("\ud800" <= letter <= "\udfff" for letter in name):
+            raise InputError(f"{folder}: found the name {name!r}, expected UTF-8")
+    return names
 
 
 def _holds(folder: pathlib.Path, inner: pathlib.Path) -> bool:

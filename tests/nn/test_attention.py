@@ -108,6 +108,7 @@ def test_dropout_needs_a_key_and_changes_the_output() -> None:
     assert not np.allclose(plain, dropped, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_cudnn_is_asked_where_it_can_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """With XLA in its place, which takes the same arguments: here there is no GPU."""
     x = jax.random.normal(jax.random.key(0), (3, TOKENS, 16)).astype(jnp.bfloat16)
