@@ -123,8 +123,11 @@ def fit_pca(
 
     Raises:
         InputError: an array that is empty, no matrix, or holds a row that is not finite; fewer
-            than two descriptors or samples; `dim` below 1, or above the rank of what is fitted.
+            than two descriptors or samples; `dim` below 1, or above the rank of what is fitted; a
+            negative seed.
     """
+    if seed < 0:
+        raise InputError(f"seed: found {seed}, expected at least 0")
     descriptors = as_rows(descriptors, "descriptors")
     total, length = descriptors.shape
     count = total if samples is None else min(samples, total)

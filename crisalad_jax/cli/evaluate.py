@@ -49,6 +49,9 @@ class Evaluate:
     like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
     images: pathlib.Path | None = None
     """Folder of the images that a .mat file or .npy lists name; by default beside them."""
+    queries: str | None = None
+    """Folder of the queries, where @UTM sets have several: queries_night of SVOX; by default
+    queries."""
     radius: float | None = None
     """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
     max_heading_difference: float | None = None
@@ -101,6 +104,7 @@ def run(arguments: Evaluate) -> None:
         images=arguments.images,
         max_heading_difference=arguments.max_heading_difference,
         frames=arguments.frames,
+        queries=arguments.queries,
         layout=arguments.layout,
     )
     console.print(

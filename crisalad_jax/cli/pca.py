@@ -12,7 +12,7 @@ from crisalad_jax.pca import SAMPLES, PcaConfig, fit_pca, save_pca
 
 @dataclasses.dataclass(frozen=True)
 class Pca:
-    """Fit principal components to descriptors, for shorter ones (extract --pca)."""
+    """Fit principal components to descriptors, for shorter ones (extract, evaluate --pca)."""
 
     descriptors: pathlib.Path
     """A .npy file, such as `crisalad extract` writes; not of images that are evaluated on."""

@@ -20,16 +20,22 @@ class Positions(NamedTuple):
     of: dict[str, tuple[float, float]]
 
 
+def utm_position(name: str) -> tuple[float, float] | None:
+    """East and north in metres, where a file's name says so: `@UTM_east@UTM_north@...`."""
+    fields = name.split("@")
+    try:
+        east, north = float(fields[1]), float(fields[2])
+    except (IndexError, ValueError):
+        return None
+    return (east, north) if math.isfinite(east) and math.isfinite(north) else None
+
+
 def utm_positions(names: Sequence[str]) -> Positions:
     """East and north in metres of those images whose names say so, `@UTM_east@UTM_north@...`."""
     found = {}
     for name in names:
-        fields = pathlib.PurePosixPath(name).name.split("@")
-        try:
-            position = float(fields[1]), float(fields[2])
-        except (IndexError, ValueError):
-            continue
-        if all(map(math.isfinite, position)):
+        position = utm_position(pathlib.PurePosixPath(name).name)
+        if position is not None:
             found[name] = position
     return Positions(AXES[0], found)
 
@@ -38,8 +44,9 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
     """Read a table with the header `name,east,north` or `name,lat,lon`; more columns do not matter.
 
     Raises:
-        InputError: the file cannot be read, has another header, a name twice, or a value that is no
-            finite number, or no latitude or longitude.
+        InputError: the file cannot be read, has another header or one with both pairs, a row with
+            more fields than that, a name twice, or a value that is no finite number, or no
+            latitude or longitude.
     """
     path = pathlib.Path(path)
     found: dict[str, tuple[float, float]] = {}
@@ -47,14 +54,14 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             header = rows.fieldnames or []
-            axes = next((axes for axes in AXES if {"name", *axes} <= set(header)), None)
-            if axes is None:
-                raise InputError(
-                    f"{path}: found columns {', '.join(header) or 'none'}, expected "
-                    "name,east,north or name,lat,lon"
-                )
+            axes = _axes(path, header)
             for row in rows:
                 where = f"{path}: line {rows.line_num}"
+                if None in row:
+                    raise InputError(
+                        f"{where}: found more fields than the header's {len(header)}, expected as "
+                        "many (a decimal is written with a point)"
+                    )
                 if row["name"] in found:
                     raise InputError(f"{where}: found {row['name']!r} twice, expected it once")
                 found[row["name"]] = _position(row, axes, where)
@@ -64,6 +71,17 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot read these positions: {reason}") from error
     return Positions(axes, found)
+
+
+def _axes(path: pathlib.Path, header: Sequence[str]) -> tuple[str, str]:
+    found = [axes for axes in AXES if {"name", *axes} <= set(header)]
+    if len(found) != 1:
+        both = ", not both" if found else ""
+        raise InputError(
+            f"{path}: found columns {', '.join(header) or 'none'}, expected name,east,north or "
+            f"name,lat,lon{both}"
+        )
+    return found[0]
 
 
 def _position(row: dict[str, str], axes: tuple[str, str], where: str) -> tuple[float, float]:

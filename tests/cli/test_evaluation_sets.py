@@ -52,6 +52,8 @@ def test_flags_reach_the_reader(capfd, tmp_path, shared, streets):
         option = flag[2:].replace("-", " ")
         words = (f"crisalad: {option}: found '{value}', but", "which takes split, radius")
         fails(capfd, *town, flag, value, words=words)
+    words = ("test: found queries/, expected a folder queries_night",)
+    fails(capfd, *town, "--queries", "queries_night", words=words)
     words = (f"{streets}/database/0.jpg: found no coordinates",)
     fails(capfd, *start, "--data", streets, "--layout", "utm", words=words)
     fails(capfd, *town, "--layout", "netflad", words=("layout: found 'netflad', expected one of",))

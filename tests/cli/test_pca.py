@@ -84,6 +84,7 @@ def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
     (tmp_path / "t.npy").write_text("nothing")
     for name, more, words in (
         ("d.npy", ("--dim", 49), ("dim: found 49, expected 1 to 48",)),
+        ("d.npy", ("--seed", -3, "--samples", 50), ("seed: found -3, expected at least 0",)),
         ("d.npy", ("--out", "pca.npy"), ("pca.npy: found the suffix '.npy', expected .safe",)),
         ("none.npy", (), ("none.npy: found no such file, expected a .npy file",)),
         ("i.npy", (), ("i.npy: found int8, expected an array of floating-point numbers",)),

@@ -36,6 +36,15 @@ def test_a_table_in_any_order_with_more_columns(tmp_path, axes):
         ("name,east,north\na,1,\n", r"line 2: found \['1', ''\], expected two finite numbers"),
         ("name,east,north\na,1\n", r"line 2: found \['1', None\], expected two finite"),
         ("name,east,north\na,1,inf\n", "line 2: .*expected two finite numbers"),
+        (
+            "name,east,north,lat,lon\na,1,2,3,4\n",
+            "found columns name, east, north, lat, lon, expected name,east,north or name,lat,lon, "
+            "not both",
+        ),
+        (  # decimal commas
+            "name,east,north\na.jpg,500123,4,4500000,7\n",
+            "line 2: found more fields than the header's 3, expected as many",
+        ),
         ("name,lat,lon\na,91,0\n", "line 2: .*expected a latitude and a longitude"),
         ("name,lat,lon\na,0,181\n", "line 2: .*expected a latitude and a longitude"),
     ],

@@ -15,6 +15,18 @@ def is_pair(root: pathlib.Path, *parts: str) -> bool:
     return all((root / part).is_dir() for part in parts)
 
 
+def find_database(folder: pathlib.Path) -> pathlib.Path:
+    """`database/`, or where there is none `gallery/`, as SVOX has it."""
+    gallery = folder / "gallery"
+    database = folder / "database"
+    return gallery if gallery.is_dir() and not database.is_dir() else database
+
+
+def has_sides(folder: pathlib.Path) -> bool:
+    """Whether a folder itself holds a database and queries."""
+    return find_database(folder).is_dir() and (folder / "queries").is_dir()
+
+
 def list_part(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
     """The images under a folder, in sorted order.
 
@@ -57,7 +69,7 @@ def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str
     """
     # resolve: a root of "." still has a name to print
     resolved = root.resolve()
-    if split is None and is_pair(root, "database", "queries"):
+    if split is None and has_sides(root):
         if resolved.parent.name == "images":
             return root, f"{resolved.parent.parent.name}/{resolved.name}"
         return root, resolved.name

@@ -4,6 +4,7 @@ A struct `dbStruct` with the fields whichSet, dbImage, utmDb (2 x N), qImage, ut
 posDistThr, and others that are not needed here.
 """
 
+import math
 import os
 import pathlib
 from typing import Any
@@ -52,10 +53,10 @@ def read_netvlad(
         ("qImage", "utmQ", "numQ", _QUERY_FOLDERS),
     ):
         listed = _names(path, struct, names)
-        expected = int(_number(path, struct, count))
+        expected = _number(path, struct, count)
         if len(listed) != expected or not listed:
             raise InputError(
-                f"{path}: {names}: found {len(listed)} images, expected {count}, {expected}, and "
+                f"{path}: {names}: found {len(listed)} images, expected {count}, {expected:g}, and "
                 "at least one"
             )
         positions = _positions(path, struct, utm, len(listed))
@@ -110,7 +111,10 @@ def _number(path: pathlib.Path, struct: np.void, field: str) -> float:
     value = struct[field]
     if value.dtype.kind not in "iuf" or value.size != 1:
         raise InputError(f"{path}: {field}: found {_found(value)}, expected a number")
-    return float(value.item())
+    number = float(value.item())
+    if not math.isfinite(number):
+        raise InputError(f"{path}: {field}: found {number}, expected a finite number")
+    return number
 
 
 def _names(path: pathlib.Path, struct: np.void, field: str) -> list[str]:

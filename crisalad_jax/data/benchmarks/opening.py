@@ -8,11 +8,11 @@ from typing import NamedTuple
 from crisalad_jax.config import choose
 from crisalad_jax.data.benchmarks import folders, vpr_bench
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import find_split, has_split, is_pair, listing
+from crisalad_jax.data.benchmarks.disk import find_split, has_sides, has_split, is_pair, listing
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls, read_msls_subtask
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
 from crisalad_jax.data.benchmarks.salad_lists import has_lists, is_list, read_salad_lists
-from crisalad_jax.data.benchmarks.utm import has_utm_names, read_utm
+from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
 from crisalad_jax.errors import InputError
 
 
@@ -26,7 +26,7 @@ class Layout(NamedTuple):
 
 
 LAYOUTS = {
-    "utm": Layout("a folder of @UTM names", read_utm, ("split", "radius")),
+    "utm": Layout("a folder of @UTM names", read_utm, ("split", "radius", "queries")),
     "vpr-bench": Layout("a VPR-Bench folder", vpr_bench.read_vpr_bench),
     "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images")),
     "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images")),
@@ -47,6 +47,7 @@ def open_benchmark(
     images: str | os.PathLike[str] | None = None,
     max_heading_difference: float | None = None,
     frames: int | None = None,
+    queries: str | None = None,
     layout: str | None = None,
 ) -> Benchmark:
     """Read an evaluation set, by the layout that is found by looking into it, or as `layout` says.
@@ -62,6 +63,7 @@ def open_benchmark(
         images: the folder of the images that a file names.
         max_heading_difference: largest difference of headings of a positive in degrees.
         frames: how many frames a positive may be away.
+        queries: the folder of the queries, where there are several.
         layout: one of `LAYOUTS`; `msls-subtask` is never found by looking.
 
     Raises:
@@ -69,13 +71,16 @@ def open_benchmark(
             raises.
     """
     root = pathlib.Path(root)
-    chosen = choose("layout", _find_layout(root, split) if layout is None else layout, LAYOUTS)
+    chosen = choose(
+        "layout", _find_layout(root, split, queries) if layout is None else layout, LAYOUTS
+    )
     options = {
         "split": split,
         "radius": radius,
         "images": images,
         "max_heading_difference": max_heading_difference,
         "frames": frames,
+        "queries": queries,
     }
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():
@@ -88,7 +93,7 @@ def open_benchmark(
     return chosen.read(root, **given)
 
 
-def _find_layout(root: pathlib.Path, split: str | None) -> str:
+def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> str:
     if root.is_file():
         if root.suffix == ".mat":
             return "netvlad"
@@ -100,9 +105,9 @@ def _find_layout(root: pathlib.Path, split: str | None) -> str:
         )
     if is_msls(root):
         return "msls"
-    if has_split(root) or is_pair(root, "database", "queries"):
+    if has_split(root) or has_sides(root):
         folder, _ = find_split(root, split)
-        plain = (folder / folders.TRUTH).exists() or not has_utm_names(folder)
+        plain = (folder / folders.TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
         return "folders" if plain else "utm"
     if is_pair(root, "ref", "query") and ((root / vpr_bench.TRUTH).exists() or not has_lists(root)):
         return "vpr-bench"

@@ -33,10 +33,9 @@ def within(
     axis = int(np.argmax(np.ptp(database, axis=0)))
     order = np.argsort(database[:, axis], kind="stable")
     ordered = database[order]
-    # The extra metre keeps rounding at the edge of the band from deciding: the distance decides.
-    reach = radius + 1.0
-    first = np.searchsorted(ordered[:, axis], queries[:, axis] - reach, side="left")
-    last = np.searchsorted(ordered[:, axis], queries[:, axis] + reach, side="right")
+    # Rounding keeps order: the band's rounded edges lose none that is at most `radius` away.
+    first = np.searchsorted(ordered[:, axis], queries[:, axis] - radius, side="left")
+    last = np.searchsorted(ordered[:, axis], queries[:, axis] + radius, side="right")
     positives = []
     for query, start, stop in zip(queries, first, last, strict=True):
         squared = np.square(ordered[start:stop] - query).sum(axis=1)

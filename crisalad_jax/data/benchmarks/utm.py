@@ -12,11 +12,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import find_split, list_part
+from crisalad_jax.data.benchmarks.disk import (
+    find_database,
+    find_split,
+    list_part,
+    listing,
+    shown,
+)
 from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.benchmarks.positives import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.data.positions import utm_position
 from crisalad_jax.errors import InputError
 
+QUERIES = "queries"
+"""The folder of the queries, unless another is named."""
 _PLACE_METRES = 1000.0
 _PAIRED = {607: "SPED", 1231: "AmsterTime"}
 """Sets whose places have an image on each side, and no coordinates, by how many they are."""
@@ -31,7 +40,11 @@ _MSLS_NOTE = re.compile(r"(?:day|night)_[a-z]+_([a-z]+)")
 
 
 def read_utm(
-    root: str | os.PathLike[str], split: str | None = None, radius: float = DEFAULT_RADIUS
+    root: str | os.PathLike[str],
+    split: str | None = None,
+    radius: float = DEFAULT_RADIUS,
+    *,
+    queries: str = QUERIES,
 ) -> Benchmark:
     """Read `@UTM_east@UTM_north@...` images; a positive is at most `radius` metres away.
 
@@ -41,9 +54,11 @@ def read_utm(
 
     Args:
         root: a folder with `images/{test,val,train}`, or one that itself holds `database/` and
-            `queries/`.
+            `queries/`; SVOX's database is in `gallery/`.
         split: None takes `test`, else `val`.
         radius: in metres, inclusive.
+        queries: the folder of the queries: SVOX has `queries_night` and others beside `queries`.
+            The benchmark's name says which, unless it is `queries`.
 
     Raises:
         InputError: no such split or folder, a folder without images, a name without coordinates, a
@@ -52,8 +67,9 @@ def read_utm(
     root = pathlib.Path(root)
     check_radius(radius)
     folder, name = find_split(root, split)
-    database, queries = (list_part(folder / part) for part in ("database", "queries"))
-    places, asked = _coordinates(database), _coordinates(queries)
+    database, asking = list_part(find_database(folder)), _list_queries(folder, queries)
+    places, asked = _coordinates(database), _coordinates(asking)
+    which = "" if queries == QUERIES else f", {queries}"
 
     nordland = _nordland(places, asked)
     if nordland is not None:
@@ -62,10 +78,10 @@ def read_utm(
         frames = int(radius / metres + 1e-9)
         words = f"{frames} frame{'s' * (frames != 1)}"
         return Benchmark(
-            name=f"{_NORDLANDS[metres]}, +-{words}",
+            name=f"{_NORDLANDS[metres]}{which}, +-{words}",
             root=root,
             database=database,
-            queries=queries,
+            queries=asking,
             positives=within(there, here, frames),
             rule=f"at most {words} apart ({radius:g} m); it is Nordland by eastings of 0 and "
             f"northings of {metres:.4g} m a frame",
@@ -73,12 +89,13 @@ def read_utm(
 
     positives = within(places, asked, radius)
     if radius < _PLACE_METRES and _are_placeholders(places, asked):
-        known = _PAIRED.get(len(database)) if len(database) == len(queries) else None
+        known = _PAIRED.get(len(database)) if len(database) == len(asking) else None
         return Benchmark(
-            name=f"{known or name} (@UTM placeholders 1 km apart: a place matches itself only)",
+            name=f"{known or name}{which} (@UTM placeholders 1 km apart: a place matches itself "
+            "only)",
             root=root,
             database=database,
-            queries=queries,
+            queries=asking,
             positives=positives,
             rule="the same place; by eastings of 0 and northings of whole kilometres the "
             "coordinates are placeholders"
@@ -86,34 +103,41 @@ def read_utm(
         )
 
     rule = f"UTM distance of at most {radius:g} m"
-    cities = _msls_cities(database + queries)
+    cities = _msls_cities(database + asking)
     if cities is None:
-        name = f"{name} (@UTM, {radius:g} m)"
+        name = f"{name}{which} (@UTM, {radius:g} m)"
     else:
-        name = f"{msls_title(cities)}, downloader style, {len(queries)} queries, {radius:g} m"
+        title = f"{msls_title(cities)}{which}, downloader style"
+        name = f"{title}, {len(asking)} queries, {radius:g} m"
         rule += f"; by the notes in the names it is MSLS of {', '.join(sorted(cities))}"
-    return Benchmark(name, root, database, queries, positives, rule, places, asked, radius)
+    return Benchmark(name, root, database, asking, positives, rule, places, asked, radius)
 
 
-def has_utm_names(folder: pathlib.Path) -> bool:
-    """Whether any image under database/ or queries/ has a name that begins with @."""
-    parts = (list_part(folder / part) for part in ("database", "queries"))
-    return any(path.name.startswith("@") for paths in parts for path in paths)
+def has_utm_names(folder: pathlib.Path, queries: str = QUERIES) -> bool:
+    """Whether any image of the database or the queries has a name that begins with @."""
+    paths = list_part(find_database(folder)) + _list_queries(folder, queries)
+    return any(path.name.startswith("@") for path in paths)
+
+
+def _list_queries(folder: pathlib.Path, queries: str) -> tuple[pathlib.Path, ...]:
+    """The images of one of the folders of queries."""
+    there = [path.name for path in folder.glob(f"{QUERIES}*") if path.is_dir()]
+    if queries not in there:
+        found = shown(f"{name}/" for name in there) if there else listing(folder)
+        raise InputError(f"{folder}: found {found}, expected a folder {queries}")
+    return list_part(folder / queries)
 
 
 def _coordinates(paths: tuple[pathlib.Path, ...]) -> Float64[np.ndarray, "images 2"]:
     """East and north in metres."""
     coordinates = np.empty((len(paths), 2))
     for row, path in zip(coordinates, paths, strict=True):
-        fields = path.name.split("@")
-        try:
-            row[:] = float(fields[1]), float(fields[2])
-        except (IndexError, ValueError):
-            row[:] = np.nan
-        if not np.isfinite(row).all():
+        position = utm_position(path.name)
+        if position is None:
             raise InputError(
                 f"{path}: found no coordinates, expected a name @UTM_east@UTM_north@..."
             )
+        row[:] = position
     return coordinates
 
 

@@ -122,6 +122,10 @@ def test_missing_images_are_counted(tmp_path):
     ("changes", "message"),
     [
         ({"numDb": 31.0}, "dbImage: found 30 images, expected numDb, 31"),
+        ({"numDb": 30.5}, "dbImage: found 30 images, expected numDb, 30.5"),
+        ({"numDb": np.nan}, "a.mat: numDb: found nan, expected a finite number"),
+        ({"numQ": np.inf}, "a.mat: numQ: found inf, expected a finite number"),
+        ({"posDistThr": np.nan}, "a.mat: posDistThr: found nan, expected a finite number"),
         ({"numQ": 8.0}, "qImage: found 9 images, expected numQ, 8"),
         ({"utmDb": DATABASE}, r"utmDb: found an array of \(30, 2\) .*, expected 2 x 30 numbers"),
         ({"utmQ": QUERIES[:8].T}, r"utmQ: found an array of \(2, 8\) .*, expected 2 x 9 numbers"),

@@ -41,6 +41,30 @@ def test_open_benchmark_finds_the_layout(tmp_path):
         open_benchmark(tmp_path / "c", "val")
 
 
+def test_svox_is_found_with_the_queries_that_are_asked(tmp_path):
+    folder = tmp_path / "svox" / "images" / "test"
+    write_utm(folder, np.array([[0, 0], [100, 0]]), np.array([[0, 5]]))
+    (folder / "database").rename(folder / "gallery")
+    touch(folder / "queries_night" / "@0100.00@0007.00@.jpg")
+    touch(folder / "queries_rain" / "@0900.00@0007.00@.jpg")
+    for root in (tmp_path / "svox", folder):
+        benchmark = open_benchmark(root)
+        assert benchmark.name == "svox/test (@UTM, 25 m)"
+        assert lists_of(benchmark.positives) == [[0]]
+        night = open_benchmark(root, queries="queries_night")
+        assert night.name == "svox/test, queries_night (@UTM, 25 m)"
+        assert lists_of(night.positives) == [[1]]
+        assert night.queries == (folder / "queries_night" / "@0100.00@0007.00@.jpg",)
+        assert night.database == benchmark.database
+        for unknown in ("queries_fog", "gallery", ""):
+            with pytest.raises(InputError) as caught:
+                open_benchmark(root, queries=unknown)
+            assert str(caught.value) == (
+                f"{folder}: found queries/, queries_night/, queries_rain/, expected a folder "
+                f"{unknown}"
+            )
+
+
 def test_open_benchmark_says_what_it_found(tmp_path):
     (tmp_path / "pictures").mkdir()
     (tmp_path / "notes.txt").write_text("")
@@ -113,6 +137,7 @@ OPTIONS = {
     "images": "photos",
     "max_heading_difference": 40.0,
     "frames": 2,
+    "queries": "queries_night",
 }
 
 
