@@ -82,6 +82,8 @@ class Indexed(NamedTuple):
     """Images that the map had already."""
     positions: int
     """Images of those added whose position is known."""
+    stay: int
+    """Positions given of images that the map had already, which it keeps as it has them."""
     unreadable: list[str]
 
 
@@ -127,6 +129,8 @@ def index_images(
                 f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
                 f"{known.root}, expected new names for new pictures"
             )
+    target.axes_of(names, positions)  # before any work
+    stay = sum(target.image(name) is not None for name in positions.of)
     waiting: list[Described] = []
     unreadable: list[str] = []
 
@@ -159,5 +163,6 @@ def index_images(
         added=len(added),
         there=len(paths) - len(new),
         positions=sum(image.position is not None for image in added),
+        stay=stay,
         unreadable=unreadable,
     )

@@ -1,11 +1,13 @@
 """What a map says of itself in map.json: the model, its settings, where descriptors are."""
 
+import contextlib
 import dataclasses
 import datetime
 import json
 import os
 import pathlib
 import uuid
+from collections.abc import Iterator
 from typing import Any
 
 from crisalad_jax.checkpoint import model_hash
@@ -15,11 +17,12 @@ from crisalad_jax.files import durable_path
 from crisalad_jax.model import Crisalad
 from crisalad_jax.serial import from_plain
 from crisalad_jax.stores import store_name
+from crisalad_jax.stores.files import remove_leftovers
 
 FORMAT = 1
 """Version of the format that this package writes, and the newest that it reads."""
-DESCRIPTION, SEGMENTS = "map.json", "segments"
-"""The file, and the folder of what was appended."""
+DESCRIPTION, SEGMENTS, LOCK = "map.json", "segments", ".lock"
+"""The file, the folder of what was appended, and what who appends holds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +104,42 @@ def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
             f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
             "crisalad-jax"
         )
-    return from_plain(MapDescription, value, source=str(path))
+    description = from_plain(MapDescription, value, source=str(path))
+    try:
+        store_name(description.store, folder, description.dtype)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return description
+
+
+def has_images(folder: pathlib.Path) -> bool:
+    """Whether the map in this folder has any image; one that has none counts as no map."""
+    return any((folder / SEGMENTS).glob("[0-9]*.json"))
+
+
+@contextlib.contextmanager
+def undone_without_images(folder: pathlib.Path) -> Iterator[None]:
+    """Remove the map if an exception ends this before it has images: nothing is lost with it."""
+    try:
+        yield
+    except BaseException:
+        if not has_images(folder):
+            with contextlib.suppress(OSError):
+                _remove(folder)
+        raise
+
+
+def _remove(folder: pathlib.Path) -> None:
+    """Remove a map without images. Where there is more, its description stays to say of what."""
+    segments = folder / SEGMENTS
+    remove_leftovers(segments)
+    for path in segments.glob("[0-9]*.npy"):
+        path.unlink()
+    segments.rmdir()
+    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, LOCK}:
+        (folder / DESCRIPTION).unlink(missing_ok=True)
+        (folder / LOCK).unlink()
+        folder.rmdir()
 
 
 def check_model(

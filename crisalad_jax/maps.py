@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,18 +20,19 @@ from crisalad_jax.data.positions import Positions
 from crisalad_jax.errors import InputError
 from crisalad_jax.map_description import (
     DESCRIPTION,
+    LOCK,
     SEGMENTS,
     MapDescription,
+    has_images,
     read_description,
+    undone_without_images,
     write_record,
 )
 from crisalad_jax.retrieval import Neighbours
-from crisalad_jax.rows import UNIT_TOLERANCE
+from crisalad_jax.rows import check_rows
 from crisalad_jax.serial import to_plain
 from crisalad_jax.stores import Store, open_store
 from crisalad_jax.stores.files import remove_leftovers
-
-_LOCK = ".lock"
 
 
 class MapImage(NamedTuple):
@@ -130,12 +131,22 @@ class Map:
             raise InputError(
                 f"{name}: found shape {descriptors.shape}, expected (images, {length})"
             )
-        # "Not within" rather than "beyond", so that NaN counts as wrong.
-        norms = np.linalg.norm(descriptors.astype(np.float32), axis=1)
-        if (wrong := np.flatnonzero(~(np.abs(norms - 1) <= UNIT_TOLERANCE))).size:
+        check_rows(descriptors, name, range(len(descriptors)), unit=True)
+
+    def axes_of(self, names: Iterable[str], positions: Positions | None) -> tuple[str, str] | None:
+        """The axes of the positions of new images; None where none of them has one.
+
+        Raises:
+            InputError: the map's positions are in other axes.
+        """
+        if positions is None or positions.of.keys().isdisjoint(names):
+            return None
+        if self.axes and positions.axes != self.axes:
             raise InputError(
-                f"{name}: row {wrong[0]} is of length {norms[wrong[0]]:.4g}, expected unit vectors"
+                f"{self.folder}: found positions in {', '.join(positions.axes)}, expected "
+                f"{', '.join(self.axes)} as in the map"
             )
+        return positions.axes
 
     def append(
         self,
@@ -170,12 +181,7 @@ class Map:
             MapImage(name, size, known.get(name), root)
             for name, size in zip(names, sizes, strict=True)
         ]
-        axes = positions.axes if positions and any(image.position for image in images) else None
-        if axes and self.axes and axes != self.axes:
-            raise InputError(
-                f"{self.folder}: found positions in {', '.join(axes)}, expected "
-                f"{', '.join(self.axes)} as in the map"
-            )
+        axes = self.axes_of(names, positions)
         kept = np.ascontiguousarray(descriptors, self.description.dtype)
         segment = _Segment(len(self), len(images), hashlib.sha256(kept.data).hexdigest())
         self._store.add(segment.first, kept)
@@ -227,7 +233,7 @@ def open_map(folder: str | os.PathLike[str]) -> Iterator[Map]:
     description = read_description(folder)
     if description is None:
         raise InputError(f"{folder}: found no map, expected a folder that `crisalad index` wrote")
-    if not _has_images(folder):
+    if not has_images(folder):
         raise InputError(f"{folder}: found a map without images, expected at least one")
     with contextlib.closing(_opened(folder, description)) as opened:
         yield opened
@@ -239,7 +245,8 @@ def open_for_appending(
 ) -> Iterator[Map]:
     """Open the map that has this description to append to it, or make it.
 
-    One process at a time may; others may search meanwhile.
+    One process at a time may; others may search meanwhile. A map without images, which a kill left,
+    is made anew; one that an exception leaves without images is removed.
 
     Raises:
         InputError: another process appends, the map there is another one or what `open_map` raises,
@@ -255,15 +262,12 @@ def open_for_appending(
             raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
         found = read_description(folder)
         remove_leftovers(folder / SEGMENTS)
-        if found is None:
+        stack.enter_context(undone_without_images(folder))
+        if found != description:
+            if has_images(folder):
+                raise InputError(f"{folder}: found another map than was expected here")
             write_record(folder / DESCRIPTION, to_plain(description), indent=2)
-        elif found != description:
-            raise InputError(f"{folder}: found another map than was expected here")
         yield stack.enter_context(contextlib.closing(_opened(folder, description)))
-
-
-def _has_images(folder: pathlib.Path) -> bool:
-    return any((folder / SEGMENTS).glob("[0-9]*.json"))
 
 
 def _opened(folder: pathlib.Path, description: MapDescription) -> Map:
@@ -273,7 +277,7 @@ def _opened(folder: pathlib.Path, description: MapDescription) -> Map:
         collection=description.collection,
         length=description.descriptor_length,
         dtype=description.dtype,
-        new=not _has_images(folder),
+        new=not has_images(folder),
     )
     try:
         return Map(folder, description, store)
@@ -287,11 +291,15 @@ def _locked(folder: pathlib.Path) -> Iterator[None]:
     """Hold the map's lock, which ends with the process if not before."""
     import fcntl
 
-    with (folder / _LOCK).open("w") as file:
+    taken = InputError(
+        f"{folder}: another process is appending to this map, expected to be the only one"
+    )
+    with (folder / LOCK).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError(
-                f"{folder}: another process is appending to this map, expected to be the only one"
-            ) from error
+            raise taken from error
+        # Another may have removed the map, and its lock with it, since this one opened the lock.
+        if os.fstat(file.fileno()).st_nlink == 0:
+            raise taken
         yield

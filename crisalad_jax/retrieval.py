@@ -171,7 +171,7 @@ class _Part:
     ) -> None:
         """Rank what the devices named of a block among the best."""
         k = self.best.indices.shape[1]
-        error = _rounding(self.queries.shape[1])
+        error = rounding(self.queries.shape[1])
         # Whatever ends among the best has a product of at least so much.
         least = self.best.similarities[:, -1] - error
         all_values = np.concatenate(values, axis=1)
@@ -207,7 +207,7 @@ class _Part:
         similarities, indices = np.full(shape, -np.inf, np.float32), np.full(shape, -1)
         similarities[:, :k] = self.best.similarities[touched]
         indices[:, :k] = self.best.indices[touched]
-        similarities[line, column] = _similarities(self.queries, block.rows, query, row)
+        similarities[line, column] = exact_similarities(self.queries, block.rows, query, row)
         indices[line, column] = block.start + row
         # A stable sort: of equal ones those found earlier stand first, and they are the lower.
         order = np.argsort(-similarities, axis=1, kind="stable")[:, :k]
@@ -215,7 +215,7 @@ class _Part:
         self.best.indices[touched] = np.take_along_axis(indices, order, axis=1)
 
 
-def _rounding(length: int) -> float:
+def rounding(length: int) -> float:
     """How far a float32 product of two descriptors of this length may be off, in any order.
 
     The probabilistic bound of Higham and Mary (2019), lambda sqrt(n) u, at lambda = 8, where it
@@ -224,7 +224,7 @@ def _rounding(length: int) -> float:
     return 8 * math.sqrt(length) * 2.0**-24 * (1 + UNIT_TOLERANCE) ** 2
 
 
-def _similarities(
+def exact_similarities(
     queries: Float32[np.ndarray, "q d"],
     rows: Float[np.ndarray, "n d"],
     query: Int[np.ndarray, " pair"],

@@ -71,7 +71,7 @@ def blocks(
             np.copyto(buffer[: len(rows)], rows, casting="unsafe")
         buffer[len(rows) :] = 0
         _let_go(rows)
-        _check(buffer[: len(rows)], name, range(start, len(array)), unit=True)
+        check_rows(buffer[: len(rows)], name, range(start, len(array)), unit=True)
         yield Block(start, buffer, len(rows))
         start += len(buffer)
 
@@ -98,17 +98,27 @@ def pieces(
             rows = np.array(array[some], np.float32)
         if places is None:
             _let_go(array[some])
-            _check(rows, name, range(start, len(array)), unit=False)
+            check_rows(rows, name, range(start, len(array)), unit=False)
         else:
             _let_go(array[places[start] : places[start + len(rows) - 1] + 1])
-            _check(rows, name, places[start:], unit=False)
+            check_rows(rows, name, places[start:], unit=False)
         yield rows
 
 
-def _check(
+def check_rows(
     rows: Float[np.ndarray, "rows d"], name: str, places: Sequence[int] | np.ndarray, *, unit: bool
 ) -> None:
-    """Check that these rows are finite, and unit vectors where they are to be."""
+    """Check that these rows are finite, and unit vectors where they are to be.
+
+    Args:
+        rows: descriptors.
+        name: where they are from.
+        places: theirs there, for the message.
+        unit: whether they are to be of unit length, or finite only.
+
+    Raises:
+        InputError: one is not; the message names the first.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         squares = [
             np.einsum("nd,nd->n", wide, wide)

@@ -169,6 +169,8 @@ def test_one_process_appends_at_a_time(folder):
     [
         (lambda m: edit(m / "map.json", format=2), "found a map of format 2, expected at most 1"),
         (lambda m: (m / "map.json").write_text('{"model'), "map.json: cannot read this map"),
+        (lambda m: edit(m / "map.json", dtype="int3"), "map.json: dtype: found 'int3', expected"),
+        (lambda m: edit(m / "map.json", store="no"), "map.json: store: found 'no', expected files"),
         (lambda m: (m / "map.json").write_text("[]"), "map.json: found list, expected an object"),
         (lambda m: (m / "map.json").unlink(), "map: found segments and no map.json"),
         (
@@ -230,8 +232,12 @@ def test_another_description_does_not_append(folder):
         (["7.jpg", "7.jpg"], rows(7, 2), "found 1 of 2 names twice, or in the map already"),
         (["7.jpg", "3.jpg"], rows(7, 2), "found 1 of 2 names twice, or in the map already"),
         (["7.jpg"], rows(7, 1)[:, :-1], r"found shape \(1, 47\), expected \(images, 48\)"),
-        (["7.jpg"], 2 * rows(7, 1), "row 0 is of length 2, expected unit vectors"),
-        (["7.jpg"], np.nan * rows(7, 1), "row 0 is of length nan, expected unit vectors"),
+        (
+            ["7.jpg"],
+            2 * rows(7, 1),
+            "descriptors: row 0 is of length 2, expected finite unit vectors",
+        ),
+        (["7.jpg"], np.nan * rows(7, 1), "row 0 is not finite, expected finite unit vectors"),
         ([], rows(7, 1)[:0], r"found shape \(0, 48\)"),
     ],
 )
@@ -276,6 +282,70 @@ def test_a_map_without_images_answers_nothing(tmp_path):
             target.search(rows(0, 1), 1)
     with pytest.raises(InputError, match="found a map without imag"), open_map(tmp_path / "map"):
         pass
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_map_that_fails_before_it_has_images_is_removed(tmp_path, there):
+    """Also what was written of a first addition that does not count."""
+    if there:
+        with open_for_appending(tmp_path / "map", description("files")):
+            pass
+
+    def fail() -> None:
+        with open_for_appending(tmp_path / "map", description("files")) as target:
+            target._store.add(0, rows(0, 2))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_map_that_fails_once_it_has_images_keeps_them(tmp_path):
+
+    def fail() -> None:
+        with open_for_appending(tmp_path / "map", description("files")) as target:
+            target.append(names(0, 1), [7], rows(0, 1), root="/images")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert killed_appends.check(tmp_path / "map") == 1
+
+
+def test_what_others_put_into_a_map_that_fails_is_kept(tmp_path):
+
+    def fail() -> None:
+        with open_for_appending(tmp_path / "map", description("files")):
+            (tmp_path / "map" / "notes.txt").write_text("x")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert sorted(os.listdir(tmp_path / "map")) == [".lock", "map.json", "notes.txt"]
+    append_until(tmp_path / "map", 1)
+
+
+def test_a_map_without_images_is_made_anew_as_another(tmp_path):
+    with open_for_appending(tmp_path / "map", description("files")):
+        pass
+    other = dataclasses.replace(description("files"), dtype="float16", model="1" * 64)
+    with open_for_appending(tmp_path / "map", other) as target:
+        target.append(names(0, 1), [7], rows(0, 1), root="/images")
+    assert read_description(tmp_path / "map") == other
+
+
+@pytest.mark.parametrize("value", [np.nan, 2.0])
+def test_a_row_of_a_file_that_is_no_descriptor_is_named(folder, value):
+    path = folder / "segments" / "0000000003.npy"
+    spoilt = np.load(path)
+    spoilt[2] *= value
+    np.save(path, spoilt)
+    with (
+        open_map(folder) as found,
+        pytest.raises(InputError, match=r"0000000003\.npy: row 2 is (not finite|of length 2),"),
+    ):
+        found.search(rows(0, 2), 3)
 
 
 def test_a_map_in_milvus_that_was_killed_before_it_had_images_goes_on(tmp_path):

@@ -16,6 +16,7 @@ from crisalad_jax.map_description import (
     MapDescription,
     check_model,
     describe_map,
+    has_images,
     read_description,
 )
 from crisalad_jax.maps import open_for_appending
@@ -34,7 +35,8 @@ class Index:
     out: pathlib.Path
     """The map's folder. After a kill the same command goes on."""
     positions: pathlib.Path | None = None
-    """CSV of name,east,north (metres) or name,lat,lon; by default what @UTM names say."""
+    """CSV of name,east,north (metres) or name,lat,lon, for images that are new; by default what
+    @UTM names say."""
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
     map's, and of a new map files."""
@@ -56,6 +58,8 @@ def run(arguments: Index) -> None:
     """Describe the images that the map lacks, and append them."""
     check_grouping((), arguments.batch_size, seed=0)
     found = read_description(arguments.out)
+    if not has_images(arguments.out):
+        found = None  # what a kill left before there was an image binds to nothing
     paths = list_images(arguments.images)
     names = [path.relative_to(arguments.images).as_posix() for path in paths]
     if arguments.positions is None:
@@ -88,11 +92,15 @@ def run(arguments: Index) -> None:
             quiet=arguments.quiet,
         )
         count = len(target)
-    if not count:
-        raise InputError(f"{arguments.images}: found {len(paths)} images, none of them readable")
+        if not count:
+            raise InputError(
+                f"{arguments.images}: found {len(paths)} images, none of them readable"
+            )
+    stay = result.stay if arguments.positions is not None else 0
     console.print(
         f"{arguments.out}: {result.added} images added, {result.positions} with positions"
         + (f"; {result.there} were there already" if result.there else "")
+        + (f"; {stay} positions given are of such, and stay as they are" if stay else "")
         + (f"; {len(result.unreadable)} unreadable left out" if result.unreadable else "")
         + f"; {count} descriptors of {description.descriptor_length} numbers ({description.store})",
         soft_wrap=True,

@@ -30,6 +30,8 @@ _AT_ONCE = 1024
 """Queries that are searched for together: the map is read once for so many."""
 _ROWS = 24
 """Queries in a gallery, at most."""
+_COLUMNS = 8
+"""Answers to each, at most."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Query:
     json: pathlib.Path | None = None
     """File for the answers, a line of JSON for each query; - prints them."""
     gallery: pathlib.Path | None = None
-    """PNG of queries beside their answers."""
+    """PNG of up to 24 queries beside up to 8 answers each."""
     map_images: pathlib.Path | None = None
     """Folder of the map's images, for the gallery, if they are not where they were."""
     batch_size: int = 16
@@ -66,8 +68,7 @@ def run(arguments: Query) -> None:
     printed = arguments.json == pathlib.Path("-")
     if arguments.json is not None and not printed:
         check_target(arguments.json)
-    if arguments.gallery is not None:
-        check_target(arguments.gallery)
+    _check_gallery(arguments)
     paths = _listed(arguments.images)
     params = _model_of(arguments)
     with open_map(arguments.map) as opened, contextlib.ExitStack() as stack:
@@ -86,19 +87,33 @@ def run(arguments: Query) -> None:
                 if table is not None:
                     _add_rows(table, path, answers)
             if arguments.gallery is not None:
-                found.append(neighbours)
+                found.append(Neighbours(*(array[:, :_COLUMNS] for array in neighbours)))
         if arguments.gallery is not None:
             _draw(arguments, opened, paths, found)
     if table is not None:
         console.print(table)
-    for path in (arguments.gallery, None if printed else arguments.json):
+    for path, most in ((arguments.gallery, _ROWS), (None if printed else arguments.json, None)):
         if path is not None:
             console.print(
-                f"{path}: {len(paths)} queries in a map of {len(opened)} images",
+                f"{path}: {_some(len(paths), most)} queries in a map of {len(opened)} images",
                 soft_wrap=True,
                 markup=False,
                 highlight=False,
             )
+
+
+def _check_gallery(arguments: Query) -> None:
+    if arguments.gallery is None:
+        if arguments.map_images is not None:
+            raise InputError("--map-images: found without --gallery, expected both")
+        return
+    check_target(arguments.gallery)
+    if arguments.json is not None and arguments.json.resolve() == arguments.gallery.resolve():
+        raise InputError(f"--gallery: found {arguments.gallery}, as --json, expected two files")
+
+
+def _some(count: int, most: int | None) -> str:
+    return f"{count}" if most is None or count <= most else f"{most} of {count}"
 
 
 def _listed(images: tuple[pathlib.Path, ...]) -> list[pathlib.Path]:
@@ -215,6 +230,7 @@ def _draw(
         similarities,
         None,
         rows=_ROWS,
-        columns=arguments.k,
+        columns=_COLUMNS,
+        names=([path.as_posix() for path in paths], [image.name for image in images]),
         title=str(arguments.map),
     )

@@ -13,6 +13,9 @@ from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.report.style import DPI, GREY, INK, RIGHT, WRONG, fit_width, save
 
+_NAME = 28
+"""Characters of a name, which at 7 points are as wide as a picture."""
+
 
 def prediction_gallery(
     path: str | os.PathLike[str],
@@ -26,6 +29,7 @@ def prediction_gallery(
     columns: int = 4,
     chosen: Sequence[int] | None = None,
     title: str = "",
+    names: tuple[Sequence[str], Sequence[str]] | None = None,
 ) -> None:
     """Write a PNG of queries, one a row, with what was retrieved for them, best first.
 
@@ -46,6 +50,7 @@ def prediction_gallery(
         columns: retrievals shown for each, at most k.
         chosen: the queries shown, in their order.
         title: stands above the picture.
+        names: of the queries and of the database, to stand below each, shortened in the middle.
 
     Raises:
         InputError: no queries or retrievals, numbers of rows that differ, an index beyond the
@@ -66,7 +71,8 @@ def prediction_gallery(
         chosen = _evenly(np.arange(len(queries)), min(rows, len(queries)))
 
     # Inches. Frames and captions are drawn into the gaps.
-    width, gap, between, margin = 1.7, 0.16, 0.34, 0.25
+    width, gap, margin = 1.7, 0.16, 0.25
+    between = 0.34 if names is None else 0.48
     head = 0.85 if title else 0.55
     thumbnails = {
         file: thumbnail(read_image(file), round(width * DPI))
@@ -98,8 +104,12 @@ def prediction_gallery(
         note = "" if positives is None or np.size(positives[query]) else ", no positive exists"
         _caption(axes, f"query {query}{note}", INK)
         axes.spines[:].set(color=GREY, linewidth=0.5)
+        if names is not None:
+            _name(axes, names[0][query])
         for rank, index in enumerate(shown[query]):
             axes = place(row, rank + 1, thumbnails[database[index]])
+            if names is not None:
+                _name(axes, names[1][int(index)])
             caption = f"{rank + 1}   {similarities[query, rank]:.3f}"
             if right is None:
                 axes.spines[:].set(color=GREY, linewidth=0.5)
@@ -179,3 +189,27 @@ def thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray,
 
 def _caption(axes: Axes, text: str, colour: str) -> None:
     axes.set_xlabel(text, fontsize=9, color=colour, loc="left", labelpad=4)
+
+
+def _name(axes: Axes, name: str) -> None:
+    # Below the caption; a dollar sign in a name is no formula.
+    axes.annotate(
+        shortened(name, _NAME),
+        (0, 0),
+        xycoords="axes fraction",
+        xytext=(0, -18),
+        textcoords="offset points",
+        va="top",
+        fontsize=7,
+        family="monospace",
+        color=GREY,
+        parse_math=False,
+    )
+
+
+def shortened(text: str, most: int) -> str:
+    """The text in at most so many characters: its beginning and its end."""
+    if len(text) <= most:
+        return text
+    end = (most - 1) // 2
+    return f"{text[: most - 1 - end]}\N{HORIZONTAL ELLIPSIS}{text[len(text) - end :]}"

@@ -6,12 +6,16 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import durable_path, write_npy
-from crisalad_jax.retrieval import Neighbours
+from crisalad_jax.retrieval import Neighbours, exact_similarities, rounding
+from crisalad_jax.rows import check_rows
 from crisalad_jax.stores.ties import lower_first
+
+_SPARE = 16
+"""Candidates beyond k, for products that float32 cannot tell apart."""
 
 
 class FileStore:
@@ -66,30 +70,62 @@ class FileStore:
         return rows
 
     def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
-        """See `Store`."""
-        import faiss
+        """See `Store`.
 
+        FAISS multiplies in float32 and names candidates, whose products differ with the segment and
+        the number of queries; those are then summed in float64 and rounded once.
+        """
         firsts = self._firsts[: bisect.bisect_left(self._firsts, count)]
 
         def ask(queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
-            best = Neighbours(
-                np.empty((len(queries), 0), np.int64), np.empty((len(queries), 0), np.float32)
-            )
-            for first in firsts:
-                block = np.ascontiguousarray(self._open(first), np.float32)
-                similarities, indices = faiss.knn(
-                    queries, block, min(k, len(block)), metric=faiss.METRIC_INNER_PRODUCT
-                )
-                both = np.concatenate([best.similarities, similarities], axis=1)
-                numbers = np.concatenate([best.indices, indices + first], axis=1)
-                order = np.argsort(-both, axis=1, kind="stable")[:, :k]
-                best = Neighbours(
-                    np.take_along_axis(numbers, order, axis=1),
-                    np.take_along_axis(both, order, axis=1),
-                )
-            return best
+            return self._exact(queries, self._candidates(queries, k, firsts), firsts)
 
-        return lower_first(ask, np.ascontiguousarray(queries, np.float32), k, count)
+        # What was left out is off by `rounding` at most, and so is what was taken in its place.
+        return lower_first(
+            ask,
+            np.ascontiguousarray(queries, np.float32),
+            k,
+            count,
+            spare=_SPARE,
+            margin=2 * rounding(self._length),
+        )
+
+    def _candidates(
+        self, queries: Float32[np.ndarray, "q d"], k: int, firsts: Sequence[int]
+    ) -> Int64[np.ndarray, "q k"]:
+        """Numbers of the k largest products in float32 of each query, in these segments."""
+        import faiss
+
+        numbers = np.empty((len(queries), 0), np.int64)
+        products = np.empty((len(queries), 0), np.float32)
+        for first in firsts:
+            block = np.ascontiguousarray(self._open(first), np.float32)
+            check_rows(block, str(self._path(first)), range(len(block)), unit=True)
+            found, places = faiss.knn(
+                queries, block, min(k, len(block)), metric=faiss.METRIC_INNER_PRODUCT
+            )
+            products = np.concatenate([products, found], axis=1)
+            numbers = np.concatenate([numbers, places + first], axis=1)
+            order = np.argsort(-products, axis=1, kind="stable")[:, :k]
+            products = np.take_along_axis(products, order, axis=1)
+            numbers = np.take_along_axis(numbers, order, axis=1)
+        return numbers
+
+    def _exact(
+        self,
+        queries: Float32[np.ndarray, "q d"],
+        numbers: Int64[np.ndarray, "q k"],
+        firsts: Sequence[int],
+    ) -> Neighbours:
+        """Exact similarities of candidates, whose rows alone are read."""
+        similarities = np.empty(numbers.shape, np.float32)
+        for first in firsts:
+            rows = self._open(first)
+            query, column = np.nonzero((numbers >= first) & (numbers < first + len(rows)))
+            similarities[query, column] = exact_similarities(
+                queries, rows, query, numbers[query, column] - first
+            )
+        return Neighbours(numbers, similarities)
 
     def close(self) -> None:
         """See `Store`: there are none."""

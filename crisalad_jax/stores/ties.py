@@ -11,18 +11,34 @@ Ask = Callable[[Float32[np.ndarray, "q d"], int], Neighbours]
 """Queries and k, to the k most similar of each, the order of equals being no matter."""
 
 
-def lower_first(ask: Ask, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+def lower_first(
+    ask: Ask,
+    queries: Float32[np.ndarray, "q d"],
+    k: int,
+    count: int,
+    *,
+    spare: int = 1,
+    margin: float = 0.0,
+) -> Neighbours:
     """What `ask` finds among `count` descriptors, equal ones by number, also at the k-th place.
 
-    One more than k is asked for. Where that is as similar as the k-th, there may be others: those
-    queries ask for more, until the last is less similar.
+    Some more than k are asked for. Where the last of them is as similar as the k-th, there may be
+    others: those queries ask for more, until the last is less similar.
+
+    Args:
+        ask: the search.
+        queries: unit descriptors.
+        k: neighbours per query, at most `count`.
+        count: how many descriptors there are.
+        spare: how many more than k are asked for at first.
+        margin: how much more similar than all that it gave may be what `ask` left out.
     """
-    asked = min(k + 1, count)
+    asked = min(k + spare, count)
     found = _in_order(ask(queries, asked))
     indices, similarities = found.indices[:, :k].copy(), found.similarities[:, :k].copy()
     rows = np.arange(len(queries))
     while asked < count:
-        open_still = found.similarities[:, k - 1] == found.similarities[:, -1]
+        open_still = found.similarities[:, k - 1] <= found.similarities[:, -1] + margin
         rows = rows[open_still]
         if not len(rows):
             break

@@ -16,7 +16,8 @@ from crisalad_jax.checkpoint import load_weights, save_weights
 from crisalad_jax.data.images import list_images
 from crisalad_jax.descriptors import read_descriptors, writer_for
 from crisalad_jax.evaluation import group, read_tokens
-from crisalad_jax.maps import open_map
+from crisalad_jax.map_description import describe_map
+from crisalad_jax.maps import open_for_appending, open_map
 from tests.conftest import BATCH, MODEL, random_params
 from tests.stores.test_stores import ROUNDING, brute_force
 from tests.test_cli import fails, files_in, succeeds
@@ -117,6 +118,21 @@ def test_answers_are_a_table_json_or_a_gallery(folder, queries, tmp_path, capfd,
     # Five rows of a query and five answers, each 204 pixels wide, and wide rather than high.
     assert image.shape[1] > 6 * 204
     assert image.std() > 20
+
+
+def test_a_gallery_shows_so_much_and_says_of_how_much(
+    folder, queries, tmp_path, capfd, monkeypatch
+):
+    monkeypatch.setattr("crisalad_jax.cli.query._ROWS", 2)
+    monkeypatch.setattr("crisalad_jax.cli.query._COLUMNS", 3)
+    picture, answers = tmp_path / "g.png", tmp_path / "a.jsonl"
+    asked = ("--k", 7, "--gallery", picture, "--json", answers)
+    said = succeeds(capfd, *query(folder, queries, *asked))
+    assert f"{picture}: 2 of 5 queries in a map of 7 images" in said
+    assert f"{answers}: 5 queries in a map of 7 images" in said
+    # A query and three answers of 1.7 inches at 120 dots; the next would be beyond 1,000.
+    assert 4 * 204 < cv2.imread(str(picture)).shape[1] < 1000
+    assert len(json.loads(answers.read_text().splitlines()[0])["neighbours"]) == 7
 
 
 def test_queries_are_searched_for_in_portions_all_the_same(
@@ -239,6 +255,11 @@ def test_a_map_keeps_its_settings(shared, folder, database, capfd, flags, words)
         (("{map}/none.jpg",), "none.jpg: cannot read: No such file"),
         (("{map}/segments",), "segments: found no image"),
         (("{images}", "--gallery", "{map}"), "map: found a folder, expected a file"),
+        (("{images}", "--map-images", "{map}"), "--map-images: found without --gallery, expected"),
+        (
+            ("{images}", "--json", "{map}/x", "--gallery", "{map}/../map/x"),
+            "x, as --json, expected two files",
+        ),
         (("{images}", "--json", "{map}"), "map: found a folder, expected a file"),
         (("{images}", "--map", "{images}"), "and no map.json, expected a map"),
         (("{images}", "--map", "{map}/none"), "none: found no map, expected a folder that"),
@@ -254,6 +275,44 @@ def test_a_folder_without_a_readable_image_makes_no_images(shared, tmp_path, cap
     (tmp_path / "images" / "a.jpg").write_bytes(b"none")
     made = index(shared, tmp_path / "images", tmp_path / "map", "--on-bad-image", "skip")
     fails(capfd, *made, words=("found 1 images, none of them readable",))
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_command_that_failed_binds_the_corrected_one_to_nothing(
+    shared, database, tmp_path, capfd
+):
+    """No server answers; then a kill has left a map of other settings without an image."""
+    out = tmp_path / "map"
+    nowhere = ("--store", "milvus:http://127.0.0.1:9")
+    fails(capfd, *index(shared, database, out, *nowhere), words=("Fail connecting",))
+    assert not out.exists()
+    params, config = load_weights(shared / "weights.safetensors")
+    other = describe_map(params, config, tmp_path / "w", out, dtype="float16")
+    other = dataclasses.replace(other, model="0" * 64)
+    with open_for_appending(out, other):
+        pass
+    succeeds(capfd, *index(shared, database, out, "--dtype", "float32"))
+    with open_map(out) as found:
+        assert (len(found), found.description.dtype) == (7, "float32")
+
+
+def test_positions_of_images_that_are_there_are_said_to_stay(
+    shared, folder, database, tmp_path, capfd, monkeypatch
+):
+    table = tmp_path / "positions.csv"
+    known = list_images(database)
+    table.write_text(f"name,east,north\n{known[0].name},1,2\n{known[1].name},3,4\nno.jpg,5,6\n")
+    made = index(shared, database, folder, "--positions", table)
+    assert "2 positions given are of such, and stay as they are" in succeeds(capfd, *made)
+    with open_map(folder) as found:
+        assert found.images[0].position not in ((1.0, 2.0), None)
+    images = tmp_path / "images"
+    images.mkdir()
+    (images / "new.png").write_bytes(known[0].read_bytes())
+    table.write_text("name,lat,lon\nnew.png,1,2\n")
+    monkeypatch.setattr("crisalad_jax.indexing.describe_alone", None)  # nothing is described
+    made = index(shared, images, folder, "--positions", table)
+    fails(capfd, *made, words=("found positions in lat, lon, expected east, north as in the map",))
 
 
 @pytest.mark.slow

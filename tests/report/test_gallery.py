@@ -6,7 +6,7 @@ import pytest
 
 from crisalad_jax import report
 from crisalad_jax.errors import InputError
-from crisalad_jax.report.gallery import _choose_queries
+from crisalad_jax.report.gallery import _choose_queries, shortened
 from tests.report.pictures import GREEN, RED, boxes_of, is_colour, near_colour, read_picture
 
 
@@ -116,6 +116,27 @@ def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
     with pytest.raises(InputError, match=r"database.1\.png: found an empty file"):
         _gallery(photographs, path, [[0, 1]], [[0]])
     assert not path.exists()
+
+
+def test_names_stand_below_the_captions_as_they_are(photographs, tmp_path):
+    """Ink in the row of names where there are names; a name with dollars is drawn as any other."""
+    names = ["$x_1$"], ["a" * 200, "", *"cdef"]
+    picture = _gallery(photographs, tmp_path / "g.png", [[0, 1]], None, names=names)
+    plain = _gallery(photographs, tmp_path / "p.png", [[0, 1]], None)
+    width = picture.shape[1]
+    assert width == plain.shape[1]
+    assert picture.shape[0] == pytest.approx(plain.shape[0] + 0.14 * 120, abs=1)
+    ink = [(picture[-60:-44, left : left + 204] < 200).any(axis=(0, 2)) for left in (30, 273, 496)]
+    assert [part.any() for part in ink] == [True, True, False]
+    # 28 letters of one width fill a picture's width, and not more; five take less.
+    assert 180 < np.flatnonzero(ink[1])[-1] < 203
+    assert np.flatnonzero(ink[0])[-1] < 60
+
+
+def test_long_names_are_shortened_in_the_middle():
+    assert shortened("abcdefgh", 8) == "abcdefgh"
+    assert shortened("abcdefghi", 8) == "abcd\N{HORIZONTAL ELLIPSIS}ghi"
+    assert shortened("abcdefghi", 7) == "abc\N{HORIZONTAL ELLIPSIS}ghi"
 
 
 def test_gallery_shows_the_queries_chosen_in_their_order(photographs, tmp_path):

@@ -8,7 +8,7 @@ import pymilvus
 import pytest
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.retrieval import Neighbours
+from crisalad_jax.retrieval import Neighbours, search
 from crisalad_jax.stores import Store, milvus, open_store, store_name
 from crisalad_jax.stores.ties import lower_first
 
@@ -145,6 +145,29 @@ def test_a_damaged_file_is_found_when_the_map_is_opened(tmp_path, spoil, words):
     path.write_bytes(spoil(path.read_bytes()))
     with pytest.raises(InputError, match=rf"0000000000\.npy: {words}"):
         store.check([(0, 3)])
+
+
+def test_files_give_the_bits_of_an_exact_search_whatever_else_is_asked(tmp_path):
+    """Of copies in two segments, products in float32 differ with what else is multiplied."""
+    generator = np.random.default_rng(0)
+    first = unit_rows(256, length=96)
+    rows = np.concatenate([first, first[generator.choice(256, 37, replace=False)]])
+    queries = unit_rows(200, seed=1, length=96)
+    queries[:100] = rows[generator.choice(256, 100)]
+    store = open_store("files", tmp_path, collection="", length=96, dtype="float32", new=True)
+    fill(store, rows, (256, 37))
+    expected = search(rows, queries, 2)
+    for size in (200, 7, 1):
+        parts = [store.search(queries[i : i + size], 2, 293) for i in range(0, 200, size)]
+        for found, wanted in zip(zip(*parts, strict=True), expected, strict=True):
+            np.testing.assert_array_equal(np.concatenate(found), wanted)
+
+
+def test_files_find_the_lower_number_among_more_copies_than_are_asked_for_at_first(tmp_path):
+    store = opened(tmp_path, "files")
+    rows = np.tile(unit_rows(1), (60, 1))
+    fill(store, rows, (1, 3, 40, 16))
+    assert store.search(rows[:3], 4, 60).indices.tolist() == [[0, 1, 2, 3]] * 3
 
 
 # Milvus
@@ -324,3 +347,20 @@ def test_any_choice_among_equals_becomes_the_lower_number(seed):
     np.testing.assert_array_equal(
         found.similarities, np.take_along_axis(similarities, expected, axis=1)
     )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_candidates_that_are_off_by_the_margin_hide_nothing(seed):
+    """`ask` chooses by similarities that are off by 0.1 at most, and gives the right ones."""
+    generator = np.random.default_rng(seed)
+    count, k = 40, 3
+    similarities = generator.integers(0, 20, (1, count)).astype(np.float32) / 50
+    rough = similarities + generator.uniform(-0.1, 0.1, similarities.shape)
+
+    def ask(part: np.ndarray, asked: int) -> Neighbours:
+        indices = np.argsort(-rough, axis=1)[:, :asked]
+        return Neighbours(indices, np.take_along_axis(similarities, indices, axis=1))
+
+    found = lower_first(ask, np.zeros((1, 1), np.float32), k, count, margin=0.2 + 1e-6)
+    expected = np.argsort(-similarities, axis=1, kind="stable")[:, :k]
+    np.testing.assert_array_equal(found.indices, expected)
