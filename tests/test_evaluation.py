@@ -350,18 +350,20 @@ def test_an_observer_sees_the_descriptors_of_each_grouping(
     seen = {}
 
     def observe(grouping: str, database: np.ndarray, queries: np.ndarray) -> None:
+        assert grouping not in seen  # of several shuffles the first alone
         seen[grouping] = database, queries
 
     results = evaluate(
         params,
         MODEL,
         benchmark,
-        groupings=("single", "sequential"),
+        groupings=("single", "sequential", "shuffled"),
         batch_size=BATCH,
+        seeds=2,
         observe=observe,
         quiet=True,
     )
-    assert list(seen) == ["single", "sequential"]
+    assert list(seen) == ["single", "sequential", "shuffled"]
     first = describe(params, images[:BATCH], MODEL)
     np.testing.assert_allclose(seen["sequential"][0][:BATCH], first, rtol=0, atol=TOLERANCE)
     for result in results:

@@ -7,7 +7,7 @@ from typing import Literal
 from crisalad_jax.checkpoint import model_hash
 from crisalad_jax.cli.common import console, model_of
 from crisalad_jax.config import ModelConfig
-from crisalad_jax.data.images import list_images
+from crisalad_jax.data.images import list_images, names_in
 from crisalad_jax.data.positions import read_positions, utm_positions
 from crisalad_jax.errors import InputError
 from crisalad_jax.groupings import check_grouping
@@ -61,7 +61,7 @@ def run(arguments: Index) -> None:
     if not has_images(arguments.out):
         found = None  # what a kill left before there was an image binds to nothing
     paths = list_images(arguments.images)
-    names = [path.relative_to(arguments.images).as_posix() for path in paths]
+    names = names_in(arguments.images, paths)
     if arguments.positions is None:
         positions = utm_positions(names)
     else:
@@ -104,8 +104,6 @@ def run(arguments: Index) -> None:
         + (f"; {len(result.unreadable)} unreadable left out" if result.unreadable else "")
         + f"; {count} descriptors of {description.descriptor_length} numbers ({description.store})",
         soft_wrap=True,
-        markup=False,
-        highlight=False,
     )
 
 

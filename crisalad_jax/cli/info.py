@@ -124,6 +124,6 @@ def _describe_map(folder: pathlib.Path, arguments: Info) -> None:
         }
     width = max(map(len, summary))
     lines = (f"{name:<{width}}  {value}" for name, value in summary.items())
-    console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+    console.print("\n".join(lines), soft_wrap=True, highlight=False)
     if arguments.json is not None:
         write_json(arguments.json, summary)

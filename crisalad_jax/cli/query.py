@@ -97,8 +97,6 @@ def run(arguments: Query) -> None:
             console.print(
                 f"{path}: {_some(len(paths), most)} queries in a map of {len(opened)} images",
                 soft_wrap=True,
-                markup=False,
-                highlight=False,
             )
 
 
