@@ -67,10 +67,10 @@ def test_appended_in_portions_or_at_once_the_bits_are_the_same(
     monkeypatch.setattr(crisalad_jax.indexing, "SEGMENT", segment)
     paths = list_images(database)
     whole = index(tmp_path / "whole", params, database)
-    assert whole == Indexed(added=7, there=0, positions=7, unreadable=[])
+    assert whole == Indexed(added=7, there=0, positions=7, stay=0, unreadable=[])
     for stop in (3, 4, 7):
         portion = index(tmp_path / "parts", params, database, paths[:stop])
-    assert portion == Indexed(added=3, there=4, positions=3, unreadable=[])
+    assert portion == Indexed(added=3, there=4, positions=3, stay=4, unreadable=[])
     segments = {1: 2, 256: 1}[segment]
     assert len(list((tmp_path / "whole" / "segments").glob("*.npy"))) == segments
     with open_map(tmp_path / "whole") as one, open_map(tmp_path / "parts") as other:
@@ -86,7 +86,7 @@ def test_an_unreadable_image_ends_it_or_is_left_out(params, database, tmp_path):
     with pytest.raises(InputError, match=f"{paths[5].name}: found 8 bytes that do not decode"):
         index(tmp_path / "stopped", params, database)
     result = index(tmp_path / "map", params, database, on_bad_image="skip")
-    assert result == Indexed(added=6, there=0, positions=6, unreadable=[paths[5].name])
+    assert result == Indexed(added=6, there=0, positions=6, stay=0, unreadable=[paths[5].name])
     with open_map(tmp_path / "map") as found:
         assert len(found) == 6
         assert found.image(paths[5].name) is None
