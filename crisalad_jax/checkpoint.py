@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import safetensors
-import safetensors.numpy
 
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_source
+from crisalad_jax.files import check_source, write_safetensors
 from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import differences, from_plain, to_plain
@@ -25,6 +24,10 @@ FORMAT = "crisalad-jax 1"
 """The one key of a weight file's metadata; its value is the configuration as JSON."""
 EXTRA = "extra."
 """What names of arrays begin with that are kept for the way back to a public checkpoint alone."""
+
+_FREE = ("image_size", "compute_dtype", "keeps")
+_FREE_OF_PARTS = (("salad", "dropout"), ("encoder", "dropout"))
+"""What a model is asked for: the same parameters serve whatever these are."""
 
 
 def save_weights(
@@ -43,14 +46,7 @@ def save_weights(
     """
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
-    metadata = {FORMAT: json.dumps(to_plain(config))}
-    with atomic_path(path) as temporary:
-        try:
-            safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
-        except safetensors.SafetensorError as error:  # a full disk too
-            raise InputError(f"{path}: cannot be written: {error}") from error
-        # The library makes files that only their owner can read.
-        temporary.chmod(0o644)
+    write_safetensors(path, arrays, {FORMAT: json.dumps(to_plain(config))})
 
 
 def is_ours(path: str | os.PathLike[str]) -> bool:
@@ -113,14 +109,13 @@ def load_weights(
 
 
 def _with_free_fields_of(other: ModelConfig, config: ModelConfig) -> ModelConfig:
-    return dataclasses.replace(
-        config,
-        image_size=other.image_size,
-        compute_dtype=other.compute_dtype,
-        keeps=other.keeps,
-        salad=dataclasses.replace(config.salad, dropout=other.salad.dropout),
-        encoder=dataclasses.replace(config.encoder, dropout=other.encoder.dropout),
-    )
+    parts = {
+        part: dataclasses.replace(
+            getattr(config, part), **{field: getattr(getattr(other, part), field)}
+        )
+        for part, field in _FREE_OF_PARTS
+    }
+    return dataclasses.replace(config, **{f: getattr(other, f) for f in _FREE}, **parts)
 
 
 def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:
@@ -161,10 +156,10 @@ def model_hash(params: Crisalad, config: ModelConfig) -> str:
     weights and for its copy in another layout.
     """
     plain = to_plain(config)
-    for part, field in (("", "image_size"), ("", "compute_dtype"), ("", "keeps")):
-        (plain[part] if part else plain).pop(field)
-    for part in ("salad", "encoder"):
-        plain[part].pop("dropout")
+    for field in _FREE:
+        plain.pop(field)
+    for part, field in _FREE_OF_PARTS:
+        plain[part].pop(field)
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for name, leaf in sorted(named_leaves(params).items()):
         array = np.ascontiguousarray(leaf)

@@ -19,7 +19,7 @@ import safetensors.numpy
 from crisalad_jax.checkpoint import is_ours, load_extras, load_weights, save_weights
 from crisalad_jax.config import ModelConfig, ViTConfig, choose
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_source, check_target
+from crisalad_jax.files import atomic_path, check_source, check_target, write_safetensors
 from crisalad_jax.layouts import LAYOUTS, State, check_holds, infer, to_params, to_state
 from crisalad_jax.model import Crisalad
 from crisalad_jax.nn.vit import Block, ViT
@@ -213,9 +213,7 @@ def write_checkpoint(
     check_holds(config, layout, extras)
     state = to_state(params, config, layout, extras)
     if layout == "huggingface":
-        with atomic_path(path) as temporary:
-            safetensors.numpy.save_file(state, temporary, metadata={"format": "pt"})
-            temporary.chmod(0o644)
+        write_safetensors(path, state, {"format": "pt"})
         return
     torch = _torch(f"write {path}")
     content: Any = {

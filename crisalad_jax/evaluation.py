@@ -3,7 +3,7 @@
 import functools
 import pathlib
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Int64
 from crisalad_jax import platform
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
+from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage, image_batches
 from crisalad_jax.errors import InputError
 from crisalad_jax.groupings import (
     DEFAULT_GROUPINGS,
@@ -61,6 +61,33 @@ def read_tokens(
         InputError: an image cannot be read, and `on_bad_image` is "stop".
     """
     parts: list[tuple[np.ndarray, ...]] = []
+    stream = tokens_in_batches(
+        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image, cache=cache
+    )
+    with progress_bar(label, len(paths), "images", quiet=quiet) as bar:
+        for tokens, batch in stream:
+            used = int((batch.indices >= 0).sum())
+            parts.append(tuple(leaf[:used] for leaf in tokens))
+            bar.advance(used)
+    return FolderTokens(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+
+
+def tokens_in_batches(
+    params: Crisalad,
+    config: ModelConfig,
+    paths: Sequence[pathlib.Path],
+    *,
+    batch_size: int,
+    on_bad_image: OnBadImage = "stop",
+    cache: ImageCache | None = None,
+) -> Iterator[tuple[FolderTokens, ImageBatch]]:
+    """Tokens of images in order, a batch at a time with what it was made of; the last is padded.
+
+    Two batches are in memory, and images that are read ahead.
+
+    Raises:
+        InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
+    """
     batches = image_batches(
         paths,
         image_size=config.image_size,
@@ -70,23 +97,20 @@ def read_tokens(
     )
     devices = devices_for(batch_size)
     params = devices.share(params)
-    with progress_bar(label, len(paths), "images", quiet=quiet) as bar:
 
-        def collect(tokens: Tokens, valid: Bool[np.ndarray, " image"], used: int) -> None:
-            found = *jax.device_get((tokens.global_token, tokens.local)), valid
-            parts.append(tuple(leaf[:used] for leaf in found))
-            bar.advance(used)
+    def back(tokens: Tokens, batch: ImageBatch) -> tuple[FolderTokens, ImageBatch]:
+        global_tokens, local = jax.device_get((tokens.global_token, tokens.local))
+        return FolderTokens(global_tokens, local, batch.valid), batch
 
-        ahead = None
-        for batch in batches:
-            tokens = tokenise(params, devices.spread(batch.images), config)
-            # While the device is at this one, the one before comes back.
-            if ahead is not None:
-                collect(*ahead)
-            ahead = (tokens, batch.valid, int((batch.indices >= 0).sum()))
+    ahead = None
+    for batch in batches:
+        tokens = tokenise(params, devices.spread(batch.images), config)
+        # While the device is at this one, the one before comes back.
         if ahead is not None:
-            collect(*ahead)
-    return FolderTokens(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+            yield back(*ahead)
+        ahead = (tokens, batch)
+    if ahead is not None:
+        yield back(*ahead)
 
 
 def group(

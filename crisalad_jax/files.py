@@ -6,7 +6,7 @@ import os
 import pathlib
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -111,6 +111,25 @@ def write_npy(path: pathlib.Path, array: np.ndarray) -> None:
         header = np.lib.format.header_data_from_array_1_0(array)
         np.lib.format.write_array_header_1_0(file, header)
         file.write(array.data)
+
+
+def write_safetensors(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
+) -> None:
+    """Write arrays in C order and texts as a safetensors file, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    import safetensors.numpy  # which those who write no weights need not load
+
+    with atomic_path(path) as temporary:
+        try:
+            safetensors.numpy.save_file(dict(arrays), temporary, metadata=dict(metadata))
+        except safetensors.SafetensorError as error:  # a full disk too
+            raise InputError(f"{path}: cannot be written: {error}") from error
+        # The library makes files that only their owner can read.
+        temporary.chmod(0o644)
 
 
 @contextlib.contextmanager

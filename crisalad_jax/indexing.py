@@ -4,19 +4,16 @@ import pathlib
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float32, Int64
 
 from crisalad_jax.config import ModelConfig
-from crisalad_jax.data.loader import ImageBatch, OnBadImage, image_batches
+from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import FolderTokens, group
+from crisalad_jax.evaluation import group, tokens_in_batches
 from crisalad_jax.maps import Map
-from crisalad_jax.model import Crisalad, tokenise
-from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.platform import devices_for
+from crisalad_jax.model import Crisalad
 from crisalad_jax.progress import progress_bar
 
 SEGMENT = 256
@@ -48,30 +45,15 @@ def describe_alone(
     Raises:
         InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
     """
-    batches = image_batches(
-        paths, image_size=config.image_size, batch_size=batch_size, on_bad_image=on_bad_image
+    stream = tokens_in_batches(
+        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image
     )
-    devices = devices_for(batch_size)
-    shared = devices.share(params)
-
-    def finish(tokens: Tokens, batch: ImageBatch) -> Described:
-        on_host = jax.device_get(tokens)
-        found = FolderTokens(on_host.global_token, on_host.local, batch.valid)
-        descriptors = group(params, config, found, "single", batch_size=batch_size)
+    for tokens, batch in stream:
+        descriptors = group(params, config, tokens, "single", batch_size=batch_size)
         unreadable = (batch.indices >= 0) & ~batch.valid
-        return Described(
+        yield Described(
             batch.indices[batch.valid], descriptors[batch.valid], batch.indices[unreadable]
         )
-
-    ahead = None
-    for batch in batches:
-        tokens = tokenise(shared, devices.spread(batch.images), config)
-        # While the device is at this one, the one before is finished.
-        if ahead is not None:
-            yield finish(*ahead)
-        ahead = (tokens, batch)
-    if ahead is not None:
-        yield finish(*ahead)
 
 
 class Indexed(NamedTuple):

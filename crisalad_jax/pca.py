@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import safetensors
-import safetensors.numpy
 from jaxtyping import Float, Float32, Float64
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_source
+from crisalad_jax.files import check_source, write_safetensors
 from crisalad_jax.progress import Bar, progress_bar
 from crisalad_jax.rows import as_rows, pieces, sample
 from crisalad_jax.serial import from_plain, to_plain
@@ -233,14 +232,7 @@ def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
         InputError: the file cannot be written.
     """
     arrays = {name: np.array(getattr(pca, name), order="C") for name in _ARRAYS}
-    metadata = {FORMAT: json.dumps(to_plain(pca.config))}
-    with atomic_path(path) as temporary:
-        try:
-            safetensors.numpy.save_file(arrays, temporary, metadata=metadata)
-        except safetensors.SafetensorError as error:  # a full disk too
-            raise InputError(f"{path}: cannot be written: {error}") from error
-        # The library makes files that only their owner can read.
-        temporary.chmod(0o644)
+    write_safetensors(path, arrays, {FORMAT: json.dumps(to_plain(pca.config))})
 
 
 def load_pca(path: str | os.PathLike[str]) -> Pca:

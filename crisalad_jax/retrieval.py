@@ -19,7 +19,7 @@ from crisalad_jax import platform
 from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.errors import InputError
 from crisalad_jax.progress import progress_bar
-from crisalad_jax.rows import KEPT, UNIT_TOLERANCE, WIDE, Block, aligned, as_rows, blocks
+from crisalad_jax.rows import KEPT, UNIT_TOLERANCE, WIDE, Block, aligned, as_sides, blocks
 
 # Queries compared at a time: with 4,096 database rows their similarities are 16 MiB.
 _QUERY_CHUNK = 1024
@@ -77,12 +77,7 @@ def search(
     for name, value in (("k", k), ("chunk", chunk)):
         if value < 1:
             raise InputError(f"{name}: found {value}, expected at least 1")
-    database, queries = as_rows(database, "database"), as_rows(queries, "queries")
-    if database.shape[1] != queries.shape[1]:
-        raise InputError(
-            f"queries: found descriptors of length {queries.shape[1]}, "
-            f"expected {database.shape[1]} as in the database"
-        )
+    database, queries = as_sides(database, queries)
 
     count, k = len(database), min(k, len(database))
     chunk = _even(count, chunk, len(jax.local_devices()) * _GROUP)

@@ -43,6 +43,23 @@ def as_rows(array: np.ndarray, name: str) -> Float[np.ndarray, "n d"]:
     return array
 
 
+def as_sides(
+    database: np.ndarray, queries: np.ndarray
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "q d"]]:
+    """Database and queries as matrices of descriptors (see `as_rows`) of one length.
+
+    Raises:
+        InputError: one is no matrix, or empty; or their lengths differ.
+    """
+    database, queries = as_rows(database, "database"), as_rows(queries, "queries")
+    if database.shape[1] != queries.shape[1]:
+        raise InputError(
+            f"queries: found descriptors of length {queries.shape[1]}, "
+            f"expected {database.shape[1]} as in the database"
+        )
+    return database, queries
+
+
 class Block(NamedTuple):
     """Some rows that follow each other."""
 

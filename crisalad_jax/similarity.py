@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-from crisalad_jax.errors import InputError
-from crisalad_jax.rows import WIDE, Block, aligned, as_rows, blocks
+from crisalad_jax.rows import WIDE, Block, aligned, as_sides, blocks
 
 # Queries and database rows compared at a time: their similarities are 32 MiB.
 _QUERY_CHUNK, _DATABASE_CHUNK = 1024, 8192
@@ -23,12 +22,7 @@ def similarity_map(
     Raises:
         InputError: as `retrieval.search`.
     """
-    database, queries = as_rows(database, "database"), as_rows(queries, "queries")
-    if database.shape[1] != queries.shape[1]:
-        raise InputError(
-            f"queries: found descriptors of length {queries.shape[1]}, "
-            f"expected {database.shape[1]} as in the database"
-        )
+    database, queries = as_sides(database, queries)
     rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
     found = np.full((rows[-1] + 1, columns[-1] + 1), -np.inf, np.float32)
     sizes = min(_DATABASE_CHUNK, len(database)), min(_QUERY_CHUNK, len(queries))

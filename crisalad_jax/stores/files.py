@@ -119,11 +119,12 @@ class FileStore:
     ) -> Neighbours:
         """Exact similarities of candidates, whose rows alone are read."""
         similarities = np.empty(numbers.shape, np.float32)
-        for first in firsts:
-            rows = self._open(first)
-            query, column = np.nonzero((numbers >= first) & (numbers < first + len(rows)))
+        segments = np.searchsorted(firsts, numbers, side="right") - 1
+        for segment in np.unique(segments):
+            first = firsts[segment]
+            query, column = np.nonzero(segments == segment)
             similarities[query, column] = exact_similarities(
-                queries, rows, query, numbers[query, column] - first
+                queries, self._open(first), query, numbers[query, column] - first
             )
         return Neighbours(numbers, similarities)
 
