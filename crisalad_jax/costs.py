@@ -62,8 +62,9 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
     if backbone.adapter.kind != "none":
         costs["adapters"] = depth * adapter_macs(config)
     if encoder.layers:
-        width = config.token_dim
-        pieces = config.local_tokens + (config.global_dim // width if encoder.global_token else 0)
+        shape = config.shape
+        width = shape.token_dim
+        pieces = shape.tokens + (shape.global_dim // width if encoder.global_token else 0)
         per_token = 4 * width**2 + 2 * width * encoder.feedforward + 2 * images * width
         costs["cross-image encoder"] = encoder.layers * pieces * per_token
     return costs

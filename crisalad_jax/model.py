@@ -39,7 +39,7 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     return Crisalad(
         backbone=init_vit(backbone, config.backbone),
         aggregator=init_aggregator(aggregator, config),
-        encoder=init_cross_image(encoder, config.token_dim, config.encoder)
+        encoder=init_cross_image(encoder, config.shape.token_dim, config.encoder)
         if config.encoder.layers
         else None,
     )

@@ -22,7 +22,7 @@ from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.nn.vit import Block
 from crisalad_jax.pytree import named_leaves
 
-ADAPTERS_AND_HEAD, ALL = "adapters+head", "all"
+HEAD, ADAPTERS_AND_HEAD, ALL = "head", "adapters+head", "all"
 STATISTICS = (".running_mean", ".running_var")
 """Batch-norm statistics, which never train: they are measured, not learnt."""
 _LAST_BLOCKS = re.compile(r"last-(\d+)-blocks\+head")
@@ -65,10 +65,11 @@ def spreads_images(trains: str) -> bool:
 def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     """Split into (trainable, frozen): the model's structure, None for the other's leaves.
 
-    `trains` is "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "all", or
-    "last-N-blocks+head" (SALAD: the last N blocks, the final layer norm, and the head). But for
-    "all", the stack of blocks is cut in two, and `merge_params` makes it one again: no gradient
-    passes the frozen blocks before the last N, nor all of a first block whose adapter alone trains.
+    `trains` is "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "head" (the
+    last two alone), "all", or "last-N-blocks+head" (SALAD: the last N blocks, the final layer norm,
+    and the head). Where some of the blocks train, their stack is cut in two, and `merge_params`
+    makes it one again: no gradient passes the frozen blocks before the last N, nor all of a first
+    block whose adapter alone trains.
     Batch-norm statistics stay frozen in every case.
 
     Raises:
@@ -78,6 +79,8 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     match = _LAST_BLOCKS.fullmatch(trains)
     if trains == ALL:
         prefixes: tuple[str, ...] = ("",)
+    elif trains == HEAD:
+        prefixes = head
     elif trains == ADAPTERS_AND_HEAD:
         params = _cut_blocks(params, 1)
         prefixes = (*head, "backbone.blocks.0.adapter.", "backbone.blocks.1.adapter.")
@@ -89,7 +92,7 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
         prefixes = (*head, "backbone.norm.", "backbone.blocks.1.")
     else:
         raise InputError(
-            f"trains: found {trains!r}, expected adapters+head, last-N-blocks+head or all"
+            f"trains: found {trains!r}, expected head, adapters+head, last-N-blocks+head or all"
         )
     names = iter(named_leaves(params))
 

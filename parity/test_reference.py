@@ -361,6 +361,7 @@ Kind = Literal["depthwise", "multi-resolution"]
         ),
         ("last-1-blocks+head", ("backbone.blocks.1.", "backbone.norm.", "aggr", "enc")),
         ("last-0-blocks+head", ("backbone.norm.", "aggr", "enc")),
+        ("head", ("aggr", "enc")),
     ],
 )
 @pytest.mark.parametrize("kind", ["depthwise", "multi-resolution"])
@@ -413,7 +414,7 @@ def test_schedule() -> None:
     assert factors == [0.5, 1, 1, 0.75, 0.5, 0.25, 0]
 
 
-@pytest.mark.parametrize("trains", ["last-3-blocks+head", "head"])
+@pytest.mark.parametrize("trains", ["last-3-blocks+head", "tail"])
 def test_what_cannot_train(trains: str) -> None:
-    with pytest.raises(InputError, match=r"found '.*head', expected adapters\+head, last-N"):
+    with pytest.raises(InputError, match=r"found '.*', expected head, adapters\+head, last-N"):
         freeze(Crisalad(MODEL), trains)

@@ -172,7 +172,7 @@ def test_one_patch_more_than_clusters_is_enough():
             },
             "bottleneck: found 0.25, which is a width of 24 for dim 96; expected a multiple of 16",
         ),
-        (ModelConfig, {"aggregator": "netvlad"}, "ModelConfig.aggregator: found 'netvlad'"),
+        (ModelConfig, {"aggregator": "vlad"}, "ModelConfig.aggregator: found 'vlad'"),
         (
             ModelConfig,
             {"aggregator": "gem-pyramid", "image_size": (28, 56)},
@@ -181,7 +181,7 @@ def test_one_patch_more_than_clusters_is_enough():
         (
             ModelConfig,
             {"aggregator": "gem-pyramid", "encoder": CrossImageConfig(heads=5)},
-            "ViTConfig.dim: found 768, expected a multiple of the cross-image encoder's 5 heads",
+            "aggregator gem-pyramid: found tokens of 768 numbers, expected a multiple of the cross-image encoder's 5 heads",
         ),
         (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
@@ -237,7 +237,7 @@ def test_one_patch_more_than_clusters_is_enough():
         (TrainConfig, {"epochs": 0}, "TrainConfig.epochs: found 0"),
         (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
         (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, .*images_per_place .4"),
-        (TrainConfig, {"trains": "head"}, "TrainConfig.trains: found 'head', expected adapters"),
+        (TrainConfig, {"trains": "tail"}, "TrainConfig.trains: found 'tail', expected head"),
         (TrainConfig, {"trains": "last--1-blocks+head"}, "TrainConfig.trains"),
         (TrainConfig, {"patience": 0}, "TrainConfig.patience: found 0"),
         (TrainConfig, {"seed": -1}, "TrainConfig.seed: found -1"),

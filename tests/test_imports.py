@@ -33,7 +33,7 @@ LAYERS = (
 )
 # Leaves: what each may know of the package.
 LEAVES = {
-    "config": {"errors"},
+    "config": {"errors", "config"},
     "pytree": set(),
     "sinkhorn": {"config", "errors", "pytree"},
     "losses": {"config", "errors"},

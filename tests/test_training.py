@@ -116,7 +116,7 @@ def test_blocks_are_counted_from_the_end(params) -> None:
 
 @pytest.mark.parametrize(
     ("trains", "message"),
-    [("head", "found 'head', expected adapters"), ("last-3-blocks+head", "at most 2")],
+    [("tail", "found 'tail', expected head"), ("last-3-blocks+head", "at most 2")],
 )
 def test_unknown_parts_raise(params, trains: str, message: str) -> None:
     with pytest.raises(InputError, match=message):

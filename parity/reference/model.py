@@ -34,7 +34,9 @@ class Crisalad(nn.Module):
             nn.Sequential(UnitPatches(), GemPyramid()) if kind == "gem-pyramid" else None
         )
         self.encoder = (
-            CrossImageEncoder(config.token_dim, config.encoder) if config.encoder.layers else None
+            CrossImageEncoder(config.shape.token_dim, config.encoder)
+            if config.encoder.layers
+            else None
         )
 
     def forward(self, images: Tensor, mask: Tensor | None = None) -> Tensor:

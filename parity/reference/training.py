@@ -17,7 +17,7 @@ HEAD = ("aggregator.", "aggregation.", "encoder.")
 def freeze(model: Crisalad, trains: str) -> list[nn.Parameter]:
     """Let gradients flow to the parameters that `trains` names alone, and return those.
 
-    "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "last-N-blocks+head"
+    "head" (aggregator and cross-image encoder), "adapters+head" (the paper), "last-N-blocks+head"
     (SALAD: the last N blocks, the final layer norm, and the head), or "all". Batch-norm statistics
     are buffers and train in no case.
 
@@ -28,6 +28,8 @@ def freeze(model: Crisalad, trains: str) -> list[nn.Parameter]:
     match = re.fullmatch(r"last-(\d+)-blocks\+head", trains)
     if trains == "all":
         prefixes: tuple[str, ...] = ("",)
+    elif trains == "head":
+        prefixes = HEAD
     elif trains == "adapters+head":
         prefixes = (*HEAD, *(f"backbone.blocks.{i}.adapter." for i in range(depth)))
     elif match and int(match[1]) <= depth:
@@ -35,8 +37,8 @@ def freeze(model: Crisalad, trains: str) -> list[nn.Parameter]:
         prefixes = (*HEAD, "backbone.norm.", *(f"backbone.blocks.{i}." for i in last))
     else:
         raise InputError(
-            f"trains: found {trains!r}, expected adapters+head, last-N-blocks+head with N at most "
-            f"{depth}, or all"
+            f"trains: found {trains!r}, expected head, adapters+head, last-N-blocks+head with N at "
+            f"most {depth}, or all"
         )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name.startswith(prefixes))

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from crisalad_jax.config import CrossImageConfig, ModelConfig, SaladConfig
-from crisalad_jax.nn.aggregators import GemPyramid, aggregate, gem_pyramid, init_aggregator, join
+from crisalad_jax.nn.aggregators import aggregate, init_aggregator, join
+from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid, gem_pyramid
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
 

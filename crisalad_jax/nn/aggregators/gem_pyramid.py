@@ -1,4 +1,4 @@
-"""From a backbone's features to an image's tokens: SALAD, CricaVPR's GeM pyramid, a class token."""
+"""CricaVPR's pyramid of generalised means (Lu et al., CVPR 2024)."""
 
 import itertools
 
@@ -7,7 +7,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import PYRAMID_LEVELS, ModelConfig
 from crisalad_jax.nn.layers import Keys, l2_normalise, widen
-from crisalad_jax.nn.salad import Salad, init_salad, published_order, salad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
 from crisalad_jax.pytree import params
@@ -23,38 +22,22 @@ class GemPyramid:
     p: Float[Array, ""]
 
 
-Aggregator = Salad | GemPyramid
+def init(key: PRNGKeyArray, config: ModelConfig) -> GemPyramid:
+    """Start as the public implementation, at an exponent of 3."""
+    return GemPyramid(jnp.full((), 3.0))
 
 
-def init_aggregator(key: PRNGKeyArray, config: ModelConfig) -> Aggregator | None:
-    """Random parameters of `config.aggregator`; a class token has none."""
-    if config.aggregator == "salad":
-        return init_salad(key, config.backbone.dim, config.salad)
-    return GemPyramid(jnp.full((), 3.0)) if config.aggregator == "gem-pyramid" else None
-
-
-def aggregate(
-    params: Aggregator | None,
+def apply(
+    params: GemPyramid,
     features: Features,
     grid: tuple[int, int],
     config: ModelConfig,
     *,
     key: Keys | None,
 ) -> Tokens:
-    """Tokens of one image or of a batch, in float32 at least.
-
-    `grid` is the rows and columns of patches. `key` draws dropout, one for all or one an
-    image; None means inference.
-
-    Raises:
-        InputError: SALAD finds no more patches than clusters.
-    """
-    if isinstance(params, Salad):
-        return salad(params, features, config.salad, key=key)
-    class_token, patches = widen(features.class_token), widen(features.patches)
-    if params is None:
-        return Tokens(class_token, patches[..., :0, :])
-    return Tokens(class_token, gem_pyramid(params, patches, grid))
+    """The class token, and a generalised mean for each region."""
+    means = gem_pyramid(params, widen(features.patches), grid)
+    return Tokens(widen(features.class_token), means)
 
 
 def gem_pyramid(
@@ -79,9 +62,3 @@ def gem_pyramid(
 def _cuts(side: int, level: int) -> list[tuple[int, int]]:
     edges = [round(i * side / level) for i in range(level + 1)]
     return list(itertools.pairwise(edges))
-
-
-def join(tokens: Tokens, config: ModelConfig) -> Float[Array, " descriptor"]:
-    """One unit descriptor: the global token, then the local ones in the published order."""
-    local = published_order(tokens.local) if config.aggregator == "salad" else tokens.local
-    return l2_normalise(jnp.concatenate([tokens.global_token, local.ravel()]))
