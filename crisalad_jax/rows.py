@@ -22,6 +22,8 @@ _ALIGNMENT = 64
 """Bytes on whose multiples XLA's arrays begin."""
 _NEIGHBOURS = 2**21
 """Bytes: the system maps pages around the one that is read, on Linux up to so many."""
+_SCATTERED = 4
+"""Rows far from each other that are read before their pages are let go."""
 
 
 def as_rows(array: np.ndarray, name: str) -> Float[np.ndarray, "n d"]:
@@ -91,6 +93,18 @@ def blocks(
         check_rows(buffer[: len(rows)], name, range(start, len(array)), unit=True)
         yield Block(start, buffer, len(rows))
         start += len(buffer)
+
+
+def gathered(
+    array: Float[np.ndarray, "n d"], places: Int[np.ndarray, " m"]
+) -> Float[np.ndarray, "m d"]:
+    """Rows at some places in rising order, as they are kept or in float32."""
+    rows = np.empty((len(places), array.shape[1]), array.dtype if array.dtype in KEPT else WIDE)
+    for start in range(0, len(places), _SCATTERED):
+        some = places[start : start + _SCATTERED]
+        rows[start : start + _SCATTERED] = array[some]
+        _let_go(array[some[0] : some[-1] + 1])
+    return rows
 
 
 def sample(total: int, count: int, seed: int) -> Int[np.ndarray, " count"]:

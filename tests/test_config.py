@@ -181,7 +181,8 @@ def test_one_patch_more_than_clusters_is_enough():
         (
             ModelConfig,
             {"aggregator": "gem-pyramid", "encoder": CrossImageConfig(heads=5)},
-            "aggregator gem-pyramid: found tokens of 768 numbers, expected a multiple of the cross-image encoder's 5 heads",
+            "aggregator gem-pyramid: found tokens of 768 numbers, expected a multiple of the "
+            "cross-image encoder's 5 heads",
         ),
         (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),

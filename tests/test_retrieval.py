@@ -11,6 +11,7 @@ import pytest
 
 from crisalad_jax import retrieval
 from crisalad_jax.errors import InputError
+from crisalad_jax.rows import as_sides
 from tests.test_platform import in_a_program
 
 
@@ -45,10 +46,23 @@ def _assert_ranked(found, database, queries, k):
         assert len(set(row.tolist())) == len(row)
 
 
+def _by_devices(
+    database: np.ndarray, queries: np.ndarray, k: int, *, chunk: int = 4096
+) -> retrieval.Neighbours:
+    """As on an accelerator; a CPU leaves it to numpy."""
+    return retrieval._search(*as_sides(database, queries), k, chunk, on_host=False)
+
+
+BOTH_WAYS = pytest.mark.parametrize(
+    "search", [pytest.param(retrieval.search, id="numpy"), pytest.param(_by_devices, id="devices")]
+)
+
+
+@BOTH_WAYS
 @pytest.mark.parametrize("chunk", [1, 7, 64, 128, 299, 300, 8192])
-def test_search_agrees_with_brute_force_for_any_chunk(chunk):
+def test_search_agrees_with_brute_force_for_any_chunk(search, chunk):
     database, queries = _random_unit(0, 300, 24), _random_unit(1, 11, 24)
-    found = retrieval.search(database, queries, 10, chunk=chunk)
+    found = search(database, queries, 10, chunk=chunk)
     # These draws have no two similarities within 1e-6 among the first 11: the order is unique.
     indices, similarities = _brute_force(database, queries, 11)
     assert np.diff(similarities, axis=1).max() < -1e-6
@@ -72,12 +86,13 @@ def test_search_walks_queries_in_chunks(monkeypatch):
     _assert_ranked(parts, database, queries, 5)
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("chunk", [1, 3, 100, 128, 130, 1000])
-def test_equal_rows_come_in_database_order(chunk):
+def test_equal_rows_come_in_database_order(search, chunk):
     # Every row stands 100 times, 5 apart, across chunk borders and at every place in a block.
     database = np.tile(_random_unit(6, 5, 200), (100, 1))
     queries = _random_unit(7, 3, 200)
-    found = retrieval.search(database, queries, 150, chunk=chunk)
+    found = search(database, queries, 150, chunk=chunk)
     best = np.argsort(-(queries.astype(np.float64) @ database[:5].astype(np.float64).T), axis=1)
     for row, (first, second, *_) in zip(found.indices, best, strict=True):
         np.testing.assert_array_equal(row[:100], np.arange(100) * 5 + first)
@@ -91,15 +106,17 @@ def test_signed_zeros_are_a_tie():
     np.testing.assert_array_equal(found.indices, [[0, 1, 2]])
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("chunk", [2, 8192])
-def test_k_beyond_the_database_gives_every_image_and_no_padding(chunk):
+def test_k_beyond_the_database_gives_every_image_and_no_padding(search, chunk):
     # All similarities are negative: a padding row of zeros would come first.
     database = np.array([[-1, 0], [-0.6, 0.8], [-0.8, 0.6]], np.float32)
-    found = retrieval.search(database, np.array([[1, 0]], np.float32), 20, chunk=chunk)
+    found = search(database, np.array([[1, 0]], np.float32), 20, chunk=chunk)
     np.testing.assert_array_equal(found.indices, [[1, 2, 0]])
     np.testing.assert_array_equal(found.similarities, np.array([[-0.6, -0.8, -1]], np.float32))
 
 
+@BOTH_WAYS
 @hypothesis.settings(max_examples=40, deadline=None)
 @hypothesis.given(
     count=st.integers(1, 40),
@@ -108,7 +125,7 @@ def test_k_beyond_the_database_gives_every_image_and_no_padding(chunk):
     chunk=st.integers(1, 45),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_small_integers_are_ranked_exactly(count, queries, k, chunk, seed):
+def test_small_integers_are_ranked_exactly(search, count, queries, k, chunk, seed):
     # Rows with four of 16 entries +-0.5 are unit vectors, and their products are exact in float32:
     # many ties, and the float64 stable argsort is the one right answer.
     rng = np.random.default_rng(seed)
@@ -116,7 +133,7 @@ def test_small_integers_are_ranked_exactly(count, queries, k, chunk, seed):
     rows[:, :4] = rng.choice([-0.5, 0.5], (len(rows), 4))
     rows = rng.permuted(rows, axis=1)
     database, wanted = rows[:count], rows[count:]
-    found = retrieval.search(database, wanted, k, chunk=chunk)
+    found = search(database, wanted, k, chunk=chunk)
     indices, similarities = _brute_force(database, wanted, k)
     np.testing.assert_array_equal(found.indices, indices)
     np.testing.assert_array_equal(found.similarities, similarities)
@@ -190,32 +207,37 @@ def test_random_descriptors_with_copies_are_found_as_faiss_does():
     np.testing.assert_array_equal(found.indices, indices)
 
 
-def test_rows_that_float32_products_cannot_tell_apart_are_ranked_exactly():
+@BOTH_WAYS
+def test_rows_that_float32_products_cannot_tell_apart_are_ranked_exactly(search):
     """Their products differ by less than a float32 product errs: a device names the wrong ones."""
     generator = np.random.default_rng(3)
     queries = _random_unit(17, 5, 4000)
     noise = 1e-7 * generator.standard_normal((900, 4000))
     database = (queries[0] + noise).astype(np.float32)
     wanted = (queries.astype(np.float64) @ database.astype(np.float64).T).astype(np.float32)
-    found = retrieval.search(database, queries, 20, chunk=450)
+    found = search(database, queries, 20, chunk=450)
     np.testing.assert_array_equal(found.indices, np.argsort(-wanted, axis=1, kind="stable")[:, :20])
 
 
-def test_all_rows_alike_are_ranked_by_index():
+@BOTH_WAYS
+def test_all_rows_alike_are_ranked_by_index(search):
     """As from a network that has collapsed: every row of every chunk may be among the best."""
     database = _unit(np.ones((500, 33)) + 1e-9).astype(np.float32)
-    found = retrieval.search(database, database[:40], 20, chunk=64)
+    found = search(database, database[:40], 20, chunk=64)
     np.testing.assert_array_equal(found.indices, np.tile(np.arange(20), (40, 1)))
 
 
 _ON_DEVICES = """
 import sys
 import jax, numpy as np
-from crisalad_jax.retrieval import search
+from crisalad_jax import retrieval
 assert len(jax.local_devices()) == int(sys.argv[2])
 arrays = np.load(sys.argv[1])
 for name, (k, chunk) in {"some": (20, 300), "tiny": (3, 1), "all": (700, 4096)}.items():
-    found = search(arrays["database"], arrays["queries"], k, chunk=chunk)
+    # Which a CPU leaves to numpy.
+    found = retrieval._search(
+        arrays["database"], arrays["queries"], k, chunk, on_host=False
+    )
     np.savez(f"{sys.argv[3]}-{name}.npz", *found)
 """
 

@@ -187,7 +187,7 @@ def _contrast(image: Image, change: float) -> Image:
 def _sharpness(image: Image, change: float) -> Image:
     kernel = np.array([[1, 1, 1], [1, 5, 1], [1, 1, 1]], np.float32)
     sums = cv2.filter2D(image, cv2.CV_16S, kernel)
-    smooth = ((2 * sums + 13) // 26).astype(np.uint8)
+    smooth = cv2.convertScaleAbs(sums, alpha=1 / 13)  # no sum is at a half: 13 is odd
     # Pillow's 3x3 filters leave the outermost pixels alone.
     smooth[[0, -1]] = image[[0, -1]]
     smooth[:, [0, -1]] = image[:, [0, -1]]
