@@ -54,20 +54,18 @@ DTYPES = {"float32": np.float32, "bfloat16": ml_dtypes.bfloat16}
 EFFORTS: dict[str, tuple[int | None, ...]] = {"hnsw": (32, None), "ivf-pq": (8, None)}
 """Beside the default; see `Index.search`."""
 _PROGRAM = """
-import json, pathlib, re, sys, time
+import json, pathlib, re, sys
 from crisalad_jax.descriptors import open_npy
 from crisalad_jax.platform import set_up
 from crisalad_jax.retrieval import search
 
 set_up()
 database, queries = map(open_npy, sys.argv[1:3])
-started = time.perf_counter()
 search(database, queries, int(sys.argv[3]), quiet=False)
-seconds = time.perf_counter() - started
 # What getrusage says begins with the memory of the program that started this one.
 status = pathlib.Path("/proc/self/status").read_text(encoding="utf-8")
 memory = 1024 * int(re.search(r"VmHWM:\\s*(\\d+) kB", status)[1])
-print(json.dumps({"seconds": seconds, "memory": memory}))
+print(json.dumps({"memory": memory}))
 """
 
 
@@ -178,7 +176,6 @@ def memory(arguments: argparse.Namespace) -> Study:
             f"{value['rows']:,}",
             f"{value['bytes'] / 1e9:.2f}",
             f"{value['memory'] / 1e9:.2f}",
-            f"{value['seconds']:.0f}",
         )
         for value in values
     ]
@@ -187,7 +184,7 @@ def memory(arguments: argparse.Namespace) -> Study:
         f"descriptors of {arguments.memory_length:,} numbers in {arguments.dtype}: the file and "
         f"the most memory that the program had, in GB ({machine()})."
     )
-    header = ("descriptors", "file", "memory", "seconds")
+    header = ("descriptors", "file", "memory")
     return Study(Table(header, rows, caption, 0), values)
 
 

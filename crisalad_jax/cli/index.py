@@ -62,6 +62,7 @@ def run(arguments: Index) -> None:
         found = None  # what a kill left before there was an image binds to nothing
     paths = list_images(arguments.images)
     names = names_in(arguments.images, paths)
+    here = set(names)
     if arguments.positions is None:
         positions = utm_positions(names)
     else:
@@ -96,11 +97,18 @@ def run(arguments: Index) -> None:
             raise InputError(
                 f"{arguments.images}: found {len(paths)} images, none of them readable"
             )
-    stay = result.stay if arguments.positions is not None else 0
+    given = [] if arguments.positions is None else list(positions.of)
+    stay = result.stay if given else 0
+    strange = [name for name in given if name not in here]
     console.print(
         f"{arguments.out}: {result.added} images added, {result.positions} with positions"
         + (f"; {result.there} were there already" if result.there else "")
         + (f"; {stay} positions given are of such, and stay as they are" if stay else "")
+        + (
+            f"; {len(strange)} positions given are of no image here, {strange[0]!r} the first"
+            if strange
+            else ""
+        )
         + (f"; {len(result.unreadable)} unreadable left out" if result.unreadable else "")
         + f"; {count} descriptors of {description.descriptor_length} numbers ({description.store})",
         soft_wrap=True,

@@ -49,6 +49,7 @@ def run(arguments: Info) -> None:
     if arguments.json is not None:
         check_target(arguments.json)
     if arguments.map is not None:
+        _check_alone(arguments)
         _describe_map(arguments.map, arguments)
         return
     if arguments.weights is not None:
@@ -102,6 +103,16 @@ def run(arguments: Info) -> None:
     console.print("\n".join(lines), soft_wrap=True, highlight=False)
     if arguments.json is not None:
         write_json(arguments.json, summary)
+
+
+def _check_alone(arguments: Info) -> None:
+    """That nothing is asked of a model beside a map."""
+    for field in dataclasses.fields(Info):
+        of_maps = field.name in ("map", "verify", "json")
+        if not of_maps and getattr(arguments, field.name) != field.default:
+            raise InputError(
+                f"--{field.name.replace('_', '-')}: found beside --map, expected it for a model"
+            )
 
 
 def _describe_map(folder: pathlib.Path, arguments: Info) -> None:

@@ -186,6 +186,8 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
     path = folder / "segments" / "0000000000.npy"
     path.write_bytes(path.read_bytes()[:-1] + b"!")
     assert "verified False" in succeeds(capfd, "info", "--map", folder)
+    both = "info", "--map", folder, "--batch-size", 4
+    fails(capfd, *both, words=("--batch-size: found beside --map",))
     fails(capfd, "info", "--map", folder, "--verify", words=("descriptors 0 to 6 have changed",))
 
 
@@ -196,6 +198,7 @@ def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
     out = tmp_path / "map"
     said = succeeds(capfd, *index(shared, database, out, "--positions", table))
     assert "7 images added, 1 with positions" in said
+    assert "1 positions given are of no image here, 'other.jpg' the first" in said
     with open_map(out) as found:
         assert found.axes == ("lat", "lon")
         assert [image.position for image in found.images][:3] == [None, (1.5, -2.5), None]
