@@ -56,7 +56,7 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
         "backbone embedding, norm": patches * 3 * PATCH_SIZE**2 * dim,
         "backbone blocks": depth * block,
         "adapters": 0,
-        "aggregator": _salad_macs(config, patches) if config.aggregator == "salad" else 0,
+        "aggregator": _AGGREGATOR_MACS.get(config.aggregator, lambda *_: 0)(config, patches),
         "cross-image encoder": 0,
     }
     if backbone.adapter.kind != "none":
@@ -75,6 +75,19 @@ def _salad_macs(config: ModelConfig, patches: int) -> int:
     networks = salad.hidden * (2 * dim + salad.cluster_dim + salad.scores)
     sums = salad.clusters * salad.cluster_dim
     return salad.hidden * (dim + salad.token_dim) + patches * (networks + sums)
+
+
+def _transvpr_macs(config: ModelConfig, patches: int) -> int:
+    transvpr = config.transvpr
+    wide = transvpr.levels * config.backbone.dim
+    return patches * wide * (transvpr.levels + 1) + wide * transvpr.dim
+
+
+_AGGREGATOR_MACS = {
+    "salad": _salad_macs,
+    "transvpr": _transvpr_macs,
+}
+"""Of an image, by method; those that are not here have no products."""
 
 
 def adapter_macs(config: ModelConfig) -> int:

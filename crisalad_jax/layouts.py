@@ -198,6 +198,9 @@ def aggregator_lines(config: ModelConfig) -> Iterator[Entry]:
     """SALAD under serizba/salad's names, the GeM pyramid under CricaVPR's."""
     if config.aggregator == "gem-pyramid":
         yield Entry(("aggregator.p",), ("aggregation.1.p",), _FIRST)
+    if config.aggregator == "transvpr":
+        yield from _affine("aggregator.attention", "aggregator.attention", _LINEAR, bias=False)
+        yield from _affine("aggregator.reduction", "aggregator.reduction", _LINEAR)
     if config.aggregator != "salad":
         return
     if config.salad.sinkhorn.dustbin not in ("none", "token"):

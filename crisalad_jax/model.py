@@ -18,7 +18,7 @@ from crisalad_jax.nn.layers import Keys, split_key
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.salad import Salad, transport
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
-from crisalad_jax.nn.vit import Features, ViT, grid_of, init_vit, vit
+from crisalad_jax.nn.vit import Features, ViT, grid_of, init_vit, vit, vit_levels
 from crisalad_jax.pytree import params
 
 Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
@@ -130,6 +130,9 @@ def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features
     if images.dtype == jnp.uint8:
         images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
     pixels = images.astype(config.compute_dtype)
+    if config.aggregator == "transvpr":
+        depths = config.transvpr.depths(config.backbone.depth)
+        return vit_levels(params.backbone, pixels, config.backbone, depths, keeps=config.keeps)
     return vit(params.backbone, pixels, config.backbone, keeps=config.keeps)
 
 

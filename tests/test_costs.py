@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from crisalad_jax.config import PRESETS, AdapterConfig, CrossImageConfig, ModelConfig, ViTConfig
+from crisalad_jax.config import PRESETS, AdapterConfig, CrossImageConfig, ModelConfig, TransVprConfig, ViTConfig
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.model import alone, describe, init_crisalad
 
@@ -89,8 +89,14 @@ SMALL = ModelConfig(
             aggregator="gem-pyramid",
             backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="mlp")),
         ),
+        dataclasses.replace(
+            SMALL,
+            aggregator="transvpr",
+            transvpr=TransVprConfig(levels=3, dim=24),
+            encoder=CrossImageConfig(layers=0),
+        ),
     ],
-    ids=["adapters, encoder", "swiglu, registers, neither", "pyramid, mlp"],
+    ids=["adapters, encoder", "swiglu, registers, neither", "pyramid, mlp", "transvpr"],
 )
 def test_count_equals_the_programs_products(config: ModelConfig) -> None:
     images = 3

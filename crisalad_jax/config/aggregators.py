@@ -312,11 +312,15 @@ class TransVprConfig:
     levels: int = 3
     """Layers of the backbone, evenly apart, the last among them."""
     dim: int = 256
-    """Numbers in the descriptor, and in a local one."""
+    """Numbers in the descriptor."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "levels", "dim")
+
+    def depths(self, depth: int) -> tuple[int, ...]:
+        """After how many of a backbone's `depth` blocks each level is taken."""
+        return tuple(depth * (level + 1) // self.levels for level in range(self.levels))
 
     def shape(self, dim: int) -> TokenShape:
         """A global token."""

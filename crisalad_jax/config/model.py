@@ -113,6 +113,12 @@ class ModelConfig:
         require_choice(self, "keeps")
         choose("ModelConfig.aggregator", self.aggregator, AGGREGATORS)
         self.check_image_size(self.image_size)
+        depth = self.backbone.depth
+        require(
+            self.aggregator != "transvpr" or self.transvpr.levels <= depth,
+            f"TransVprConfig.levels: found {self.transvpr.levels}, expected at most {depth}, the "
+            "backbone's blocks",
+        )
         if self.encoder.layers:
             self._check_encoder()
 

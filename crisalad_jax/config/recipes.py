@@ -115,6 +115,22 @@ def _cricavpr(model: ModelConfig) -> TrainConfig:
     )
 
 
+def _transvpr(model: ModelConfig) -> TrainConfig:
+    """TransVPR's attention and head over a frozen backbone, by our loss in place of its triplets.
+
+    `tiny`, which starts from nothing, trains all of the model.
+    """
+    bare = dataclasses.replace(
+        model,
+        backbone=dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none")),
+        aggregator="transvpr",
+        encoder=dataclasses.replace(model.encoder, layers=0),
+    )
+    if model == PRESETS["tiny"]:
+        return _scratch(bare)
+    return TrainConfig(model=bare, trains="head")
+
+
 def _scratch(model: ModelConfig) -> TrainConfig:
     """From random weights, all of the model: ours, for `tiny`."""
     return TrainConfig(
@@ -147,6 +163,7 @@ RECIPES: Mapping[str, Callable[[ModelConfig], TrainConfig]] = {
     "crisalad-step": _varied(schedule="step"),
     "salad": _salad,
     "cricavpr": _cricavpr,
+    "transvpr": _transvpr,
     "scratch": _scratch,
 }
 """Named by what they reproduce. Table 2's other rows are one flag of `crisalad` each."""

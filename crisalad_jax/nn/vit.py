@@ -3,8 +3,11 @@
 Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it meets.
 """
 
+import dataclasses
 import functools
+import itertools
 import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -160,6 +163,46 @@ def vit(
     tokens = run_blocks(params, tokens, grid_of(images[0]), config, keeps=keeps)
     tokens = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
     return Features(tokens[:, 0], tokens[:, 1 + config.registers :])
+
+
+def vit_levels(
+    params: ViT,
+    images: Float[Array, "image height width 3"],
+    config: ViTConfig,
+    depths: Sequence[int],
+    *,
+    keeps: str = "products",
+) -> Features:
+    """`vit`, with the patches after several numbers of blocks side by side: level times dim wide.
+
+    All levels go through the last layer norm, as in DINOv2's own intermediate layers. `depths` are
+    in order, the last of them the number of blocks. The stack of blocks is cut at each, which for
+    inference takes the memory of its parameters once more.
+    """
+    tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+    levels = []
+    for part in _cut_at(params.blocks, depths):
+        shorter = dataclasses.replace(params, blocks=part)
+        tokens = run_blocks(shorter, tokens, grid_of(images[0]), config, keeps=keeps)
+        levels.append(layer_norm(params.norm, tokens, epsilon=NORM_EPSILON))
+    patches = jnp.concatenate([level[:, 1 + config.registers :] for level in levels], axis=-1)
+    return Features(levels[-1][:, 0], patches)
+
+
+def _cut_at(
+    blocks: Block | tuple[Block, ...], depths: Sequence[int]
+) -> Iterator[tuple[Block, ...]]:
+    """The stacks of blocks up to each of `depths` from the one before."""
+    stacks = blocks if isinstance(blocks, tuple) else (blocks,)
+    starts = itertools.accumulate((len(stack.ls1) for stack in stacks), initial=0)
+    placed = list(zip(starts, stacks, strict=False))
+    for begin, end in itertools.pairwise((0, *depths)):
+        parts = [
+            jax.tree.map(lambda x, s=start: x[max(begin - s, 0) : end - s], stack)
+            for start, stack in placed
+            if start < end and begin < start + len(stack.ls1)
+        ]
+        yield tuple(parts)
 
 
 def grid_of(image: Shaped[Array, "height width 3"]) -> tuple[int, int]:

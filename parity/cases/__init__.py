@@ -12,6 +12,7 @@ from crisalad_jax.config import (
     ModelConfig,
     SaladConfig,
     SinkhornConfig,
+    TransVprConfig,
     ViTConfig,
 )
 from parity.cases import parts
@@ -41,6 +42,7 @@ def _model(
         ),
         aggregator=aggregator,
         salad=SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0),
+        transvpr=TransVprConfig(levels=2, dim=24),
         encoder=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
     )
 
@@ -58,6 +60,7 @@ CRISALAD_REGISTERS = _model("depthwise", encoder=1, registers=3, ffn="swiglu")
 DINO_SALAD = _model()
 CRICAVPR = _model("multi-resolution", encoder=1, aggregator="gem-pyramid")
 TWO_LAYERS = _model(encoder=2)
+TRANSVPR = _model(aggregator="transvpr")
 CLASS_TOKEN = _model(aggregator="class-token")
 
 
@@ -188,6 +191,12 @@ CASES: tuple[Case, ...] = (
     Case("GeM pyramid", CRICAVPR, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
     Case("cross-image encoder", TWO_LAYERS, parts.ENCODER, SEQUENCES),
     Case(
+        "TransVPR",
+        TRANSVPR,
+        parts.AGGREGATE,
+        FEATURES | {"patches": normal(BATCH, PATCHES, 2 * 32)},
+    ),
+    Case(
         "cross-image encoder, masked",
         TWO_LAYERS,
         parts.ENCODER,
@@ -217,7 +226,7 @@ CASES: tuple[Case, ...] = (
             parts.DESCRIPTOR,
             inputs,
             forward="descriptor",
-            smooth=model.aggregator == "class-token",
+            smooth=model.aggregator in ("class-token", "transvpr"),
         )
         for name, model, inputs in (
             ("CriSALAD", CRISALAD, IMAGES),
@@ -229,6 +238,7 @@ CASES: tuple[Case, ...] = (
             ("DINO-SALAD", DINO_SALAD, IMAGES),
             ("CricaVPR", CRICAVPR, IMAGES),
             ("class token", CLASS_TOKEN, IMAGES),
+            ("TransVPR descriptor", TRANSVPR, IMAGES),
         )
     ),
 )

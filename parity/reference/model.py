@@ -12,6 +12,7 @@ from parity.reference.layers import l2_normalise, widen
 from parity.reference.pyramid import GemPyramid, UnitPatches
 from parity.reference.salad import Salad, published_order
 from parity.reference.tokens import Tokens, as_sequence, from_sequence
+from parity.reference.transvpr import TransVpr
 from parity.reference.vit import Features, ViT
 
 
@@ -30,6 +31,8 @@ class Crisalad(nn.Module):
         self.backbone = ViT(config.backbone)
         kind = config.aggregator
         self.aggregator = Salad(config.backbone.dim, config.salad) if kind == "salad" else None
+        if kind == "transvpr":
+            self.aggregator = TransVpr(config.backbone.dim, config.transvpr)
         self.aggregation = (
             nn.Sequential(UnitPatches(), GemPyramid()) if kind == "gem-pyramid" else None
         )
@@ -58,7 +61,10 @@ class Crisalad(nn.Module):
     def tokenise(self, images: Tensor) -> Tokens:
         """The first half of `forward`: every image's tokens, which owe nothing to other images."""
         self.config.check_image_size((images.shape[2], images.shape[3]))
-        return self.aggregate(self.backbone(images.to(self.compute_dtype)))
+        depths = None
+        if self.config.aggregator == "transvpr":
+            depths = self.config.transvpr.depths(self.config.backbone.depth)
+        return self.aggregate(self.backbone(images.to(self.compute_dtype), depths))
 
     def aggregate(self, features: Features) -> Tokens:
         """From a backbone's features to the images' tokens, in float32 at least."""

@@ -1,5 +1,6 @@
 """DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024)."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -132,9 +133,20 @@ class ViT(nn.Module):
             elif name.endswith(".weight") and parameter.ndim > 1:
                 nn.init.trunc_normal_(parameter, std=0.02, a=-0.04, b=0.04)
 
-    def forward(self, images: Tensor) -> Features:
-        """(batch, 3, height, width) to features; the sides are multiples of 14."""
+    def forward(self, images: Tensor, depths: Sequence[int] | None = None) -> Features:
+        """(batch, 3, height, width) to features; the sides are multiples of 14.
+
+        With `depths` the patches after so many blocks, all through the last norm, are concatenated.
+        """
         grid = grid_of(images)
+        if depths is not None:
+            tokens, levels = self.embed(images), []
+            for depth, block in enumerate(self.blocks, 1):
+                tokens = block(tokens, grid)
+                if depth in depths:
+                    levels.append(self.norm(tokens)[:, -grid[0] * grid[1] :])
+            patches = torch.cat(levels, dim=2)
+            return Features(self.norm(tokens)[:, 0], patches.mT.unflatten(-1, grid))
         tokens = self.norm(self.run_blocks(self.embed(images), grid))
         patches = tokens[:, -grid[0] * grid[1] :]
         return Features(tokens[:, 0], patches.mT.unflatten(-1, grid))

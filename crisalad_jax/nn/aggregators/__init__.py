@@ -11,14 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ModelConfig, choose
-from crisalad_jax.nn.aggregators import gem_pyramid
+from crisalad_jax.nn.aggregators import gem_pyramid, transvpr
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid
+from crisalad_jax.nn.aggregators.transvpr import TransVpr
 from crisalad_jax.nn.layers import Keys, l2_normalise, widen
 from crisalad_jax.nn.salad import Salad, init_salad, published_order, salad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
 
-Aggregator = Salad | GemPyramid
+Aggregator = Salad | GemPyramid | TransVpr
 
 
 class Method(NamedTuple):
@@ -60,6 +61,7 @@ _METHODS = {
     "salad": Method(_init_salad, _salad, published_order),
     "gem-pyramid": Method(gem_pyramid.init, gem_pyramid.apply),
     "class-token": Method(lambda key, config: None, _class_token),
+    "transvpr": Method(transvpr.init, transvpr.apply),
 }
 
 
