@@ -137,6 +137,16 @@ def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features
 
 
 @functools.partial(platform.jit, static_argnames="config")
+def features_of(params: Crisalad, images: Images, config: ModelConfig) -> Features:
+    """What the aggregator is given of every image, before it makes tokens of it.
+
+    Raises:
+        InputError: as `describe`.
+    """
+    return _features(params, images, config)
+
+
+@functools.partial(platform.jit, static_argnames="config")
 def relate(
     params: Crisalad,
     tokens: Tokens,

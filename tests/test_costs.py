@@ -8,7 +8,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from crisalad_jax.config import PRESETS, AdapterConfig, CrossImageConfig, ModelConfig, TransVprConfig, ViTConfig
+from crisalad_jax.config import (
+    PRESETS,
+    AdapterConfig,
+    CrossImageConfig,
+    ModelConfig,
+    TransVprConfig,
+    ViTConfig,
+)
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.model import alone, describe, init_crisalad
 

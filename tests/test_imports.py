@@ -21,7 +21,7 @@ LAYERS = (
     ("checkpoint", "states", "costs", "layouts"),
     ("convert", "export"),
     ("training", "retrieval", "descriptors", "pca"),
-    ("results", "approximate", "similarity"),
+    ("results", "approximate", "similarity", "reranking"),
     ("evaluation", "report", "pairs", "stores"),
     ("map_description",),
     ("maps",),

@@ -116,19 +116,9 @@ def _cricavpr(model: ModelConfig) -> TrainConfig:
 
 
 def _transvpr(model: ModelConfig) -> TrainConfig:
-    """TransVPR's attention and head over a frozen backbone, by our loss in place of its triplets.
-
-    `tiny`, which starts from nothing, trains all of the model.
-    """
-    bare = dataclasses.replace(
-        model,
-        backbone=dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none")),
-        aggregator="transvpr",
-        encoder=dataclasses.replace(model.encoder, layers=0),
-    )
-    if model == PRESETS["tiny"]:
-        return _scratch(bare)
-    return TrainConfig(model=bare, trains="head")
+    """TransVPR over adapted DINOv2, by our loss in place of its triplets (docs/methods.md)."""
+    encoder = dataclasses.replace(model.encoder, layers=0)
+    return TrainConfig(model=dataclasses.replace(model, aggregator="transvpr", encoder=encoder))
 
 
 def _scratch(model: ModelConfig) -> TrainConfig:

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import operator
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -194,15 +195,13 @@ def _cut_at(
 ) -> Iterator[tuple[Block, ...]]:
     """The stacks of blocks up to each of `depths` from the one before."""
     stacks = blocks if isinstance(blocks, tuple) else (blocks,)
-    starts = itertools.accumulate((len(stack.ls1) for stack in stacks), initial=0)
-    placed = list(zip(starts, stacks, strict=False))
     for begin, end in itertools.pairwise((0, *depths)):
-        parts = [
-            jax.tree.map(lambda x, s=start: x[max(begin - s, 0) : end - s], stack)
-            for start, stack in placed
-            if start < end and begin < start + len(stack.ls1)
-        ]
-        yield tuple(parts)
+        parts, start = [], 0
+        for stack in stacks:
+            chosen = slice(max(begin - start, 0), max(end - start, 0))
+            parts.append(jax.tree.map(operator.itemgetter(chosen), stack))
+            start += len(stack.ls1)
+        yield tuple(part for part in parts if len(part.ls1))
 
 
 def grid_of(image: Shaped[Array, "height width 3"]) -> tuple[int, int]:

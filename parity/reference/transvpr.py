@@ -1,7 +1,7 @@
 """TransVPR's global descriptor (Wang et al., CVPR 2022, section 3.2) on several ViT layers."""
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from crisalad_jax.config import TransVprConfig
 from parity.reference.layers import Linear, l2_normalise, widen
