@@ -219,7 +219,7 @@ def evaluate(
     Two images of one side show the same place where the benchmark's positions, or where it has none
     its ground truth, say so (`same_place`).
 
-    A model without a cross-image encoder has one result, `any`: no descriptor depends on a batch.
+    A model without a cross-image encoder has one grouping, `any`: no descriptor depends on a batch.
     Beyond the tokens memory holds the descriptors of one grouping and seed at a time.
 
     Args:

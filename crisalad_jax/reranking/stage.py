@@ -96,7 +96,7 @@ def parse_reranking(text: str) -> Reranking:
         InputError: no such form, name or number.
     """
     name, colon, top = text.partition(":")
-    if not colon or not top.isascii() or not top.isdecimal():
+    if not colon or not top.isascii() or not top.isdecimal() or len(top) > 9:
         raise InputError(
             f"rerank: found {text!r}, expected NAME:TOPK, as in patch-netvlad:100, with one of "
             f"{', '.join(sorted(_METHODS))}"

@@ -196,6 +196,7 @@ def test_the_first_stages_model_serves_where_it_can(benchmark) -> None:
         ("transvpr", "found 'transvpr', expected NAME:TOPK, as in patch-netvlad:100, with one of "),
         ("transvpr:", "expected NAME:TOPK"),
         ("transvpr:-3", "expected NAME:TOPK"),
+        ("transvpr:" + 5000 * "1", "expected NAME:TOPK"),
         ("transvpr:ten", "expected NAME:TOPK"),
         ("transvpr:1", "found transvpr:1, expected at least 2 retrievals"),
         ("superglue:10", "rerank: found 'superglue', expected one of patch-netvlad, transvpr"),

@@ -49,7 +49,7 @@ def apply(
     pooled = jnp.einsum("...nl,...nld->...ld", weights, by_level)
     pooled = l2_normalise(pooled.reshape(*pooled.shape[:-2], -1))
     descriptor = l2_normalise(linear(params.reduction, pooled))
-    return Tokens(descriptor, jnp.zeros((*descriptor.shape[:-1], 0, descriptor.shape[-1])))
+    return Tokens(descriptor, descriptor[..., None, :][..., :0, :])
 
 
 def attentions(
