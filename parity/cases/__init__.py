@@ -193,7 +193,6 @@ CASES: tuple[Case, ...] = (
     Case("SALAD", PLAIN, parts.AGGREGATE, FEATURES, smooth=False),
     Case("GeM pyramid", CRICAVPR, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
     Case("NetVLAD", NETVLAD, parts.AGGREGATE, FEATURES, bfloat16=False),
-    Case("AnyLoc's facets", ANYLOC, parts.FACETS, IMAGES),
     Case("AnyLoc", ANYLOC, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
     Case("cross-image encoder", TWO_LAYERS, parts.ENCODER, SEQUENCES),
     Case(

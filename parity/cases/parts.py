@@ -19,15 +19,7 @@ from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.cross_image import cross_image_encoder
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.nn.vit import (
-    Block,
-    Features,
-    block,
-    embed,
-    facet,
-    feed_forward,
-    interpolate_positions,
-)
+from crisalad_jax.nn.vit import Block, Features, block, embed, feed_forward, interpolate_positions
 from crisalad_jax.sinkhorn import assign
 from parity.reference import losses as torch_losses
 from parity.reference import sinkhorn as torch_sinkhorn
@@ -122,25 +114,6 @@ def _our_block(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, ja
 BLOCK = Part(
     _our_block, lambda model, x, _: {"tokens": model.backbone.blocks[-1](x["tokens"], GRID)}
 )
-
-
-def _our_facets(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    last = config.backbone.depth - 1
-    return {
-        name: facet(params.backbone, x["images"], config.backbone, last, name).patches
-        for name in ("query", "key", "value")
-    }
-
-
-def _their_facets(model: TorchCrisalad, x: Inputs, config: ModelConfig) -> dict[str, Tensor]:
-    images, last = _channels_first(x["images"]), config.backbone.depth - 1
-    return {
-        name: model.backbone.facet(images, last, name).patches.flatten(2).mT
-        for name in ("query", "key", "value")
-    }
-
-
-FACETS = Part(_our_facets, _their_facets)
 
 
 def _our_aggregate(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
