@@ -11,6 +11,7 @@ import pytest
 from crisalad_jax.config import (
     PRESETS,
     AdapterConfig,
+    AnyLocConfig,
     CrossImageConfig,
     ModelConfig,
     TransVprConfig,
@@ -78,6 +79,11 @@ SMALL = ModelConfig(
     salad=dataclasses.replace(PRESETS["tiny"].salad, clusters=8),
     encoder=CrossImageConfig(heads=2, feedforward=24),
 )
+PLAIN = dataclasses.replace(
+    SMALL,
+    backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="none")),
+    encoder=CrossImageConfig(layers=0),
+)
 
 
 @pytest.mark.parametrize(
@@ -96,14 +102,17 @@ SMALL = ModelConfig(
             aggregator="gem-pyramid",
             backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="mlp")),
         ),
+        dataclasses.replace(PLAIN, aggregator="netvlad"),
+        dataclasses.replace(PLAIN, aggregator="anyloc", anyloc=AnyLocConfig(7, -1, "value")),
+        dataclasses.replace(PLAIN, aggregator="anyloc", anyloc=AnyLocConfig(7, 1, "token")),
         dataclasses.replace(
-            SMALL,
-            aggregator="transvpr",
-            transvpr=TransVprConfig(levels=3, dim=24),
-            encoder=CrossImageConfig(layers=0),
+            PLAIN, aggregator="transvpr", transvpr=TransVprConfig(levels=3, dim=24)
         ),
     ],
-    ids=["adapters, encoder", "swiglu, registers, neither", "pyramid, mlp", "transvpr"],
+    ids=[
+        *("adapters, encoder", "swiglu, registers, neither", "pyramid, mlp"),
+        *("netvlad", "anyloc, values", "anyloc, tokens", "transvpr"),
+    ],
 )
 def test_count_equals_the_programs_products(config: ModelConfig) -> None:
     images = 3

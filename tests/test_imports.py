@@ -22,7 +22,7 @@ LAYERS = (
     ("convert", "export"),
     ("training", "retrieval", "descriptors", "pca"),
     ("results", "approximate", "similarity", "reranking"),
-    ("evaluation", "report", "pairs", "stores"),
+    ("evaluation", "report", "pairs", "stores", "vocabulary"),
     ("map_description",),
     ("maps",),
     ("indexing",),

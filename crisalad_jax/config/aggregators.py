@@ -190,6 +190,10 @@ class NetVladConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "clusters")
+        require(
+            self.clusters > 1,
+            f"NetVladConfig.clusters: found {self.clusters}, expected at least 2 to choose from",
+        )
 
     def shape(self, dim: int) -> TokenShape:
         """A sum of residuals for each cluster."""
@@ -268,6 +272,19 @@ class AnyLocConfig:
         """Check the ranges."""
         require_positive(self, "clusters")
         require_choice(self, "facet")
+
+    def block(self, depth: int) -> int:
+        """Which of `depth` blocks the facet is of, from 0.
+
+        Raises:
+            InputError: there is no such block.
+        """
+        require(
+            -depth <= self.layer < depth,
+            f"AnyLocConfig.layer: found {self.layer}, expected {-depth} to {depth - 1} for a "
+            f"backbone of {depth} blocks",
+        )
+        return self.layer % depth
 
     def shape(self, dim: int) -> TokenShape:
         """A sum of residuals for each word."""

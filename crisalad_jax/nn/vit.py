@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
 from crisalad_jax.config import PATCH_SIZE, ViTConfig, choose
 from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
@@ -202,6 +202,49 @@ def _cut_at(
             parts.append(jax.tree.map(operator.itemgetter(chosen), stack))
             start += len(stack.ls1)
         yield tuple(part for part in parts if len(part.ls1))
+
+
+def facet(
+    params: ViT,
+    images: Float[Array, "image height width 3"],
+    config: ViTConfig,
+    block_number: int,
+    name: str,
+) -> Features:
+    """Features of one facet of one block; the blocks after it are not run.
+
+    The facets are queries, keys and values of the block's attention, heads side by side, or the
+    tokens that the block leaves, without the last layer norm (AnyLoc: Keetha et al. 2023).
+
+    Args:
+        params: a backbone whose blocks are one stack.
+        images: normalised, with sides that are multiples of 14.
+        config: of the backbone.
+        block_number: of the block, from 0.
+        name: query, key, value or token.
+    """
+    stack = params.blocks
+    assert isinstance(stack, Block)  # training alone cuts it, and with a facet nothing trains
+    grid = grid_of(images[0])
+
+    def numbered(number: Int[Array, ""] | int) -> Block:
+        # Not a slice of the stack to scan over, which would be a copy of its weights.
+        return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
+
+    def body(
+        carry: Float[Array, "image token dim"], number: Int[Array, ""]
+    ) -> tuple[Float[Array, "image token dim"], None]:
+        return block(numbered(number), carry, grid, config), None
+
+    tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+    whole = block_number + (name == "token")
+    tokens, _ = jax.lax.scan(body, tokens, jnp.arange(whole))
+    if name != "token":
+        last = numbered(block_number)
+        here = ("query", "key", "value").index(name) * config.dim
+        part = jax.tree.map(lambda x: x[..., here : here + config.dim], last.attn.qkv)
+        tokens = linear(part, layer_norm(last.norm1, tokens, epsilon=NORM_EPSILON))
+    return Features(tokens[:, 0], tokens[:, 1 + config.registers :])
 
 
 def grid_of(image: Shaped[Array, "height width 3"]) -> tuple[int, int]:

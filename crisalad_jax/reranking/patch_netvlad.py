@@ -1,7 +1,6 @@
 """Patch-NetVLAD: VLADs of windows of several sizes (Hausler et al., CVPR 2021, section 3)."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,8 @@ from jaxtyping import Array, Float
 from crisalad_jax import platform
 from crisalad_jax.config import PATCH_SIZE, ModelConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.model import Crisalad, Images, features_of
+from crisalad_jax.model import Crisalad, Images, unit_features
+from crisalad_jax.nn.aggregators.netvlad import NetVlad
 from crisalad_jax.nn.layers import l2_normalise, linear, widen
 from crisalad_jax.reranking.matching import mutual_matches, spatial_score
 
@@ -84,9 +84,10 @@ def describe(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image window vlad"]:
     """Unit descriptors of the windows of all sizes, the smallest first, in float16."""
-    aggregator: Any = params.aggregator
+    aggregator = params.aggregator
+    assert isinstance(aggregator, NetVlad)
     grid = config.image_size[0] // PATCH_SIZE, config.image_size[1] // PATCH_SIZE
-    features = l2_normalise(widen(features_of(params, images, config).patches))
+    features = unit_features(params, images, config)
     assignment = jax.nn.softmax(linear(aggregator.conv, features), axis=-1)
 
     def of_one(image: tuple[Array, Array]) -> Array:

@@ -8,8 +8,10 @@ import numpy as np
 
 from crisalad_jax.config import (
     AdapterConfig,
+    AnyLocConfig,
     CrossImageConfig,
     ModelConfig,
+    NetVladConfig,
     SaladConfig,
     SinkhornConfig,
     TransVprConfig,
@@ -41,6 +43,8 @@ def _model(
             **backbone,
         ),
         aggregator=aggregator,
+        netvlad=NetVladConfig(clusters=5),
+        anyloc=AnyLocConfig(clusters=5, layer=-1, facet="token"),
         salad=SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0),
         transvpr=TransVprConfig(levels=2, dim=24),
         encoder=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
@@ -61,6 +65,8 @@ DINO_SALAD = _model()
 CRICAVPR = _model("multi-resolution", encoder=1, aggregator="gem-pyramid")
 TWO_LAYERS = _model(encoder=2)
 TRANSVPR = _model(aggregator="transvpr")
+NETVLAD = _model(aggregator="netvlad")
+ANYLOC = _model(aggregator="anyloc")
 CLASS_TOKEN = _model(aggregator="class-token")
 
 
@@ -189,6 +195,8 @@ CASES: tuple[Case, ...] = (
     *_sinkhorn_cases(),
     Case("SALAD", PLAIN, parts.AGGREGATE, FEATURES, smooth=False),
     Case("GeM pyramid", CRICAVPR, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
+    Case("NetVLAD", NETVLAD, parts.AGGREGATE, FEATURES, bfloat16=False),
+    Case("AnyLoc", ANYLOC, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
     Case("cross-image encoder", TWO_LAYERS, parts.ENCODER, SEQUENCES),
     Case(
         "TransVPR",
@@ -226,7 +234,9 @@ CASES: tuple[Case, ...] = (
             parts.DESCRIPTOR,
             inputs,
             forward="descriptor",
-            smooth=model.aggregator in ("class-token", "transvpr"),
+            # A patch that rounding gives to another word makes another descriptor.
+            bfloat16=model.aggregator != "anyloc",
+            smooth=model.aggregator in ("class-token", "netvlad", "transvpr"),
         )
         for name, model, inputs in (
             ("CriSALAD", CRISALAD, IMAGES),
@@ -237,6 +247,8 @@ CASES: tuple[Case, ...] = (
             ),
             ("DINO-SALAD", DINO_SALAD, IMAGES),
             ("CricaVPR", CRICAVPR, IMAGES),
+            ("NetVLAD's descriptor", NETVLAD, IMAGES),
+            ("AnyLoc's descriptor", ANYLOC, IMAGES),
             ("class token", CLASS_TOKEN, IMAGES),
             ("TransVPR descriptor", TRANSVPR, IMAGES),
         )

@@ -151,6 +151,22 @@ class ViT(nn.Module):
         patches = tokens[:, -grid[0] * grid[1] :]
         return Features(tokens[:, 0], patches.mT.unflatten(-1, grid))
 
+    def facet(self, images: Tensor, number: int, name: str) -> Features:
+        """Queries, keys, values or tokens of block `number` alone, heads side by side (AnyLoc)."""
+        grid = grid_of(images)
+        tokens = self.embed(images)
+        for block in self.blocks[:number]:
+            tokens = block(tokens, grid)
+        last = self.blocks[number]
+        assert isinstance(last, Block)
+        if name == "token":
+            found = last(tokens, grid)
+        else:
+            three = last.attn.qkv(last.norm1(tokens)).chunk(3, dim=-1)
+            found = dict(zip(("query", "key", "value"), three, strict=True))[name]
+        patches = found[:, -grid[0] * grid[1] :]
+        return Features(found[:, 0], patches.mT.unflatten(-1, grid))
+
     def embed(self, images: Tensor) -> Tensor:
         """Class token, registers and patches with their positions; registers have none."""
         patches = self.patch_embed(images)

@@ -8,7 +8,11 @@ import pytest
 
 from crisalad_jax.config import CrossImageConfig, ModelConfig, NetVladConfig, ViTConfig
 from crisalad_jax.errors import InputError
+from crisalad_jax.model import describe, unit_features
+from crisalad_jax.nn.aggregators.netvlad import NetVlad
+from crisalad_jax.nn.layers import linear
 from crisalad_jax.reranking import patch_netvlad
+from tests.conftest import random_params
 from tests.reranking.test_matching import brute_force
 
 CONFIG = ModelConfig(
@@ -97,3 +101,15 @@ def test_a_pairs_score_is_the_weighted_sum_over_sizes() -> None:
     assert len(set(np.round(expected, 3))) == 4
     # The matches are the same; then a dozen roundings of float32.
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_one_window_over_all_patches_is_the_aggregators_own_descriptor() -> None:
+    params = random_params(CONFIG)
+    images = jax.random.normal(jax.random.key(0), (1, 84, 84, 3))
+    aggregator = params.aggregator
+    assert isinstance(aggregator, NetVlad)
+    (features,) = unit_features(params, images, CONFIG)
+    shares = jax.nn.softmax(linear(aggregator.conv, features), axis=-1)
+    (whole,) = patch_netvlad.window_vlads(shares, features, aggregator.centroids, (6, 6), 6)
+    # The same 36 residuals, summed in another order.
+    np.testing.assert_allclose(whole, describe(params, images, CONFIG)[0], atol=1e-5)

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,8 +9,6 @@ from crisalad_jax.config import ModelConfig, NetVladConfig, TransVprConfig
 from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate
-from crisalad_jax.nn.layers import Linear
-from crisalad_jax.pytree import params as pytree
 from crisalad_jax.reranking import (
     Reranker,
     Reranking,
@@ -32,25 +28,11 @@ TRANSVPR = dataclasses.replace(
 NETVLAD = dataclasses.replace(PLAIN, aggregator="netvlad", netvlad=NetVladConfig(clusters=4))
 
 
-@pytree
-class Vlad:
-    """What Patch-NetVLAD reads of a NetVLAD's parameters."""
-
-    conv: Linear
-    centroids: jax.Array
-
-
 def model_of(name: str) -> tuple:
     """Random parameters of a re-ranker, its configuration and module."""
     if name == "transvpr":
         return random_params(TRANSVPR), TRANSVPR, transvpr
-    rng = np.random.default_rng(0)
-    scores, centroids = (
-        jnp.asarray(rng.standard_normal(shape), jnp.float32) for shape in ((32, 4), (4, 32))
-    )
-    plain = random_params(PLAIN)
-    own = dataclasses.replace(plain, aggregator=Vlad(Linear(scores, None), centroids))
-    return own, NETVLAD, patch_netvlad
+    return random_params(NETVLAD), NETVLAD, patch_netvlad
 
 
 @pytest.fixture(scope="module")
