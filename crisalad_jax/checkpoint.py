@@ -17,6 +17,7 @@ from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import check_source, write_safetensors
 from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc, check_vocabulary
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import differences, from_plain, to_plain
 
@@ -42,8 +43,10 @@ def save_weights(
     `extras` are arrays of a public checkpoint that no description needs (see `convert`).
 
     Raises:
-        InputError: the folder cannot be made, or the file not be written.
+        InputError: the folder cannot be made, or the file not be written; or AnyLoc's vocabulary is
+            of another backbone.
     """
+    _check_whole(params, str(path))
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
     write_safetensors(path, arrays, {FORMAT: json.dumps(to_plain(config))})
@@ -77,8 +80,9 @@ def load_weights(
 
     Raises:
         InputError: the file is missing, cut short or no such file; its parameters do not fit its
-            configuration or are not finite (all that are missing, unknown or wrong are listed); or
-            its configuration is not `expected` (all fields that differ are listed).
+            configuration or are not finite (all that are missing, unknown or wrong are listed); its
+            configuration is not `expected` (all fields that differ are listed); or AnyLoc's
+            vocabulary is of another backbone.
     """
     path = pathlib.Path(path)
     check_source(path, "a .safetensors file of weights")
@@ -105,7 +109,14 @@ def load_weights(
         wrong = differences(_with_free_fields_of(expected, config), expected)
         if wrong:
             raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
-    return _fill(config, found, path), config
+    params = _fill(config, found, path)
+    _check_whole(params, str(path))
+    return params, config
+
+
+def _check_whole(params: Crisalad, source: str) -> None:
+    if isinstance(params.aggregator, AnyLoc):
+        check_vocabulary(params.aggregator, params.backbone, source)
 
 
 def _with_free_fields_of(other: ModelConfig, config: ModelConfig) -> ModelConfig:

@@ -48,15 +48,16 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
     backbone, encoder = config.backbone, config.encoder
     patches = math.prod(config.image_size) // PATCH_SIZE**2
     tokens = 1 + backbone.registers + patches
-    dim, hidden, depth = backbone.dim, backbone.hidden, backbone.depth
+    dim, hidden = backbone.dim, backbone.hidden
+    depth, part_block = _blocks_run(config)
     products = 3 if backbone.ffn == "swiglu" else 2
     attention = 4 * tokens * dim**2 + 2 * tokens**2 * dim
     block = attention + products * tokens * dim * hidden
     costs = {
         "backbone embedding, norm": patches * 3 * PATCH_SIZE**2 * dim,
-        "backbone blocks": depth * block,
+        "backbone blocks": depth * block + part_block * tokens * dim**2,
         "adapters": 0,
-        "aggregator": _salad_macs(config, patches) if config.aggregator == "salad" else 0,
+        "aggregator": _aggregator_macs(config, patches),
         "cross-image encoder": 0,
     }
     if backbone.adapter.kind != "none":
@@ -70,11 +71,39 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
     return costs
 
 
+def _blocks_run(config: ModelConfig) -> tuple[int, int]:
+    """How many blocks are run whole, and whether a third of another's first product is.
+
+    All, but for AnyLoc, which looks no further than the block of its facet.
+    """
+    if config.aggregator != "anyloc":
+        return config.backbone.depth, 0
+    number = config.anyloc.block(config.backbone.depth)
+    return (number + 1, 0) if config.anyloc.facet == "token" else (number, 1)
+
+
+def _aggregator_macs(config: ModelConfig, patches: int) -> int:
+    if config.aggregator == "salad":
+        return _salad_macs(config, patches)
+    if config.aggregator in ("netvlad", "anyloc"):
+        # A product to share patches out, and one to sum them up.
+        return 2 * patches * config.shape.tokens * config.backbone.dim
+    if config.aggregator == "transvpr":
+        return _transvpr_macs(config, patches)
+    return 0
+
+
 def _salad_macs(config: ModelConfig, patches: int) -> int:
     dim, salad = config.backbone.dim, config.salad
     networks = salad.hidden * (2 * dim + salad.cluster_dim + salad.scores)
     sums = salad.clusters * salad.cluster_dim
     return salad.hidden * (dim + salad.token_dim) + patches * (networks + sums)
+
+
+def _transvpr_macs(config: ModelConfig, patches: int) -> int:
+    transvpr = config.transvpr
+    wide = transvpr.levels * config.backbone.dim
+    return patches * wide * (transvpr.levels + 1) + wide * transvpr.dim
 
 
 def adapter_macs(config: ModelConfig) -> int:

@@ -1,5 +1,6 @@
 """Descriptors of whole folders, and what they are worth on a benchmark by how they are grouped."""
 
+import contextlib
 import functools
 import pathlib
 import statistics
@@ -29,6 +30,7 @@ from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.pca import Pca
 from crisalad_jax.platform import devices_for
 from crisalad_jax.progress import progress_bar
+from crisalad_jax.reranking import Reranker, Reranking
 from crisalad_jax.results import ANY, GroupingResult, summarise
 from crisalad_jax.retrieval import Neighbours, search
 from crisalad_jax.same_place import SamePlace, by_truth, near, same_place_share
@@ -209,6 +211,7 @@ def evaluate(
     pca: Pca | None = None,
     cache: ImageCache | None = None,
     observe: Observe | None = None,
+    rerank: Reranking | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
     """Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
@@ -216,7 +219,7 @@ def evaluate(
     Two images of one side show the same place where the benchmark's positions, or where it has none
     its ground truth, say so (`same_place`).
 
-    A model without a cross-image encoder has one result, `any`: no descriptor depends on a batch.
+    A model without a cross-image encoder has one grouping, `any`: no descriptor depends on a batch.
     Beyond the tokens memory holds the descriptors of one grouping and seed at a time.
 
     Args:
@@ -230,11 +233,13 @@ def evaluate(
         pca: shortens the descriptors, fitted to images of other places.
         cache: of decoded images.
         observe: is given the descriptors of each grouping, of its first seed, while they are there.
+        rerank: a second stage; each grouping has a result without and then one with it.
         quiet: no progress bars.
 
     Raises:
         InputError: no ground truth, an image cannot be read, components that are not for this model
-            or make no unit vectors, or what `parse_groupings` and `check_grouping` raise.
+            or make no unit vectors, or what `parse_groupings`, `check_grouping`, `Reranking.check`
+            and `Reranker` raise.
     """
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
@@ -245,6 +250,8 @@ def evaluate(
                 "pca: found components that leave lengths as they are, expected some that make "
                 "unit vectors, which are ranked by cosine"
             )
+    if rerank is not None:
+        rerank.check(config, len(benchmark.database))
     positives = benchmark.ground_truth()
 
     def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
@@ -261,27 +268,51 @@ def evaluate(
         full = group(params, config, *side, batch_size=batch_size, quiet=quiet, **options)
         return full if pca is None else pca.apply(full)
 
-    results = []
-    for grouping in parsed if params.encoder else [Grouping("single", "single")]:
-        is_random = "shuffled" in (grouping.queries, grouping.database)
-        drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
-        name = str(grouping) if params.encoder else ANY
-        sides = (database, grouping.database), (queries, grouping.queries)
-        database_share, query_share = (
-            _mean_share(side, kind, drawn, batch_size) for side, kind in sides
-        )
-        results.append(
-            summarise(
-                name,
-                _rank(describe, sides, drawn, observe and functools.partial(observe, name)),
-                positives,
-                KS,
-                query_share=query_share,
-                database_share=database_share,
-                is_random=is_random,
+    stages: dict[str | None, Callable[[Neighbours], Neighbours]] = {None: lambda found: found}
+    with contextlib.ExitStack() as stack:
+        if rerank is not None:
+            stages[rerank.label] = stack.enter_context(
+                Reranker(
+                    rerank.over(params, config),
+                    benchmark.database,
+                    benchmark.queries,
+                    batch_size=batch_size,
+                    cache=cache,
+                    quiet=quiet,
+                )
             )
-        )
+        k = min(max(*KS, rerank.top if rerank else 0), len(benchmark.database))
+        results = []
+        for grouping in parsed if params.encoder else [Grouping("single", "single")]:
+            is_random = "shuffled" in (grouping.queries, grouping.database)
+            drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
+            name = str(grouping) if params.encoder else ANY
+            sides = (database, grouping.database), (queries, grouping.queries)
+            database_share, query_share = (
+                _mean_share(side, kind, drawn, batch_size) for side, kind in sides
+            )
+            observer = observe and functools.partial(observe, name)
+            rankings = _rank(describe, sides, drawn, k, observer)
+            for label, stage in stages.items():
+                found = {seed: _first(stage(each), max(KS)) for seed, each in rankings.items()}
+                results.append(
+                    summarise(
+                        name,
+                        found,
+                        positives,
+                        KS,
+                        query_share=query_share,
+                        database_share=database_share,
+                        is_random=is_random,
+                        rerank=label,
+                    )
+                )
     return results
+
+
+def _first(neighbours: Neighbours, count: int) -> Neighbours:
+    """The best `count` of each query."""
+    return Neighbours(*(part[:, :count] for part in neighbours))
 
 
 class _Side(NamedTuple):
@@ -326,9 +357,10 @@ def _rank(
     describe: Callable[..., Float[np.ndarray, "image descriptor"]],
     sides: Sequence[tuple[_Side, str]],
     seeds: Sequence[int],
+    k: int,
     observe: Callable[..., None] | None,
 ) -> dict[int, Neighbours]:
-    """The neighbours by seed. Only a side that is shuffled is described for each anew.
+    """The k nearest neighbours by seed. Only a side that is shuffled is described for each anew.
 
     `observe` is given the descriptors of the first.
     """
@@ -347,6 +379,6 @@ def _rank(
         )
         if observe is not None and seed == seeds[0]:
             observe(database, queries)
-        return search(database, queries, k=min(max(KS), len(database)))
+        return search(database, queries, k=k)
 
     return {seed: ranking(seed) for seed in seeds}

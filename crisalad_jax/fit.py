@@ -134,12 +134,13 @@ def fit(
         quiet: no progress bar.
 
     Raises:
-        InputError: an argument is out of range; the validation has no ground truth; `out` holds
-            something else, or a run of another configuration or start; an image cannot be read;
-            there are too few places or images; the loss is no longer finite (the state before that
-            step is saved); or a file cannot be written.
+        InputError: nothing of the model trains; an argument is out of range; the validation has no
+            ground truth; `out` holds something else, or a run of another configuration or start; an
+            image cannot be read; there are too few places or images; the loss is no longer finite
+            (the state before that step is saved); or a file cannot be written.
         Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
+    check_trains(config)
     if workers < 0:
         raise InputError(f"workers: found {workers}, expected at least 0")
     if validation is not None:
@@ -158,6 +159,19 @@ def fit(
     record = run.record
     best = record.best[0][0] if record.best else None
     return FitResult(run.params(), run.step, best, record.stopped_early, record.skipped_images)
+
+
+def check_trains(config: TrainConfig) -> None:
+    """Check that there is something to train: not with AnyLoc, whose vocabulary is of a backbone.
+
+    Raises:
+        InputError: there is not.
+    """
+    if config.model.aggregator == "anyloc":
+        raise InputError(
+            "aggregator: found anyloc, with which nothing trains, expected another; `crisalad "
+            "vocabulary` makes its models"
+        )
 
 
 def _train(run: "_Run", rest_of_epoch: Callable[[], _Batches], quiet: bool) -> None:
@@ -557,6 +571,18 @@ def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
     """Make `out` the folder of a run with this configuration, or check that it is.
 
     Raises:
+        InputError: what `check_run` raises.
+    """
+    check_run(out, config)
+    path = out / "config.json"
+    if not path.exists():
+        write_json(path, to_plain(config))
+
+
+def check_run(out: pathlib.Path, config: TrainConfig) -> None:
+    """Check that `out` is the folder of a run with this configuration, or can become one.
+
+    Raises:
         InputError: it holds a run of another configuration, or files but no run.
     """
     path = out / "config.json"
@@ -569,8 +595,6 @@ def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
             )
     elif out.exists() and (not out.is_dir() or any(map(_is_kept, out.iterdir()))):
         raise InputError(f"{out}: found files but no run, expected a run or a new or empty folder")
-    else:
-        write_json(path, to_plain(config))
 
 
 def _text(names: Iterable[Any]) -> np.ndarray:

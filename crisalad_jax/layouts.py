@@ -195,9 +195,21 @@ def hugging_face_lines(config: ViTConfig) -> Iterator[Entry | Extra]:
 
 
 def aggregator_lines(config: ModelConfig) -> Iterator[Entry]:
-    """SALAD under serizba/salad's names, the GeM pyramid under CricaVPR's."""
+    """SALAD under serizba/salad's names, the GeM pyramid under CricaVPR's; others in their manner.
+
+    NetVLAD's leaves have the names of Nanne/pytorch-NetVlad.
+    """
     if config.aggregator == "gem-pyramid":
         yield Entry(("aggregator.p",), ("aggregation.1.p",), _FIRST)
+    if config.aggregator == "transvpr":
+        yield from _affine("aggregator.attention", "aggregator.attention", _LINEAR, bias=False)
+        yield from _affine("aggregator.reduction", "aggregator.reduction", _LINEAR)
+    if config.aggregator == "netvlad":
+        yield from _affine("aggregator.conv", "aggregator.conv", _POINTWISE, bias=False)
+        yield Entry(("aggregator.centroids",), ("aggregator.centroids",), _SAME)
+    if config.aggregator == "anyloc":
+        yield Entry(("aggregator.words",), ("aggregator.words",), _SAME)
+        yield Entry(("aggregator.backbone",), ("aggregator.backbone",), _SAME)
     if config.aggregator != "salad":
         return
     if config.salad.sinkhorn.dustbin not in ("none", "token"):

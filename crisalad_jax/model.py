@@ -14,11 +14,11 @@ from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.nn.aggregators import Aggregator, aggregate, init_aggregator, join
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
-from crisalad_jax.nn.layers import Keys, split_key
+from crisalad_jax.nn.layers import Keys, l2_normalise, split_key, widen
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.salad import Salad, transport
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
-from crisalad_jax.nn.vit import Features, ViT, grid_of, init_vit, vit
+from crisalad_jax.nn.vit import Features, ViT, facet, grid_of, init_vit, vit, vit_levels
 from crisalad_jax.pytree import params
 
 Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
@@ -130,7 +130,37 @@ def _features(params: Crisalad, images: Images, config: ModelConfig) -> Features
     if images.dtype == jnp.uint8:
         images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
     pixels = images.astype(config.compute_dtype)
+    if config.aggregator == "transvpr":
+        depths = config.transvpr.depths(config.backbone.depth)
+        return vit_levels(params.backbone, pixels, config.backbone, depths, keeps=config.keeps)
+    if config.aggregator == "anyloc":
+        block = config.anyloc.block(config.backbone.depth)
+        return facet(params.backbone, pixels, config.backbone, block, config.anyloc.facet)
     return vit(params.backbone, pixels, config.backbone, keeps=config.keeps)
+
+
+@functools.partial(platform.jit, static_argnames="config")
+def features_of(params: Crisalad, images: Images, config: ModelConfig) -> Features:
+    """What the aggregator is given of every image, before it makes tokens of it.
+
+    Raises:
+        InputError: as `describe`.
+    """
+    return _features(params, images, config)
+
+
+@functools.partial(platform.jit, static_argnames="config")
+def unit_features(
+    params: Crisalad, images: Images, config: ModelConfig
+) -> Float[Array, "image patch dim"]:
+    """What the aggregator finds in the patches, made unit vectors: what vocabularies are made of.
+
+    In float32 at least.
+
+    Raises:
+        InputError: as `describe`.
+    """
+    return l2_normalise(widen(_features(params, images, config).patches))
 
 
 @functools.partial(platform.jit, static_argnames="config")

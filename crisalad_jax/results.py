@@ -61,6 +61,14 @@ class GroupingResult(NamedTuple):
     """The sample standard deviation over the seeds; None of fewer than two."""
     by_seed: Mapping[int, Scores] = MappingProxyType({})
     """Each shuffle's scores by the seed that, alone, repeats it; empty where nothing is random."""
+    rerank: str | None = None
+    """What put the first retrievals in their order, as `reranking.parse_reranking` reads it; the
+    similarities of these are its scores. None is the first stage."""
+
+    @property
+    def label(self) -> str:
+        """A name that no other result of an evaluation has."""
+        return self.grouping if self.rerank is None else f"{self.grouping} + {self.rerank}"
 
 
 def summarise(
@@ -72,6 +80,7 @@ def summarise(
     query_share: float | None,
     database_share: float | None,
     is_random: bool,
+    rerank: str | None = None,
 ) -> GroupingResult:
     """The result of one grouping.
 
@@ -83,6 +92,7 @@ def summarise(
         query_share: as in `GroupingResult`.
         database_share: likewise.
         is_random: whether the seeds mean anything.
+        rerank: as in `GroupingResult`.
 
     Raises:
         InputError: what `recalls` raises.
@@ -112,6 +122,7 @@ def summarise(
         recall_at_full_precision=mean.recall_at_full_precision,
         spread=_over(scores, statistics.stdev) if len(scores) > 1 else None,
         by_seed=dict(zip(rankings, scores, strict=True)) if is_random else {},
+        rerank=rerank,
     )
 
 
@@ -145,7 +156,7 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
             for k, value in result.recalls.items()
         )
         cells = (
-            result.grouping,
+            result.grouping + (f"\n+ {result.rerank}" if result.rerank else ""),
             f"{_percent(result.query_share)} / {_percent(result.database_share)}",
             *recall_cells,
             f"{_percent(result.average_precision)}\n{_spread(spread.average_precision)}",
@@ -176,6 +187,7 @@ def to_json(result: GroupingResult) -> dict[str, Any]:
     curve = result.precision_recall
     return {
         "grouping": result.grouping,
+        "rerank": result.rerank,
         "queries": sides[0],
         "database": sides[1],
         "same_place": {"queries": result.query_share, "database": result.database_share},

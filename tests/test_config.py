@@ -9,6 +9,7 @@ from crisalad_jax.config import (
     PRESETS,
     RECIPES,
     AdapterConfig,
+    AnyLocConfig,
     CircleConfig,
     ContrastiveConfig,
     CrossImageConfig,
@@ -17,6 +18,7 @@ from crisalad_jax.config import (
     LossConfig,
     ModelConfig,
     MultiSimilarityConfig,
+    NetVladConfig,
     OptimiserConfig,
     RandAugmentConfig,
     SaladConfig,
@@ -83,6 +85,10 @@ def test_the_recipes_are_their_papers():
     assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
     assert (optimiser.schedule, optimiser.drop_epochs, optimiser.drop_factor) == ("step", 3, 0.5)
     paper = recipe("b14")
+    netvlad = recipe("b14", "netvlad")
+    assert (netvlad.places_per_batch, netvlad.images_per_place) == (48, 4)
+    assert netvlad.loss.kind == "multi-similarity"
+    assert netvlad.model.descriptor_dim == 64 * 768
     for name, change in (
         ("crisalad-1e-4", {"learning_rate": 1e-4}),
         ("crisalad-step", {"schedule": "step"}),
@@ -114,7 +120,9 @@ def test_equal_configurations_name_one_program():
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
         recipe("b16")
-    with pytest.raises(InputError, match=r"^recipe: found 'boq', expected one of cricavpr, crisal"):
+    with pytest.raises(
+        InputError, match=r"^recipe: found 'boq', expected one of .*cricavpr, crisal"
+    ):
         recipe("b14", "boq")
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})
@@ -185,6 +193,23 @@ def test_one_patch_more_than_clusters_is_enough():
             "cross-image encoder's 5 heads",
         ),
         (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
+        (NetVladConfig, {"clusters": 1}, "NetVladConfig.clusters: found 1, expected at least 2"),
+        (AnyLocConfig, {"facet": "values"}, "AnyLocConfig.facet: found 'values', expected one of"),
+        (
+            ModelConfig,
+            {"aggregator": "anyloc", "anyloc": AnyLocConfig(layer=12)},
+            "AnyLocConfig.layer: found 12, expected -12 to 11 for a backbone of 12 blocks",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": "anyloc", "anyloc": AnyLocConfig(layer=-13)},
+            "AnyLocConfig.layer: found -13, expected -12 to 11",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": "anyloc"},
+            "CrossImageConfig.layers: found 2 for aggregator anyloc, with which nothing trains",
+        ),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (SinkhornConfig, {"epsilon": -1.0}, "SinkhornConfig.epsilon: found -1.0"),
         (SinkhornConfig, {"epsilon": float("nan")}, "SinkhornConfig.epsilon: found nan"),
@@ -248,6 +273,12 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
     with pytest.raises(InputError, match=words) as caught:
         kind(**fields)
     assert "\n" not in str(caught.value)
+
+
+def test_anylocs_layer_is_its_papers_of_vit_g():
+    """31 of 40 blocks, by Keetha et al., whether from the front or from the end."""
+    assert AnyLocConfig().block(40) == AnyLocConfig(layer=31).block(40) == 31
+    assert recipe("g14", "anyloc").model.descriptor_dim == 32 * 1536  # 49,152, as published
 
 
 def test_a_model_without_adapters_cannot_train_them():

@@ -8,7 +8,15 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from crisalad_jax.config import PRESETS, AdapterConfig, CrossImageConfig, ModelConfig, ViTConfig
+from crisalad_jax.config import (
+    PRESETS,
+    AdapterConfig,
+    AnyLocConfig,
+    CrossImageConfig,
+    ModelConfig,
+    TransVprConfig,
+    ViTConfig,
+)
 from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.model import alone, describe, init_crisalad
 
@@ -71,6 +79,11 @@ SMALL = ModelConfig(
     salad=dataclasses.replace(PRESETS["tiny"].salad, clusters=8),
     encoder=CrossImageConfig(heads=2, feedforward=24),
 )
+PLAIN = dataclasses.replace(
+    SMALL,
+    backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="none")),
+    encoder=CrossImageConfig(layers=0),
+)
 
 
 @pytest.mark.parametrize(
@@ -89,8 +102,17 @@ SMALL = ModelConfig(
             aggregator="gem-pyramid",
             backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="mlp")),
         ),
+        dataclasses.replace(PLAIN, aggregator="netvlad"),
+        dataclasses.replace(PLAIN, aggregator="anyloc", anyloc=AnyLocConfig(7, -1, "value")),
+        dataclasses.replace(PLAIN, aggregator="anyloc", anyloc=AnyLocConfig(7, 1, "token")),
+        dataclasses.replace(
+            PLAIN, aggregator="transvpr", transvpr=TransVprConfig(levels=3, dim=24)
+        ),
     ],
-    ids=["adapters, encoder", "swiglu, registers, neither", "pyramid, mlp"],
+    ids=[
+        *("adapters, encoder", "swiglu, registers, neither", "pyramid, mlp"),
+        *("netvlad", "anyloc, values", "anyloc, tokens", "transvpr"),
+    ],
 )
 def test_count_equals_the_programs_products(config: ModelConfig) -> None:
     images = 3

@@ -9,6 +9,7 @@ import pytest
 from crisalad_jax.config import (
     PRESETS,
     AdapterConfig,
+    AnyLocConfig,
     CrossImageConfig,
     ModelConfig,
     SaladConfig,
@@ -81,6 +82,13 @@ MODELS = {
         backbone=dataclasses.replace(
             MODEL.backbone, registers=3, ffn="swiglu", adapter=AdapterConfig(kind="mlp")
         ),
+    ),
+    "netvlad": dataclasses.replace(MODEL, aggregator="netvlad"),
+    "anyloc": dataclasses.replace(
+        MODEL,
+        aggregator="anyloc",
+        anyloc=AnyLocConfig(layer=0),
+        encoder=CrossImageConfig(layers=0),
     ),
     "multi-resolution, pyramid": dataclasses.replace(
         MODEL,

@@ -24,6 +24,7 @@ from crisalad_jax.cli import (
     pca,
     query,
     train,
+    vocabulary,
 )
 from crisalad_jax.config import choose
 from crisalad_jax.errors import InputError, Stopped
@@ -38,6 +39,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "extract": (extract.Extract, extract.run),
     "index": (index.Index, index.run),
     "query": (query.Query, query.run),
+    "vocabulary": (vocabulary.Vocabulary, vocabulary.run),
     "export": (export.Export, export.run),
     "pca": (pca.Pca, pca.run),
     "info": (info.Info, info.run),

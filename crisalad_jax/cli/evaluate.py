@@ -2,17 +2,21 @@
 
 import dataclasses
 import pathlib
+import re
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.cli.common import console, grouping_words, model_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate, same_place_rule
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
 from crisalad_jax.pca import load_pca
+from crisalad_jax.reranking import parse_reranking
 from crisalad_jax.results import GroupingResult, grouping_table, to_json
 from crisalad_jax.serial import to_plain
 from crisalad_jax.similarity import similarity_map
@@ -61,6 +65,11 @@ class Evaluate:
     """How many frames a positive may be away, for two plain folders of the same moments."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
+    rerank: str | None = None
+    """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad, of
+    a model with NetVLAD, or transvpr (docs/methods.md). Adds a row to each of the table."""
+    rerank_weights: pathlib.Path | None = None
+    """Model that makes these features; by default the first stage's."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -89,6 +98,11 @@ def run(arguments: Evaluate) -> None:
     if arguments.report is not None:
         check_target(arguments.report / "index.html")
     check_grouping((), arguments.batch_size, arguments.seed, arguments.seeds)
+    rerank = None if arguments.rerank is None else parse_reranking(arguments.rerank)
+    if rerank is None and arguments.rerank_weights is not None:
+        raise InputError(
+            "rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"
+        )
     params, config, model_name = model_of(
         arguments.weights,
         preset=arguments.preset,
@@ -96,6 +110,11 @@ def run(arguments: Evaluate) -> None:
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
+    if rerank is not None and arguments.rerank_weights is not None:
+        own_params, own_config = load_weights(arguments.rerank_weights)
+        rerank = dataclasses.replace(rerank, params=own_params, config=own_config)
+    if rerank is not None:
+        rerank.check(config)
     pca = None if arguments.pca is None else load_pca(arguments.pca)
     benchmark = open_benchmark(
         arguments.data,
@@ -107,6 +126,8 @@ def run(arguments: Evaluate) -> None:
         queries=arguments.queries,
         layout=arguments.layout,
     )
+    if rerank is not None:
+        rerank.check(config, len(benchmark.database))
     console.print(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
         f"images; positive: {benchmark.rule}\n{model_name}",
@@ -123,6 +144,7 @@ def run(arguments: Evaluate) -> None:
         seeds=arguments.seeds,
         pca=pca,
         observe=None if arguments.report is None else seen,
+        rerank=rerank,
         quiet=arguments.quiet,
     )
     console.print(grouping_table(results))
@@ -132,6 +154,11 @@ def run(arguments: Evaluate) -> None:
         notes.append("No cross-image encoder: no descriptor depends on its batch.")
     else:
         notes += _notes(arguments, groupings, same_place)
+    if rerank is not None:
+        notes.append(
+            f"+ {rerank.label}: the first {rerank.top} retrievals by its scores, which stand for "
+            "similarities in AP and R at 100 % P."
+        )
     for note in notes:
         console.print(note, soft_wrap=True)
     resolved = {
@@ -143,6 +170,10 @@ def run(arguments: Evaluate) -> None:
         "seed": arguments.seed,
         "seeds": arguments.seeds,
         "pca": None if arguments.pca is None else str(arguments.pca),
+        "rerank": arguments.rerank,
+        "rerank_weights": None
+        if arguments.rerank_weights is None
+        else str(arguments.rerank_weights),
         "model": to_plain(config),
     }
     if arguments.json is not None:
@@ -208,10 +239,10 @@ def _write_galleries(
 
     for result in results:
         prediction_gallery(
-            out / f"gallery_{result.grouping.replace('/', '-')}.png",
+            out / f"gallery_{re.sub(r'[/:]', '-', result.label).replace(' + ', '_')}.png",
             benchmark.queries,
             benchmark.database,
             *result.neighbours,
             benchmark.ground_truth(),
-            title=f"{benchmark.name}, {model_name}, {result.grouping}",
+            title=f"{benchmark.name}, {model_name}, {result.label}",
         )

@@ -15,7 +15,9 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.processes import leads
 from crisalad_jax.serial import read_config
+from crisalad_jax.vocabulary import needs_vocabulary, with_vocabulary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Train:
     """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
     recipe: str | None = None
     """How it trains: crisalad (the paper; the default), crisalad-1e-4 or crisalad-step (its Table
-    2), salad, cricavpr, or scratch (the default of tiny, from random weights)."""
+    2), salad, cricavpr, netvlad, or scratch (the default of tiny, from random weights)."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     image_size: tuple[int, int] | None = None
@@ -68,7 +70,7 @@ class Train:
 def run(arguments: Train) -> None:
     """Train, and draw the curves."""
     from crisalad_jax import processes
-    from crisalad_jax.fit import fit
+    from crisalad_jax.fit import check_run, check_trains, fit
     from crisalad_jax.metrics import read_metrics
     from crisalad_jax.report import training_curves
 
@@ -77,8 +79,9 @@ def run(arguments: Train) -> None:
     elif (arguments.processes, arguments.process) != (None, None):
         raise InputError("--processes, --process: found no --coordinator, expected it beside them")
     console.quiet = not processes.leads()
+    check_trains(arguments.settings)
     config, initial, places, validation = processes.agreed(lambda: _read(arguments))
-    if initial is None and config.trains != "all":
+    if (arguments.weights, arguments.backbone) == (None, None) and config.trains != "all":
         console.print(
             "Note: no --weights or --backbone, so the frozen part of the model "
             f"({config.trains} trains) is random. --trains all trains everything.",
@@ -89,6 +92,10 @@ def run(arguments: Train) -> None:
         + ("" if validation is None else f"; validation on {validation.name}"),
         soft_wrap=True,
     )
+    if arguments.weights is None and needs_vocabulary(config.model):
+        processes.led(lambda: check_run(arguments.out, config))
+        initial = processes.agreed(lambda: _with_vocabulary(initial, config, places, arguments))
+        initial = processes.handed_out(initial)
     result = fit(
         config,
         places,
@@ -125,6 +132,22 @@ def _read(
     initial = _start(arguments, config)
     places = read_places(arguments.data, cities=config.cities, min_images=config.min_images)
     return config, initial, places, _validation(arguments)
+
+
+def _with_vocabulary(
+    initial: Crisalad | None, config: TrainConfig, places: Places, arguments: Train
+) -> Crisalad:
+    """Centroids of the training images: of the same start always the same, so that runs go on."""
+    if initial is None:
+        initial = init_crisalad(jax.random.key(config.seed), config.model)
+    return with_vocabulary(
+        initial,
+        config.model,
+        [places.path(image) for image in range(len(places.files))],
+        seed=config.seed,
+        on_bad_image=arguments.on_bad_image,
+        quiet=arguments.quiet or not leads(),
+    )
 
 
 def _validation(arguments: Train) -> Benchmark | None:

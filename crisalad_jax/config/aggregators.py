@@ -190,6 +190,10 @@ class NetVladConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "clusters")
+        require(
+            self.clusters > 1,
+            f"NetVladConfig.clusters: found {self.clusters}, expected at least 2 to choose from",
+        )
 
     def shape(self, dim: int) -> TokenShape:
         """A sum of residuals for each cluster."""
@@ -269,6 +273,19 @@ class AnyLocConfig:
         require_positive(self, "clusters")
         require_choice(self, "facet")
 
+    def block(self, depth: int) -> int:
+        """Which of `depth` blocks the facet is of, from 0.
+
+        Raises:
+            InputError: there is no such block.
+        """
+        require(
+            -depth <= self.layer < depth,
+            f"AnyLocConfig.layer: found {self.layer}, expected {-depth} to {depth - 1} for a "
+            f"backbone of {depth} blocks",
+        )
+        return self.layer % depth
+
     def shape(self, dim: int) -> TokenShape:
         """A sum of residuals for each word."""
         return TokenShape(0, self.clusters, dim)
@@ -312,11 +329,15 @@ class TransVprConfig:
     levels: int = 3
     """Layers of the backbone, evenly apart, the last among them."""
     dim: int = 256
-    """Numbers in the descriptor, and in a local one."""
+    """Numbers in the descriptor."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "levels", "dim")
+
+    def depths(self, depth: int) -> tuple[int, ...]:
+        """After how many of a backbone's `depth` blocks each level is taken."""
+        return tuple(depth * (level + 1) // self.levels for level in range(self.levels))
 
     def shape(self, dim: int) -> TokenShape:
         """A global token."""

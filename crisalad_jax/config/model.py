@@ -113,8 +113,24 @@ class ModelConfig:
         require_choice(self, "keeps")
         choose("ModelConfig.aggregator", self.aggregator, AGGREGATORS)
         self.check_image_size(self.image_size)
+        depth = self.backbone.depth
+        require(
+            self.aggregator != "transvpr" or self.transvpr.levels <= depth,
+            f"TransVprConfig.levels: found {self.transvpr.levels}, expected at most {depth}, the "
+            "backbone's blocks",
+        )
+        if self.aggregator == "anyloc":
+            self._check_anyloc()
         if self.encoder.layers:
             self._check_encoder()
+
+    def _check_anyloc(self) -> None:
+        self.anyloc.block(self.backbone.depth)
+        require(
+            not self.encoder.layers,
+            f"CrossImageConfig.layers: found {self.encoder.layers} for aggregator anyloc, with "
+            "which nothing trains, expected 0",
+        )
 
     def _check_encoder(self) -> None:
         shape, heads = self.shape, self.encoder.heads

@@ -115,6 +115,31 @@ def _cricavpr(model: ModelConfig) -> TrainConfig:
     )
 
 
+def _transvpr(model: ModelConfig) -> TrainConfig:
+    """TransVPR over adapted DINOv2, by our loss in place of its triplets (docs/methods.md)."""
+    encoder = dataclasses.replace(model.encoder, layers=0)
+    return TrainConfig(model=dataclasses.replace(model, aggregator="transvpr", encoder=encoder))
+
+
+def _netvlad(model: ModelConfig) -> TrainConfig:
+    """NetVLAD over adapted DINOv2, trained as the paper trains what it compares with."""
+    encoder = dataclasses.replace(model.encoder, layers=0)
+    return TrainConfig(model=dataclasses.replace(model, aggregator="netvlad", encoder=encoder))
+
+
+def _anyloc(model: ModelConfig) -> TrainConfig:
+    """AnyLoc over DINOv2 as it is: of use for its model alone, for nothing of it trains."""
+    return TrainConfig(
+        model=dataclasses.replace(
+            model,
+            backbone=dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none")),
+            aggregator="anyloc",
+            encoder=dataclasses.replace(model.encoder, layers=0),
+        ),
+        trains="head",
+    )
+
+
 def _scratch(model: ModelConfig) -> TrainConfig:
     """From random weights, all of the model: ours, for `tiny`."""
     return TrainConfig(
@@ -147,6 +172,9 @@ RECIPES: Mapping[str, Callable[[ModelConfig], TrainConfig]] = {
     "crisalad-step": _varied(schedule="step"),
     "salad": _salad,
     "cricavpr": _cricavpr,
+    "transvpr": _transvpr,
+    "netvlad": _netvlad,
+    "anyloc": _anyloc,
     "scratch": _scratch,
 }
 """Named by what they reproduce. Table 2's other rows are one flag of `crisalad` each."""

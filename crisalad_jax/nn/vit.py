@@ -3,15 +3,19 @@
 Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it meets.
 """
 
+import dataclasses
 import functools
+import itertools
 import math
+import operator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
 from crisalad_jax.config import PATCH_SIZE, ViTConfig, choose
 from crisalad_jax.nn.adapter import Adapter, adapter, init_adapter
@@ -159,6 +163,87 @@ def vit(
     tokens = jax.vmap(lambda image: embed(params, image, config))(images)
     tokens = run_blocks(params, tokens, grid_of(images[0]), config, keeps=keeps)
     tokens = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
+    return Features(tokens[:, 0], tokens[:, 1 + config.registers :])
+
+
+def vit_levels(
+    params: ViT,
+    images: Float[Array, "image height width 3"],
+    config: ViTConfig,
+    depths: Sequence[int],
+    *,
+    keeps: str = "products",
+) -> Features:
+    """`vit`, with the patches after several numbers of blocks side by side: level times dim wide.
+
+    All levels go through the last layer norm, as in DINOv2's own intermediate layers. `depths` are
+    in order, the last of them the number of blocks. The stack of blocks is cut at each, which for
+    inference takes the memory of its parameters once more.
+    """
+    tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+    levels = []
+    for part in _cut_at(params.blocks, depths):
+        shorter = dataclasses.replace(params, blocks=part)
+        tokens = run_blocks(shorter, tokens, grid_of(images[0]), config, keeps=keeps)
+        levels.append(layer_norm(params.norm, tokens, epsilon=NORM_EPSILON))
+    patches = jnp.concatenate([level[:, 1 + config.registers :] for level in levels], axis=-1)
+    return Features(levels[-1][:, 0], patches)
+
+
+def _cut_at(
+    blocks: Block | tuple[Block, ...], depths: Sequence[int]
+) -> Iterator[tuple[Block, ...]]:
+    """The stacks of blocks up to each of `depths` from the one before."""
+    stacks = blocks if isinstance(blocks, tuple) else (blocks,)
+    for begin, end in itertools.pairwise((0, *depths)):
+        parts, start = [], 0
+        for stack in stacks:
+            chosen = slice(max(begin - start, 0), max(end - start, 0))
+            parts.append(jax.tree.map(operator.itemgetter(chosen), stack))
+            start += len(stack.ls1)
+        yield tuple(part for part in parts if len(part.ls1))
+
+
+def facet(
+    params: ViT,
+    images: Float[Array, "image height width 3"],
+    config: ViTConfig,
+    block_number: int,
+    name: str,
+) -> Features:
+    """Features of one facet of one block; the blocks after it are not run.
+
+    The facets are queries, keys and values of the block's attention, heads side by side, or the
+    tokens that the block leaves, without the last layer norm (AnyLoc: Keetha et al. 2023).
+
+    Args:
+        params: a backbone whose blocks are one stack.
+        images: normalised, with sides that are multiples of 14.
+        config: of the backbone.
+        block_number: of the block, from 0.
+        name: query, key, value or token.
+    """
+    stack = params.blocks
+    assert isinstance(stack, Block)  # training alone cuts it, and with a facet nothing trains
+    grid = grid_of(images[0])
+
+    def numbered(number: Int[Array, ""] | int) -> Block:
+        # Not a slice of the stack to scan over, which would be a copy of its weights.
+        return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
+
+    def body(
+        carry: Float[Array, "image token dim"], number: Int[Array, ""]
+    ) -> tuple[Float[Array, "image token dim"], None]:
+        return block(numbered(number), carry, grid, config), None
+
+    tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+    whole = block_number + (name == "token")
+    tokens, _ = jax.lax.scan(body, tokens, jnp.arange(whole))
+    if name != "token":
+        last = numbered(block_number)
+        here = ("query", "key", "value").index(name) * config.dim
+        part = jax.tree.map(lambda x: x[..., here : here + config.dim], last.attn.qkv)
+        tokens = linear(part, layer_norm(last.norm1, tokens, epsilon=NORM_EPSILON))
     return Features(tokens[:, 0], tokens[:, 1 + config.registers :])
 
 

@@ -57,7 +57,7 @@ def write_report(
     if not groupings:
         raise InputError("groupings: found none, expected at least one")
     for grouping in groupings:
-        check_fractions(grouping.grouping, grouping.recalls)
+        check_fractions(grouping.label, grouping.recalls)
     neighbours = groupings[0].neighbours
     verdicts = judge(neighbours, benchmark.ground_truth())
     shown = choose_shown(neighbours.similarities[:, 0], verdicts)
@@ -115,7 +115,7 @@ def _table(groupings: Sequence[GroupingResult]) -> tuple[list[str], list[list[_C
     """Headers, and a row of cells for each grouping; a column that all lack is left out."""
     ks = sorted({k for grouping in groupings for k in grouping.recalls})
     headers = ["grouping", *(f"R@{k}" for k in ks)]
-    rows = [[_Cell(g.grouping), *(_recall(g, k) for k in ks)] for g in groupings]
+    rows = [[_Cell(g.label), *(_recall(g, k) for k in ks)] for g in groupings]
     shares = [(g.query_share, g.database_share) for g in groupings]
     if any(share is not None for pair in shares for share in pair):
         headers.append("same place, queries / database")

@@ -83,12 +83,12 @@ class Gallery(NamedTuple):
 
 def curves(subject: Subject, groupings: Sequence[GroupingResult]) -> list[Drawing]:
     """Recall by K, and where it is known precision by recall, a line for each grouping."""
-    best = "; ".join(f"{g.grouping} {100 * g.recalls[min(g.recalls)]:.1f} %" for g in groupings)
+    best = "; ".join(f"{g.label} {100 * g.recalls[min(g.recalls)]:.1f} %" for g in groupings)
     path = subject.out / "recall_curves.png"
-    recall_curves(path, {g.grouping: g.recalls for g in groupings}, "", narrow=True)
+    recall_curves(path, {g.label: g.recalls for g in groupings}, "", narrow=True)
     found = [drawing(path, f"Recall at K against K. At K = 1: {best}")]
     known = {
-        g.grouping: PrecisionCurve(g.precision_recall.precision, g.precision_recall.recall)
+        g.label: PrecisionCurve(g.precision_recall.precision, g.precision_recall.recall)
         for g in groupings
         if g.precision_recall is not None
     }

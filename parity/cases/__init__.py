@@ -8,10 +8,13 @@ import numpy as np
 
 from crisalad_jax.config import (
     AdapterConfig,
+    AnyLocConfig,
     CrossImageConfig,
     ModelConfig,
+    NetVladConfig,
     SaladConfig,
     SinkhornConfig,
+    TransVprConfig,
     ViTConfig,
 )
 from parity.cases import parts
@@ -40,7 +43,10 @@ def _model(
             **backbone,
         ),
         aggregator=aggregator,
+        netvlad=NetVladConfig(clusters=5),
+        anyloc=AnyLocConfig(clusters=5, layer=-1, facet="token"),
         salad=SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0),
+        transvpr=TransVprConfig(levels=2, dim=24),
         encoder=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
     )
 
@@ -58,6 +64,9 @@ CRISALAD_REGISTERS = _model("depthwise", encoder=1, registers=3, ffn="swiglu")
 DINO_SALAD = _model()
 CRICAVPR = _model("multi-resolution", encoder=1, aggregator="gem-pyramid")
 TWO_LAYERS = _model(encoder=2)
+TRANSVPR = _model(aggregator="transvpr")
+NETVLAD = _model(aggregator="netvlad")
+ANYLOC = _model(aggregator="anyloc")
 CLASS_TOKEN = _model(aggregator="class-token")
 
 
@@ -186,7 +195,15 @@ CASES: tuple[Case, ...] = (
     *_sinkhorn_cases(),
     Case("SALAD", PLAIN, parts.AGGREGATE, FEATURES, smooth=False),
     Case("GeM pyramid", CRICAVPR, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
+    Case("NetVLAD", NETVLAD, parts.AGGREGATE, FEATURES, bfloat16=False),
+    Case("AnyLoc", ANYLOC, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
     Case("cross-image encoder", TWO_LAYERS, parts.ENCODER, SEQUENCES),
+    Case(
+        "TransVPR",
+        TRANSVPR,
+        parts.AGGREGATE,
+        FEATURES | {"patches": normal(BATCH, PATCHES, 2 * 32)},
+    ),
     Case(
         "cross-image encoder, masked",
         TWO_LAYERS,
@@ -217,7 +234,9 @@ CASES: tuple[Case, ...] = (
             parts.DESCRIPTOR,
             inputs,
             forward="descriptor",
-            smooth=model.aggregator == "class-token",
+            # A patch that rounding gives to another word makes another descriptor.
+            bfloat16=model.aggregator != "anyloc",
+            smooth=model.aggregator in ("class-token", "netvlad", "transvpr"),
         )
         for name, model, inputs in (
             ("CriSALAD", CRISALAD, IMAGES),
@@ -228,7 +247,10 @@ CASES: tuple[Case, ...] = (
             ),
             ("DINO-SALAD", DINO_SALAD, IMAGES),
             ("CricaVPR", CRICAVPR, IMAGES),
+            ("NetVLAD's descriptor", NETVLAD, IMAGES),
+            ("AnyLoc's descriptor", ANYLOC, IMAGES),
             ("class token", CLASS_TOKEN, IMAGES),
+            ("TransVPR descriptor", TRANSVPR, IMAGES),
         )
     ),
 )

@@ -3,6 +3,8 @@
 DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
 """
 
+from collections.abc import Callable, Mapping
+
 import torch
 from torch import Tensor, nn
 
@@ -12,7 +14,17 @@ from parity.reference.layers import l2_normalise, widen
 from parity.reference.pyramid import GemPyramid, UnitPatches
 from parity.reference.salad import Salad, published_order
 from parity.reference.tokens import Tokens, as_sequence, from_sequence
+from parity.reference.transvpr import TransVpr
 from parity.reference.vit import Features, ViT
+from parity.reference.vlad import AnyLoc, NetVlad
+
+AGGREGATORS: Mapping[str, Callable[[ModelConfig], nn.Module]] = {
+    "salad": lambda config: Salad(config.backbone.dim, config.salad),
+    "netvlad": lambda config: NetVlad(config.backbone.dim, config.netvlad.clusters),
+    "anyloc": lambda config: AnyLoc(config.backbone.dim, config.anyloc.clusters),
+    "transvpr": lambda config: TransVpr(config.backbone.dim, config.transvpr),
+}
+"""Those that are called `aggregator` in a state."""
 
 
 class Crisalad(nn.Module):
@@ -29,7 +41,7 @@ class Crisalad(nn.Module):
         self.compute_dtype: torch.dtype = getattr(torch, config.compute_dtype)
         self.backbone = ViT(config.backbone)
         kind = config.aggregator
-        self.aggregator = Salad(config.backbone.dim, config.salad) if kind == "salad" else None
+        self.aggregator = AGGREGATORS[kind](config) if kind in AGGREGATORS else None
         self.aggregation = (
             nn.Sequential(UnitPatches(), GemPyramid()) if kind == "gem-pyramid" else None
         )
@@ -58,7 +70,14 @@ class Crisalad(nn.Module):
     def tokenise(self, images: Tensor) -> Tokens:
         """The first half of `forward`: every image's tokens, which owe nothing to other images."""
         self.config.check_image_size((images.shape[2], images.shape[3]))
-        return self.aggregate(self.backbone(images.to(self.compute_dtype)))
+        images = images.to(self.compute_dtype)
+        if self.config.aggregator == "anyloc":
+            number = self.config.anyloc.block(self.config.backbone.depth)
+            return self.aggregate(self.backbone.facet(images, number, self.config.anyloc.facet))
+        if self.config.aggregator == "transvpr":
+            depths = self.config.transvpr.depths(self.config.backbone.depth)
+            return self.aggregate(self.backbone(images, depths))
+        return self.aggregate(self.backbone(images))
 
     def aggregate(self, features: Features) -> Tokens:
         """From a backbone's features to the images' tokens, in float32 at least."""

@@ -1,5 +1,6 @@
 """DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024)."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -132,12 +133,39 @@ class ViT(nn.Module):
             elif name.endswith(".weight") and parameter.ndim > 1:
                 nn.init.trunc_normal_(parameter, std=0.02, a=-0.04, b=0.04)
 
-    def forward(self, images: Tensor) -> Features:
-        """(batch, 3, height, width) to features; the sides are multiples of 14."""
+    def forward(self, images: Tensor, depths: Sequence[int] | None = None) -> Features:
+        """(batch, 3, height, width) to features; the sides are multiples of 14.
+
+        With `depths` the patches after so many blocks, all through the last norm, are concatenated.
+        """
         grid = grid_of(images)
+        if depths is not None:
+            tokens, levels = self.embed(images), []
+            for depth, block in enumerate(self.blocks, 1):
+                tokens = block(tokens, grid)
+                if depth in depths:
+                    levels.append(self.norm(tokens)[:, -grid[0] * grid[1] :])
+            patches = torch.cat(levels, dim=2)
+            return Features(self.norm(tokens)[:, 0], patches.mT.unflatten(-1, grid))
         tokens = self.norm(self.run_blocks(self.embed(images), grid))
         patches = tokens[:, -grid[0] * grid[1] :]
         return Features(tokens[:, 0], patches.mT.unflatten(-1, grid))
+
+    def facet(self, images: Tensor, number: int, name: str) -> Features:
+        """Queries, keys, values or tokens of block `number` alone, heads side by side (AnyLoc)."""
+        grid = grid_of(images)
+        tokens = self.embed(images)
+        for block in self.blocks[:number]:
+            tokens = block(tokens, grid)
+        last = self.blocks[number]
+        assert isinstance(last, Block)
+        if name == "token":
+            found = last(tokens, grid)
+        else:
+            three = last.attn.qkv(last.norm1(tokens)).chunk(3, dim=-1)
+            found = dict(zip(("query", "key", "value"), three, strict=True))[name]
+        patches = found[:, -grid[0] * grid[1] :]
+        return Features(found[:, 0], patches.mT.unflatten(-1, grid))
 
     def embed(self, images: Tensor) -> Tensor:
         """Class token, registers and patches with their positions; registers have none."""

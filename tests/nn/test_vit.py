@@ -16,6 +16,7 @@ from crisalad_jax.nn.vit import (
     init_vit,
     interpolate_positions,
     vit,
+    vit_levels,
 )
 
 CONFIG = ViTConfig(dim=16, depth=3, heads=2, position_grid=5)
@@ -141,3 +142,27 @@ def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None
     np.testing.assert_allclose(np.diag(similarity), 32, rtol=1e-5)
     assert (similarity[0, 1:] < 31.9).all()
     assert similarity[0, 1] > similarity[0, 2] > similarity[0, 3]
+
+
+@pytest.mark.parametrize("depths", [(1, 2, 3), (2, 3), (3,)])
+def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, ...]) -> None:
+    params = init_vit(jax.random.key(0), CONFIG)
+    expected = [
+        vit(
+            dataclasses.replace(params, blocks=jax.tree.map(lambda x, d=d: x[:d], params.blocks)),
+            images(1, 28, 42),
+            CONFIG,
+        )
+        for d in depths
+    ]
+    two = tuple(
+        jax.tree.map(lambda leaf, s=s: leaf[s], params.blocks) for s in (slice(2), slice(2, 3))
+    )
+    for blocks in (params.blocks, two):  # as it stands, and as training cuts it
+        found = vit_levels(
+            dataclasses.replace(params, blocks=blocks), images(1, 28, 42), CONFIG, depths
+        )
+        # The same sums, compiled twice.
+        np.testing.assert_allclose(found.class_token, expected[-1].class_token, atol=1e-6)
+        patches = np.concatenate([features.patches for features in expected], axis=-1)
+        np.testing.assert_allclose(found.patches, patches, atol=1e-6)

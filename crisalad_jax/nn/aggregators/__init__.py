@@ -11,14 +11,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ModelConfig, choose
-from crisalad_jax.nn.aggregators import gem_pyramid
+from crisalad_jax.nn.aggregators import anyloc, gem_pyramid, netvlad, transvpr
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid
+from crisalad_jax.nn.aggregators.netvlad import NetVlad
+from crisalad_jax.nn.aggregators.transvpr import TransVpr
 from crisalad_jax.nn.layers import Keys, l2_normalise, widen
 from crisalad_jax.nn.salad import Salad, init_salad, published_order, salad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
 
-Aggregator = Salad | GemPyramid
+Aggregator = Salad | GemPyramid | NetVlad | AnyLoc | TransVpr
 
 
 class Method(NamedTuple):
@@ -59,7 +62,10 @@ def _class_token(
 _METHODS = {
     "salad": Method(_init_salad, _salad, published_order),
     "gem-pyramid": Method(gem_pyramid.init, gem_pyramid.apply),
+    "netvlad": Method(netvlad.init, netvlad.apply),
+    "anyloc": Method(anyloc.init, anyloc.apply),
     "class-token": Method(lambda key, config: None, _class_token),
+    "transvpr": Method(transvpr.init, transvpr.apply),
 }
 
 

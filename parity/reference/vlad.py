@@ -1,0 +1,52 @@
+"""NetVLAD (Arandjelovic et al., CVPR 2016), and AnyLoc's hard VLAD (Keetha et al., RA-L 2023)."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from parity.reference.layers import l2_normalise, widen
+from parity.reference.tokens import Tokens
+from parity.reference.vit import Features
+
+
+class NetVlad(nn.Module):
+    """Assignment and centroids apart; the names are Nanne/pytorch-NetVlad's."""
+
+    def __init__(self, dim: int, clusters: int) -> None:
+        """Random, as torch's layers start."""
+        super().__init__()
+        self.conv = nn.Conv2d(dim, clusters, 1, bias=False)
+        self.centroids = nn.Parameter(l2_normalise(torch.randn(clusters, dim)))
+
+    def forward(self, features: Features) -> Tokens:
+        """V(k) = sum of a_k(x) (x - c_k) over the patches (Eq. 4), each of length 1."""
+        patches = F.normalize(widen(features.patches), dim=1)
+        shares = self.conv(patches).softmax(dim=1).flatten(2)
+        return _tokens(features, _vlad(shares, patches.flatten(2), self.centroids))
+
+
+class AnyLoc(nn.Module):
+    """Every patch counts for the nearest word."""
+
+    def __init__(self, dim: int, clusters: int) -> None:
+        """Random words, of no backbone."""
+        super().__init__()
+        self.words = nn.Parameter(l2_normalise(torch.randn(clusters, dim)))
+        self.backbone = nn.Buffer(torch.zeros(()))
+
+    def forward(self, features: Features) -> Tokens:
+        """V(k) = sum of x - c_k over the patches nearest to word k, each of length 1."""
+        patches = F.normalize(widen(features.patches), dim=1).flatten(2)
+        nearest = torch.cdist(patches.mT, self.words.expand(len(patches), -1, -1)).argmin(dim=2)
+        shares = F.one_hot(nearest, len(self.words)).mT.to(patches.dtype)
+        return _tokens(features, _vlad(shares, patches, self.words))
+
+
+def _vlad(shares: Tensor, patches: Tensor, centroids: Tensor) -> Tensor:
+    """Shares (batch, cluster, patch) of patches (batch, dim, patch) to (batch, cluster, dim)."""
+    residuals = patches[:, None] - centroids[None, :, :, None]
+    return l2_normalise((shares[:, :, None] * residuals).sum(dim=3))
+
+
+def _tokens(features: Features, clusters: Tensor) -> Tokens:
+    return Tokens(widen(features.class_token)[:, :0], clusters)

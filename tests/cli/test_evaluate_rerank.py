@@ -1,0 +1,81 @@
+"""`crisalad evaluate --rerank`."""
+
+import json
+
+import pytest
+
+from crisalad_jax.checkpoint import save_weights
+from tests.conftest import BATCH, random_params
+from tests.report.test_page import Page
+from tests.reranking.test_stage import TRANSVPR
+from tests.test_cli import fails, files_in, succeeds
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """Of a model that makes what TransVPR compares."""
+    path = tmp_path / "transvpr.safetensors"
+    save_weights(path, random_params(TRANSVPR), TRANSVPR)
+    return path
+
+
+def test_rows_come_in_pairs(capfd, tmp_path, shared, weights):
+    out = succeeds(
+        capfd,
+        *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
+        *("--batch-size", BATCH, "--grouping", "single,sequential/single", "--quiet"),
+        *("--rerank", "transvpr:3", "--rerank-weights", weights, "--json", tmp_path / "f.json"),
+        *("--out", tmp_path / "out", "--report", tmp_path / "page"),
+    )
+    assert out.count("+ transvpr:3") == 3  # two rows, and the note
+    assert "the first 3 retrievals by its scores" in out
+    found = json.loads((tmp_path / "f.json").read_text())
+    assert (found["rerank"], found["rerank_weights"]) == ("transvpr:3", str(weights))
+    rows = found["results"]
+    assert [(row["grouping"], row["rerank"]) for row in rows] == [
+        ("single", None),
+        ("single", "transvpr:3"),
+        ("sequential/single", None),
+        ("sequential/single", "transvpr:3"),
+    ]
+    for before, after in zip(rows[::2], rows[1::2], strict=True):
+        assert after["recalls"]["R@5"] == before["recalls"]["R@5"]
+        assert after["same_place"] == before["same_place"]
+    galleries = {name for name in files_in(tmp_path / "out") if name.endswith(".png")}
+    assert galleries == {
+        "gallery_single.png",
+        "gallery_single_transvpr-3.png",
+        "gallery_sequential-single.png",
+        "gallery_sequential-single_transvpr-3.png",
+    }
+    page = Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
+    assert [e["text"] for e in page.all("th", scope="row")] == [
+        *("single", "single + transvpr:3"),
+        *("sequential/single", "sequential/single + transvpr:3"),
+    ]
+
+
+def test_bad_input_is_named_before_any_work(capfd, shared, weights, monkeypatch):
+    monkeypatch.setattr("crisalad_jax.cli.evaluate.evaluate", None)
+    own = shared / "weights.safetensors"
+    start = ("evaluate", "--data", shared / "town", "--weights", own, "--quiet")
+    nowhere = ("evaluate", "--data", shared / "none", "--weights", own, "--quiet")
+    for given, words in (
+        ((*nowhere, "--rerank", "transvpr"), ("found 'transvpr', expected NAME:TOPK",)),
+        ((*nowhere, "--rerank", "glue:3"), ("found 'glue', expected one of patch-netvlad, ",)),
+        ((*nowhere, "--rerank", "transvpr:3"), ("aggregator salad", "--rerank-weights")),
+        ((*nowhere, "--rerank-weights", weights), ("rerank-weights: found without --rerank",)),
+        (
+            (*nowhere, "--rerank", "patch-netvlad:3", "--rerank-weights", weights),
+            ("found a model with aggregator transvpr, expected netvlad",),
+        ),
+        (
+            (*nowhere, "--rerank", "transvpr:3", "--rerank-weights", shared / "no"),
+            (f"{shared / 'no'}: found no such file",),
+        ),
+        (
+            (*start, "--rerank", "transvpr:8", "--rerank-weights", weights),
+            ("found transvpr:8 over a database of 7 images, expected at most 7",),
+        ),
+    ):
+        fails(capfd, *given, words=words)

@@ -1,0 +1,274 @@
+"""Vocabularies: fixed points of k-means on features that are read here again; what is refused."""
+
+import dataclasses
+import pathlib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+
+import crisalad_jax.fit
+from crisalad_jax.checkpoint import load_weights, save_weights
+from crisalad_jax.config import AnyLocConfig, CrossImageConfig, NetVladConfig, recipe
+from crisalad_jax.data.images import list_images, read_image, resize_image
+from crisalad_jax.data.places import read_places
+from crisalad_jax.errors import InputError
+from crisalad_jax.files import write_json
+from crisalad_jax.fit import fit
+from crisalad_jax.model import Crisalad, unit_features
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc
+from crisalad_jax.nn.aggregators.netvlad import NetVlad
+from crisalad_jax.serial import to_plain
+from crisalad_jax.vocabulary import needs_vocabulary, with_vocabulary
+from tests.conftest import BATCH, MODEL, RECIPE, assert_equal, random_params
+from tests.test_cli import extract, fails, succeeds
+
+ANYLOC = dataclasses.replace(
+    MODEL,
+    aggregator="anyloc",
+    anyloc=AnyLocConfig(clusters=4, layer=0, facet="key"),
+    netvlad=NetVladConfig(clusters=4),
+    encoder=CrossImageConfig(layers=0),
+)
+NETVLAD = dataclasses.replace(ANYLOC, aggregator="netvlad")
+CONFIGS = pytest.mark.parametrize("config", [ANYLOC, NETVLAD], ids=["anyloc", "netvlad"])
+
+
+@pytest.fixture(scope="module")
+def fresh() -> Crisalad:
+    """AnyLoc without a vocabulary. Drawn by numpy: to compile `init_crisalad` takes longer."""
+    params = random_params(ANYLOC)
+    return dataclasses.replace(params, aggregator=AnyLoc(jnp.ones((4, 32)), jnp.zeros(())))
+
+
+@pytest.fixture(scope="module")
+def paths(shared: pathlib.Path) -> list[pathlib.Path]:
+    return list_images(shared / "town")
+
+
+@pytest.fixture(scope="module")
+def built(fresh: Crisalad, paths: list[pathlib.Path]) -> Crisalad:
+    return with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH)
+
+
+def centroids_of(params: Crisalad) -> np.ndarray:
+    aggregator = params.aggregator
+    assert isinstance(aggregator, AnyLoc | NetVlad)
+    return np.asarray(aggregator.words if isinstance(aggregator, AnyLoc) else aggregator.centroids)
+
+
+@CONFIGS
+def test_a_centroid_is_the_mean_of_the_features_nearest_to_it(config, fresh, paths) -> None:
+    """Of all features of all images: with 12 patches an image, none are left out."""
+    centroids = centroids_of(with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH))
+    images = np.stack([resize_image(read_image(path), config.image_size) for path in paths])
+    batches = images.reshape(-1, BATCH, *images.shape[1:])
+    found = [np.asarray(unit_features(fresh, jnp.asarray(batch), config)) for batch in batches]
+    features = np.concatenate(found).reshape(-1, 32).astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(features, axis=1), 1, rtol=1e-6)
+    distances = np.linalg.norm(features[:, None] - centroids, axis=2)
+    nearest = distances.argmin(axis=1)
+    assert set(nearest) == set(range(4))
+    means = [features[nearest == k].mean(axis=0) for k in range(4)]
+    # Means of at most 144 float32 numbers; a round more of k-means would not move them.
+    np.testing.assert_allclose(centroids, means, atol=1e-6)
+
+
+def test_a_seed_draws_images_and_centroids(fresh, paths, built) -> None:
+    again = with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH)
+    assert_equal(again, built)
+    fewer = with_vocabulary(fresh, ANYLOC, paths, images=5, seed=3, batch_size=BATCH)
+    others = with_vocabulary(fresh, ANYLOC, paths, images=5, seed=4, batch_size=BATCH)
+    some = [centroids_of(params) for params in (built, fewer, others)]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        assert not np.array_equal(some[i], some[j])
+    assert_equal(dataclasses.replace(built, aggregator=fresh.aggregator), fresh)
+
+
+def test_who_needs_one() -> None:
+    assert needs_vocabulary(ANYLOC)
+    assert needs_vocabulary(NETVLAD)
+    assert not needs_vocabulary(MODEL)
+
+
+def test_what_does_not_fit_is_said_before_images_are_read(fresh, tmp_path) -> None:
+    nowhere = [tmp_path / "none.jpg"]
+    many = dataclasses.replace(ANYLOC, anyloc=AnyLocConfig(clusters=13, layer=0))
+    for config, options, words in (
+        (MODEL, {}, "aggregator: found salad, which has no vocabulary, expected netvlad or anyloc"),
+        (many, {}, "images: found 1, which is 12 features, expected at least 13"),
+        (ANYLOC, {"images": 0}, "images: found 0, expected at least 1"),
+        (ANYLOC, {"seed": -1}, "seed: found -1, expected at least 0"),
+        (ANYLOC, {"batch_size": 0}, "batch_size: found 0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            with_vocabulary(fresh, config, nowhere, **{"batch_size": BATCH} | options)
+
+
+def test_unreadable_images_stop_or_are_left_out(fresh, paths, built, tmp_path) -> None:
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"no image")
+    with pytest.raises(InputError, match=f"{bad}: found 8 bytes that do not decode"):
+        with_vocabulary(fresh, ANYLOC, [*paths, bad], batch_size=BATCH)
+    options = {"seed": 3, "batch_size": BATCH, "on_bad_image": "skip"}
+    assert_equal(with_vocabulary(fresh, ANYLOC, [*paths, bad], **options), built)
+    with pytest.raises(InputError, match="found 0 features in those that can be read, expected at"):
+        with_vocabulary(fresh, ANYLOC, [bad], **options)
+
+
+def test_features_that_are_not_finite_are_refused(fresh, paths) -> None:
+    spoilt = dataclasses.replace(fresh.backbone, cls_token=jnp.full(32, jnp.nan))
+    broken = dataclasses.replace(fresh, backbone=spoilt)
+    token = AnyLocConfig(clusters=4, layer=-1, facet="token")
+    with pytest.raises(InputError, match="features: found NaN or infinity"):
+        with_vocabulary(
+            broken, dataclasses.replace(ANYLOC, anyloc=token), paths[:BATCH], batch_size=BATCH
+        )
+
+
+# Whose it is
+
+
+def other(backbone):
+    return dataclasses.replace(backbone, cls_token=backbone.cls_token + 1)
+
+
+def test_a_vocabulary_of_another_backbone_is_refused(capfd, built, shared, tmp_path) -> None:
+    path = tmp_path / "w.safetensors"
+    mixed = dataclasses.replace(built, backbone=other(built.backbone))
+    with pytest.raises(InputError, match=f"{path}: found a vocabulary of another backbone"):
+        save_weights(path, mixed, ANYLOC)
+    assert not path.exists()
+
+    save_weights(path, built, ANYLOC)
+    found, _ = load_weights(path)
+    assert_equal(found, built)
+    arrays = safetensors.numpy.load_file(path)
+    with safetensors.safe_open(path, framework="numpy") as file:
+        metadata = file.metadata()
+    arrays["backbone.cls_token"] = arrays["backbone.cls_token"] + 1
+    safetensors.numpy.save_file(arrays, path, metadata=metadata)
+    start = extract(shared, shared / "town", tmp_path / "d.npy")
+    start = tuple(path if part == shared / "weights.safetensors" else part for part in start)
+    fails(capfd, *start, words=(f"{path}: found a vocabulary of another backbone, expected one",))
+
+
+def test_words_that_nobody_built_go_with_any_backbone(fresh, tmp_path) -> None:
+    mixed = dataclasses.replace(fresh, backbone=other(fresh.backbone))
+    save_weights(tmp_path / "w.safetensors", mixed, ANYLOC)
+    assert_equal(load_weights(tmp_path / "w.safetensors")[0], mixed)
+
+
+# The commands
+
+
+def test_vocabulary_leaves_a_whole_model(capfd, fresh, built, shared, tmp_path) -> None:
+    start, out = tmp_path / "start.safetensors", tmp_path / "new" / "w.safetensors"
+    save_weights(start, fresh, ANYLOC)
+    command = ("vocabulary", "--weights", start, "--images", shared / "town", "--out", out)
+    said = succeeds(capfd, *command, "--seed", 3, "--batch-size", BATCH, "--quiet")
+    words = "anyloc (key of block 0), 4 words from 12 images, descriptors of 128 numbers"
+    assert said == f"{out}: {words}"
+    found, config = load_weights(out)
+    assert config == ANYLOC
+    assert_equal(found, built)
+    succeeds(
+        capfd,
+        *("extract", "--weights", out, "--images", shared / "town", "--quiet"),
+        *("--out", tmp_path / "d.npy", "--batch-size", BATCH),
+    )
+    descriptors = np.load(tmp_path / "d.npy")
+    assert descriptors.shape == (12, 128)
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_vocabulary_of_a_preset_and_a_backbone(capfd, shared, tmp_path) -> None:
+    """NetVLAD's, on the backbone of a model of another aggregator."""
+    config = recipe("tiny", "scratch").model
+    params = random_params(config)
+    start, out = tmp_path / "start.safetensors", tmp_path / "w.safetensors"
+    save_weights(start, params, config)
+    said = succeeds(
+        capfd,
+        *("vocabulary", "--backbone", start, "--preset", "tiny", "--aggregator", "netvlad"),
+        *("--clusters", 3, "--image-size", 42, 56, "--images", shared / "town", "--out", out),
+        *("--max-images", 4, "--batch-size", BATCH, "--quiet"),
+    )
+    assert said == f"{out}: netvlad, 3 words from 4 images, descriptors of 384 numbers"
+    found, found_config = load_weights(out)
+    assert (found_config.image_size, found_config.netvlad.clusters) == ((42, 56), 3)
+    assert_equal(found.backbone, params.backbone)
+
+
+def test_bad_input_of_vocabulary_is_one_line(capfd, shared, tmp_path) -> None:
+    out, weights = tmp_path / "w.safetensors", shared / "weights.safetensors"
+    start = ("vocabulary", "--images", shared / "town", "--out")
+    for more, words in (
+        ((tmp_path / "w.npy",), "w.npy: found the suffix '.npy', expected .safetensors"),
+        ((out, "--weights", weights), f"{weights}: found aggregator salad, expected netvlad or"),
+        ((out, "--weights", weights, "--backbone", weights), "--backbone: found beside --weights"),
+        ((out, "--weights", weights, "--layer", 1), "--layer: found beside --weights"),
+        ((out, "--preset", "tiny", "--layer", 4), "layer: found 4, expected -4 to 3"),
+        (
+            (out, "--preset", "tiny", "--aggregator", "netvlad", "--facet", "key"),
+            "--facet: found with --aggregator netvlad, expected anyloc",
+        ),
+        (
+            (out, "--preset", "tiny", "--backbone", weights),
+            f"{weights}: this backbone is of another size",
+        ),
+    ):
+        fails(capfd, *start, *more, words=(words,))
+    assert not out.exists()
+
+
+def test_training_netvlad_starts_from_the_training_images(
+    capfd, shared, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same start in every call, which is what lets a run go on; given weights stay."""
+    config = dataclasses.replace(RECIPE, model=NETVLAD)
+    write_json(tmp_path / "recipe.json", to_plain(config))
+    starts = []
+
+    def stop(*_, initial=None, **__):
+        starts.append(initial)
+        raise InputError("far enough")
+
+    monkeypatch.setattr(crisalad_jax.fit, "fit", stop)
+    command = ("train", "--data", shared / "city", "--config", tmp_path / "recipe.json")
+    weights = shared / "weights.safetensors"
+    for _ in range(2):
+        begin = (*command, "--out", tmp_path / "run", "--backbone", weights, "--quiet")
+        fails(capfd, *begin, words=("far enough",))
+    places = read_places(shared / "city", min_images=2)
+    images = [places.path(image) for image in range(len(places.files))]
+    expected = with_vocabulary(starts[0], NETVLAD, images, seed=config.seed)
+    assert_equal(starts[0], expected)
+    assert_equal(starts[1], expected)
+    assert_equal(starts[0].backbone, load_weights(weights)[0].backbone)
+
+    save_weights(tmp_path / "w.safetensors", random_params(NETVLAD), NETVLAD)
+    begin = (*command, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
+    fails(capfd, *begin, "--quiet", words=("far enough",))
+    assert_equal(starts[2], load_weights(tmp_path / "w.safetensors")[0])
+
+    # What holds something else is said before images are read for the centroids.
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    monkeypatch.setattr("crisalad_jax.cli.train.with_vocabulary", None)
+    begin = (*command, "--out", tmp_path / "full", "--backbone", weights, "--quiet")
+    fails(capfd, *begin, words=("full: found files but no run",))
+
+
+def test_anyloc_does_not_train(capfd, shared, tmp_path) -> None:
+    config = dataclasses.replace(RECIPE, model=ANYLOC)
+    words = "aggregator: found anyloc, with which nothing trains, expected another"
+    with pytest.raises(InputError, match=words):
+        fit(config, read_places(shared / "city", min_images=2), tmp_path / "run")
+    write_json(tmp_path / "recipe.json", to_plain(config))
+    command = ("train", "--data", tmp_path / "none", "--config", tmp_path / "recipe.json")
+    fails(capfd, *command, "--out", tmp_path / "run", words=(words,))
+    assert not (tmp_path / "run").exists()
