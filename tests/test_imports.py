@@ -20,6 +20,7 @@ LAYERS = (
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),
     ("convert", "export"),
+    ("classification",),
     ("training", "retrieval", "descriptors", "pca"),
     ("results", "approximate", "similarity"),
     ("evaluation", "report", "pairs", "stores"),
