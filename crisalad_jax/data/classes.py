@@ -78,12 +78,10 @@ def class_groups(
                 f"expected at least places_per_batch {places_per_batch}; fewer groups "
                 "(--loss.large-margin-cosine.groups) have more"
             )
-    # Sets take turns; one with fewer groups repeats them.
-    most = max(map(len, chosen))
     return tuple(
-        _regrouped(places, classes, groups[turn % len(groups)])
-        for turn in range(most)
-        for classes, groups in zip(sets, chosen, strict=True)
+        _regrouped(places, classes, group)
+        for turn in zip(*chosen)  # noqa: B905, for as many of each set
+        for classes, group in zip(sets, turn, strict=True)
     )
 
 
