@@ -182,25 +182,37 @@ def state_in(out: pathlib.Path):
     return saved.state
 
 
+@pytest.mark.slow
 def test_classification_learns(tmp_path, places):
     """From a cold start, one group: chance is an eighth."""
     loss = LossConfig(
         kind="large-margin-cosine",
         large_margin_cosine=LargeMarginCosineConfig(groups=1, steps=60),
     )
-    config = dataclasses.replace(CONFIG, loss=loss, epochs=1, augment="none", micro_batch=None)
+    config = dataclasses.replace(CONFIG, loss=loss, epochs=1, augment="none")
     fit(config, places, tmp_path, quiet=True)
     steps = [line for line in read_metrics(tmp_path / "metrics.jsonl") if "loss" in line]
     assert np.mean([line["b_acc"] for line in steps[-10:]]) > 0.9
-    assert steps[-1]["loss"] < 0.2 * steps[0]["loss"]
+    assert steps[-1]["loss"] < 0.5 * steps[0]["loss"]
 
 
-def test_too_few_classes_are_told_before_any_file_is_written(tmp_path, places):
-    many = LargeMarginCosineConfig(groups=3, steps=2)
+@pytest.mark.parametrize(
+    ("loss", "words"),
+    [
+        (
+            LargeMarginCosineConfig(groups=3, steps=2),
+            "city: found 2 classes in the smallest of 3 groups, expected at least places_per_batch",
+        ),
+        (LargeMarginCosineConfig(classes="viewpoints"), r"city: found one position \(lat, lon\)"),
+    ],
+)
+def test_classes_that_cannot_be_made_are_told_before_any_file_is_written(
+    tmp_path, places, loss, words
+):
     config = dataclasses.replace(
-        CONFIG, loss=dataclasses.replace(CONFIG.loss, large_margin_cosine=many)
+        CONFIG, loss=dataclasses.replace(CONFIG.loss, large_margin_cosine=loss)
     )
-    with pytest.raises(InputError, match="found 2 classes in the smallest of 3 groups"):
+    with pytest.raises(InputError, match=words):
         fit(config, places, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 
