@@ -21,6 +21,7 @@ from crisalad_jax import processes
 from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import TrainConfig
 from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.classes import class_groups
 from crisalad_jax.data.loader import (
     ImageBatch,
     ImageCache,
@@ -136,8 +137,8 @@ def fit(
     Raises:
         InputError: nothing of the model trains; an argument is out of range; the validation has no
             ground truth; `out` holds something else, or a run of another configuration or start; an
-            image cannot be read; there are too few places or images; the loss is no longer finite
-            (the state before that step is saved); or a file cannot be written.
+            image cannot be read; there are too few places, classes or images; the loss is no longer
+            finite (the state before that step is saved); or a file cannot be written.
         Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
     """
     check_trains(config)
@@ -178,6 +179,10 @@ def _train(run: "_Run", rest_of_epoch: Callable[[], _Batches], quiet: bool) -> N
     silent = quiet or not processes.leads()
     bar = progress_bar("training", run.steps, "steps", quiet=silent, done=run.step)
     with put_off_signals() as stop, bar as bar:
+        if run.classes:
+            bar.say(
+                f"classes in {len(run.classes)} groups: {min(run.classes)} to {max(run.classes)}"
+            )
         try:
             try:
                 _take_steps(run, rest_of_epoch, stop, bar)
@@ -226,18 +231,10 @@ class _Run:
         }
         for what, number in (checksums | {"--split-state": int(split_state)}).items():
             processes.check_same(what, number)
-        self.steps_per_epoch = len(
-            epoch_batches(
-                places,
-                places_per_batch=config.places_per_batch,
-                images_per_place=config.images_per_place,
-                order=config.batch_order,
-                seed=config.seed,
-                epoch=0,
-            )
-        )
+        self._groups = groups_of(config, places)
+        self.steps_per_epoch = _steps_per_epoch(config, self._groups)
         self.config, self.out = config, out
-        self._places, self._validation = places, validation
+        self._validation = validation
         self._devices = _devices(config)
         if split_state and self._devices.mesh.size == 1:
             raise InputError(
@@ -245,6 +242,9 @@ class _Run:
                 "not share a step where all trains"
             )
         self.steps = self.steps_per_epoch * config.epochs
+        self.classes = (
+            tuple(len(group.place_id) for group in self._groups) if config.loss.classifies else ()
+        )
         self._cache = ImageCache()
         self._compiled = StepConfig(
             config.model,
@@ -254,10 +254,13 @@ class _Run:
             self.steps_per_epoch,
             config.micro_batch,
             self._devices.mesh if split_state else None,
+            self.classes,
         )
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
+        # 0 and 1 may be what the line above has drawn.
+        classifiers_key = jax.random.fold_in(jax.random.key(config.seed), 2)
         params = init_crisalad(init_key, config.model) if initial is None else initial
-        state, frozen = init_state(params, config.trains, self._compiled)
+        state, frozen = init_state(params, config.trains, self._compiled, key=classifiers_key)
         self._frozen: PyTree = jax.device_get(frozen)
         self._frozen_there = self._devices.share(narrow(self._frozen, config.model))
         self.record = _Record(
@@ -329,8 +332,9 @@ class _Run:
         epoch, start_step = divmod(self.step, self.steps_per_epoch)
         batches = batches_of(
             self.config,
-            self._places,
+            self._groups[epoch % len(self._groups)],
             epoch,
+            steps=self.steps_per_epoch,
             start_step=start_step,
             part=(jax.process_index(), jax.process_count()),
             on_bad_image=on_bad_image,
@@ -527,6 +531,41 @@ class _Files:
         for path in set((self._out / "best").glob("step-*.safetensors")) - kept:
             self.states.wait()  # or a kill now would leave a state that still counts them
             path.unlink()
+
+
+def groups_of(config: TrainConfig, places: Places) -> tuple[Places, ...]:
+    """What the epochs draw from in turn: all places, or groups of classes (`data.classes`).
+
+    Raises:
+        InputError: there are too few classes, or positions are missing.
+    """
+    if not config.loss.classifies:
+        return (places,)
+    return class_groups(
+        places,
+        config.loss.large_margin_cosine,
+        min_images=config.min_images,
+        places_per_batch=config.places_per_batch,
+    )
+
+
+def _steps_per_epoch(config: TrainConfig, groups: Sequence[Places]) -> int:
+    """The same in all epochs: as asked for, or so many as take the largest group's places once."""
+    if config.loss.classifies and config.loss.large_margin_cosine.steps is not None:
+        return config.loss.large_margin_cosine.steps
+    return max(
+        len(
+            epoch_batches(
+                group,
+                places_per_batch=config.places_per_batch,
+                images_per_place=config.images_per_place,
+                order=config.batch_order,
+                seed=config.seed,
+                epoch=0,
+            )
+        )
+        for group in groups
+    )
 
 
 def batches_of(

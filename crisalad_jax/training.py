@@ -13,9 +13,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from crisalad_jax import platform
+from crisalad_jax.classification import Classifiers, init_classifiers, updated
 from crisalad_jax.config import LossConfig, ModelConfig, OptimiserConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.losses import metric_loss
+from crisalad_jax.losses import LossResult, large_margin_cosine_loss, metric_loss
 from crisalad_jax.model import Crisalad, among, relate, tokenise
 from crisalad_jax.nn.layers import split_key
 from crisalad_jax.nn.tokens import TransportStatistics
@@ -36,6 +37,8 @@ class TrainState(NamedTuple):
     step: Int[Array, ""]
     trainable: PyTree
     optimiser: PyTree
+    classifiers: Classifiers | None = None
+    """Where the loss classifies."""
 
 
 class Metrics(NamedTuple):
@@ -44,6 +47,7 @@ class Metrics(NamedTuple):
     loss: Float[Array, ""]
     b_acc: Float[Array, ""]
     gradient_norm: Float[Array, ""]
+    """Of all that trains, a classifier among it."""
     learning_rate: Float[Array, ""]
     """Of this step."""
     images: Int[Array, ""]
@@ -193,6 +197,9 @@ class StepConfig:
     The gradient is taken of whole parameters, the optimiser's step of parts (the first stage of
     ZeRO, Rajbhandari et al. 2020)."""
 
+    classes: tuple[int, ...] = ()
+    """Of each group, where the loss classifies; an epoch trains one group after the other."""
+
     @property
     def schedule(self) -> optax.Schedule:
         """The learning rate of a step, from 0."""
@@ -208,11 +215,21 @@ class StepConfig:
         return self.model.compute_dtype
 
 
-def init_state(params: Crisalad, trains: str, config: StepConfig) -> tuple[TrainState, PyTree]:
-    """The state before step 0, and the frozen parameters, which no step touches."""
+def init_state(
+    params: Crisalad, trains: str, config: StepConfig, *, key: PRNGKeyArray | None = None
+) -> tuple[TrainState, PyTree]:
+    """The state before step 0, and the frozen parameters, which no step touches.
+
+    `key` draws the classifiers, where the loss classifies.
+    """
     trainable, frozen = split_params(params, trains)
     optimiser = config.make_optimiser().init(trainable)
-    return TrainState(jnp.zeros((), jnp.int32), trainable, optimiser), frozen
+    classifiers = None
+    if config.classes:
+        assert key is not None
+        rate = config.loss.large_margin_cosine.learning_rate
+        classifiers = init_classifiers(key, config.classes, config.model.descriptor_dim, rate)
+    return TrainState(jnp.zeros((), jnp.int32), trainable, optimiser, classifiers), frozen
 
 
 def narrow(frozen: PyTree, config: ModelConfig) -> PyTree:
@@ -242,20 +259,28 @@ def train_step(
 ) -> tuple[TrainState, Metrics]:
     """One step of the optimiser on the loss of a batch.
 
-    The gradient is taken of the trainable parameters alone. Dropout is drawn from `key` and the
-    step's number, so that a resumed run repeats an uninterrupted one. Where loss or gradient is not
-    finite, or no image valid, the state is returned as it was, and the metrics tell.
+    The gradient is taken of the trainable parameters, and of the classifier of the epoch's group
+    where the loss classifies; labels are then that group's classes. Dropout is drawn from `key` and
+    the step's number, so that a resumed run repeats an uninterrupted one. Where loss or gradient is
+    not finite, or no image valid, the state is returned as it was, and the metrics tell.
     """
     tokens_key, encoder_key = split_key(jax.random.fold_in(key, state.step), 2)
 
-    def loss_of(trainable: PyTree) -> tuple[Float[Array, ""], tuple[Any, ...]]:
+    group = state.step // config.steps_per_epoch % max(len(config.classes), 1)
+    classifier = None if state.classifiers is None else state.classifiers.weights[group]
+
+    def loss_of(trained: tuple[PyTree, Any]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
+        trainable, classifier = trained
         params = eqx.combine(trainable, frozen)
         # The halves of `describe`, for what the tokens tell.
         tokens = tokenise(
             params, images, config.model, key=tokens_key, micro_batch=config.micro_batch
         )
         descriptors = relate(params, tokens, config.model, mask=among(valid), key=encoder_key)
-        loss, b_acc = metric_loss(descriptors, labels, config.loss, valid=valid)
+        if classifier is None:
+            loss, b_acc = metric_loss(descriptors, labels, config.loss, valid=valid)
+        else:
+            loss, b_acc = _classified(descriptors, labels, classifier, group, valid, config)
         return loss, (b_acc, tokens.transport)
 
     def placed(tree: PyTree, *, whole: bool = False) -> PyTree:
@@ -273,15 +298,40 @@ def train_step(
 
         return jax.tree.map(place, tree)
 
-    (loss, (b_acc, transport)), gradient = jax.value_and_grad(loss_of, has_aux=True)(
-        placed(state.trainable, whole=True)
-    )
+    (loss, (b_acc, transport)), (gradient, classifier_gradient) = jax.value_and_grad(
+        loss_of, has_aux=True
+    )((placed(state.trainable, whole=True), placed(classifier, whole=True)))
     transport = jax.tree.map(lambda each: jnp.where(valid, each, 0).sum() / valid.sum(), transport)
-    norm = optax.tree.norm(gradient)
+    norm = optax.tree.norm((gradient, classifier_gradient))
     optimiser = config.make_optimiser()
     updates, new_optimiser = optimiser.update(placed(gradient), state.optimiser, state.trainable)
-    new = TrainState(state.step + 1, optax.apply_updates(state.trainable, updates), new_optimiser)
+    classifiers = state.classifiers
+    if classifiers is not None:
+        rate = config.loss.large_margin_cosine.learning_rate
+        classifiers = updated(classifiers, group, classifier_gradient, rate)
+    trainable = optax.apply_updates(state.trainable, updates)
+    new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
     usable = jnp.isfinite(loss) & jnp.isfinite(norm) & valid.any()
     kept = jax.tree.map(lambda after, before: jnp.where(usable, after, before), new, state)
     rate = jnp.asarray(config.schedule(state.step))
     return placed(kept), Metrics(loss, b_acc, norm, rate, valid.sum(), transport)
+
+
+def _classified(
+    descriptors: Float[Array, "image descriptor"],
+    labels: Int[Array, " image"],
+    classifier: Float[Array, "class descriptor"],
+    group: Int[Array, ""],
+    valid: Bool[Array, " image"],
+    config: StepConfig,
+) -> LossResult:
+    loss = config.loss.large_margin_cosine
+    return large_margin_cosine_loss(
+        descriptors,
+        labels,
+        classifier,
+        scale=loss.scale,
+        margin=loss.margin,
+        valid=valid,
+        classes=jnp.asarray(config.classes)[group],
+    )

@@ -14,6 +14,7 @@ from crisalad_jax.config import (
     ContrastiveConfig,
     CrossImageConfig,
     FastAPConfig,
+    LargeMarginCosineConfig,
     LightAugmentConfig,
     LossConfig,
     ModelConfig,
@@ -99,6 +100,39 @@ def test_the_recipes_are_their_papers():
     assert recipe("tiny", "scratch") == recipe("tiny")
 
 
+def test_classification_is_as_published():
+    """gmberton/CosPlace and gmberton/EigenPlaces: their papers' constants and their code's."""
+    cosplace = recipe("b14", "cosplace")
+    assert (cosplace.model.aggregator, cosplace.model.encoder.layers) == ("cosplace", 0)
+    assert cosplace.model.descriptor_dim == 512
+    optimiser = cosplace.optimiser
+    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-5, 0.0)
+    assert optimiser.final_fraction == 1.0
+    assert (cosplace.places_per_batch, cosplace.images_per_place) == (32, 1)
+    assert (cosplace.epochs, cosplace.patience) == (50, None)
+    assert cosplace.loss.kind == "large-margin-cosine"
+    loss = cosplace.loss.large_margin_cosine
+    assert (loss.scale, loss.margin, loss.learning_rate) == (30.0, 0.4, 0.01)
+    assert (loss.classes, loss.groups, loss.steps) == ("places", 8, 10_000)
+    assert (loss.cell, loss.sector, loss.spacing, loss.sector_spacing) == (10.0, 30.0, 5, 2)
+    assert cosplace.min_images_of_place == cosplace.min_images == 4
+    eigenplaces = recipe("b14", "eigenplaces")
+    assert eigenplaces.model.descriptor_dim == 2048
+    assert eigenplaces.optimiser == optimiser
+    assert (eigenplaces.min_images, eigenplaces.min_images_of_place) == (5, 1)
+    loss = eigenplaces.loss.large_margin_cosine
+    assert (loss.scale, loss.margin, loss.learning_rate) == (100.0, 0.4, 0.01)
+    assert (loss.classes, loss.groups, loss.steps) == ("viewpoints", 9, 5000)
+    assert (loss.cell, loss.spacing, loss.focal_distance) == (15.0, 3, 10.0)
+
+
+def test_a_classification_needs_no_second_image_of_a_place():
+    classified = recipe("b14", "cosplace")
+    assert TrainConfig(loss=classified.loss, images_per_place=1).images_per_place == 1
+    with pytest.raises(InputError, match=r"TrainConfig\.images_per_place: found 0"):
+        TrainConfig(loss=classified.loss, images_per_place=0)
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", RECIPES)
 def test_every_recipe_fits_every_preset(preset: str, name: str):
@@ -120,9 +154,7 @@ def test_equal_configurations_name_one_program():
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
         recipe("b16")
-    with pytest.raises(
-        InputError, match=r"^recipe: found 'boq', expected one of .*cricavpr, crisal"
-    ):
+    with pytest.raises(InputError, match=r"^recipe: found 'boq', expected one of .*cricavpr, c"):
         recipe("b14", "boq")
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})
@@ -249,6 +281,19 @@ def test_one_patch_more_than_clusters_is_enough():
         (CircleConfig, {"margin": 1.0}, "CircleConfig.margin: found 1.0"),
         (SupConConfig, {"temperature": 0.0}, "SupConConfig.temperature: found 0.0"),
         (FastAPConfig, {"bins": 0}, "FastAPConfig.bins: found 0"),
+        (
+            LargeMarginCosineConfig,
+            {"classes": "cities"},
+            "LargeMarginCosineConfig.classes: found 'cities', expected one of cells, places, view",
+        ),
+        (LargeMarginCosineConfig, {"margin": 1.0}, "LargeMarginCosineConfig.margin: found 1.0"),
+        (LargeMarginCosineConfig, {"groups": 0}, "LargeMarginCosineConfig.groups: found 0"),
+        (LargeMarginCosineConfig, {"steps": 0}, "LargeMarginCosineConfig.steps: found 0"),
+        (
+            LargeMarginCosineConfig,
+            {"sector": 50.0},
+            "LargeMarginCosineConfig.sector: found 2 sectors of 50 degrees, expected a divisor of",
+        ),
         (RandAugmentConfig, {"magnitude": 31}, "RandAugmentConfig.magnitude: found 31"),
         (RandAugmentConfig, {"operations": -1}, "RandAugmentConfig.operations: found -1"),
         (LightAugmentConfig, {"crop": 1.0}, "LightAugmentConfig.crop: found 1.0"),

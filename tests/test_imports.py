@@ -20,6 +20,7 @@ LAYERS = (
     ("model",),
     ("checkpoint", "states", "costs", "layouts"),
     ("convert", "export"),
+    ("classification",),
     ("training", "retrieval", "descriptors", "pca"),
     ("results", "approximate", "similarity", "reranking"),
     ("evaluation", "report", "pairs", "stores", "vocabulary"),

@@ -16,6 +16,7 @@ from pytorch_metric_learning.distances import CosineSimilarity, DotProductSimila
 from pytorch_metric_learning.losses import (
     CircleLoss,
     ContrastiveLoss,
+    CosFaceLoss,
     FastAPLoss,
     MultiSimilarityLoss,
     SupConLoss,
@@ -32,7 +33,7 @@ from crisalad_jax.config import (
     SupConConfig,
     TripletConfig,
 )
-from crisalad_jax.losses import all_pairs, metric_loss, mine
+from crisalad_jax.losses import all_pairs, large_margin_cosine_loss, metric_loss, mine
 
 PAPER = LossConfig()
 
@@ -319,3 +320,99 @@ def test_b_acc_counts_anchors_without_a_hard_positive() -> None:
     assert metric_loss(jnp.asarray(x), labels, PAPER).b_acc == 0
     x[3] = [0, 1]
     assert metric_loss(jnp.asarray(x), labels, PAPER).b_acc == 1
+
+
+def cosine_batch(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Descriptors and classes' vectors of any length, and labels, in float64."""
+    generator = np.random.default_rng(seed)
+    classes, images = 5, 7
+    labels = generator.integers(0, classes, images)
+    weights = generator.standard_normal((classes, 6)) * generator.uniform(0.1, 3, (classes, 1))
+    return weights[labels] + generator.standard_normal((images, 6)), labels, weights
+
+
+def cosine_loss(
+    x: np.ndarray, labels: np.ndarray, weights: np.ndarray, **changes
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Ours: value and both gradients."""
+
+    def loss(x: jax.Array, weights: jax.Array) -> jax.Array:
+        constants = {"scale": 30.0, "margin": 0.4} | changes
+        return large_margin_cosine_loss(x, jnp.asarray(labels), weights, **constants).loss
+
+    with jax.enable_x64(True):
+        value, gradients = jax.value_and_grad(loss, (0, 1))(jnp.asarray(x), jnp.asarray(weights))
+        return float(value), *map(np.asarray, gradients)
+
+
+@pytest.mark.parametrize(("scale", "margin"), [(30.0, 0.4), (100.0, 0.4), (4.0, 0.0)])
+def test_the_large_margin_cosine_loss_is_the_equation_and_the_librarys(scale, margin) -> None:
+    """Wang et al., CVPR 2018, equation 4, written out in torch; float64 leaves 1e-16 times 100."""
+    for seed in range(8):
+        x, labels, weights = cosine_batch(seed)
+        images, vectors = (torch.tensor(a, requires_grad=True) for a in (x, weights))
+        cosines = torch.stack(
+            [
+                torch.stack([(f @ w) / (f.norm() * w.norm()) for w in vectors.unbind()])
+                for f in images.unbind()
+            ]
+        )
+        terms = []
+        for row, label in zip(cosines, labels, strict=True):
+            own = torch.exp(scale * (row[label] - margin))
+            others = sum(torch.exp(scale * c) for j, c in enumerate(row) if j != label)
+            terms.append(-torch.log(own / (own + others)))
+        expected = torch.stack(terms).mean()
+        expected.backward()
+        assert images.grad is not None
+        assert vectors.grad is not None
+        found = cosine_loss(x, labels, weights, scale=scale, margin=margin)
+        np.testing.assert_allclose(found[0], expected.item(), rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(found[1], images.grad, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(found[2], vectors.grad, rtol=1e-9, atol=1e-11)
+        library = CosFaceLoss(len(weights), 6, margin=margin, scale=scale)
+        library.W = torch.nn.Parameter(torch.tensor(weights.T))
+        theirs = library(torch.tensor(x), torch.tensor(labels)).item()
+        np.testing.assert_allclose(found[0], theirs, rtol=1e-9, atol=1e-11)
+
+
+def test_images_that_are_not_valid_and_rows_beyond_the_classes_take_no_part() -> None:
+    x, labels, weights = cosine_batch(3)
+    alone = cosine_loss(x, labels, weights)
+    more = np.random.default_rng(1).standard_normal((2, 6))
+    padded = np.concatenate([weights, 3 * x[:1], np.zeros((1, 6))])
+    found = cosine_loss(
+        np.concatenate([x, more]),
+        np.concatenate([labels, [0, -1]]),
+        padded,
+        valid=jnp.arange(len(x) + 2) < len(x),
+        classes=len(weights),
+    )
+    # Sums of other lengths round otherwise.
+    np.testing.assert_allclose(found[0], alone[0], rtol=1e-13)
+    np.testing.assert_allclose(found[1][: len(x)], alone[1], rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(found[2][: len(weights)], alone[2], rtol=1e-10, atol=1e-13)
+    for gradient, rows in ((found[1], len(x)), (found[2], len(weights))):
+        np.testing.assert_array_equal(gradient[rows:], 0)
+
+
+def test_accuracy_is_the_share_of_valid_images_nearest_to_their_class() -> None:
+    weights = jnp.eye(3)
+    # Nearest to 0, 1, 1, 2 and 0; the margin, larger than what is between, does not count.
+    x = jnp.array([[1, 0.9, 0], [0, 1, 0.9], [0.9, 1, 0], [0, 0, 2.0], [1, 0, 0]])
+    labels, valid = jnp.array([0, 1, 0, 2, 1]), jnp.array([True, True, True, True, False])
+    constants = {"scale": 30.0, "margin": 0.4}
+    assert large_margin_cosine_loss(x, labels, weights, valid=valid, **constants).b_acc == 3 / 4
+    assert large_margin_cosine_loss(x, labels, weights, **constants).b_acc == pytest.approx(3 / 5)
+    found = large_margin_cosine_loss(x, labels, weights, valid=valid, classes=1, **constants)
+    assert found.b_acc == 2 / 4  # of one class all images are nearest to it
+
+
+def test_a_descriptor_of_zeros_has_a_finite_gradient_and_a_nan_is_told() -> None:
+    x, labels, weights = cosine_batch(4)
+    x[0] = 0
+    value, *gradients = cosine_loss(x, labels, weights)
+    assert np.isfinite(value)
+    assert all(np.isfinite(gradient).all() for gradient in gradients)
+    x[0] = np.nan
+    assert np.isnan(cosine_loss(x, labels, weights)[0])

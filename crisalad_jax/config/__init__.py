@@ -58,6 +58,7 @@ from crisalad_jax.config.checks import choose as choose
 from crisalad_jax.config.losses import CircleConfig as CircleConfig
 from crisalad_jax.config.losses import ContrastiveConfig as ContrastiveConfig
 from crisalad_jax.config.losses import FastAPConfig as FastAPConfig
+from crisalad_jax.config.losses import LargeMarginCosineConfig as LargeMarginCosineConfig
 from crisalad_jax.config.losses import LossConfig as LossConfig
 from crisalad_jax.config.losses import MultiSimilarityConfig as MultiSimilarityConfig
 from crisalad_jax.config.losses import SupConConfig as SupConConfig

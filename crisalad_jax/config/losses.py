@@ -92,13 +92,78 @@ class FastAPConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class LargeMarginCosineConfig:
+    """Large-margin cosine loss (CosFace, Wang et al., CVPR 2018) over groups of classes.
+
+    The constants are CosPlace's (Berton et al., CVPR 2022); see docs/methods.md.
+    """
+
+    scale: float = 30.0
+    """What cosines are multiplied by; EigenPlaces' is 100."""
+    margin: float = 0.4
+    """What is taken from the cosine of an image's own class."""
+    learning_rate: float = 0.01
+    """Of the classifiers, which train by an Adam of their own, without decay."""
+    classes: Literal["places", "cells", "viewpoints"] = "places"
+    """The training set's own places; CosPlace's cells of position and heading; or EigenPlaces'
+    cells of position, looking at a focal point. The latter two ask for real positions."""
+    groups: int = 8
+    """Epochs train so many groups in turn, those with the most classes; of viewpoints so many
+    lateral and so many frontal ones."""
+    steps: int | None = None
+    """Steps of an epoch; None passes once over the largest group."""
+    cell: float = 10.0
+    """Side of a cell in metres, CosPlace's M; EigenPlaces' is 15."""
+    sector: float = 30.0
+    """Width of a sector of headings in degrees, CosPlace's alpha."""
+    spacing: int = 5
+    """Every so-many-th cell is of one group, CosPlace's N; EigenPlaces' is 3. Places of one group
+    are as far apart."""
+    sector_spacing: int = 2
+    """Every so-many-th sector is of one group, CosPlace's L."""
+    focal_distance: float = 10.0
+    """Metres from the mean of a cell's positions to its focal point, EigenPlaces' D."""
+    view_angle: float = 45.0
+    """An image is of a viewpoint's class if it looks within so many degrees of the focal point."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_choice(self, "classes")
+        require_positive(
+            self,
+            *("scale", "learning_rate", "groups", "cell", "sector", "spacing", "sector_spacing"),
+            *("focal_distance", "view_angle"),
+        )
+        require_fraction(self, "margin")
+        if self.steps is not None:
+            require(
+                self.steps > 0,
+                f"LargeMarginCosineConfig.steps: found {self.steps}, expected more than 0, or None",
+            )
+        turn = self.sector * self.sector_spacing
+        require(
+            360 % turn == 0,
+            f"LargeMarginCosineConfig.sector: found {self.sector_spacing} sectors of "
+            f"{self.sector:g} degrees, expected a divisor of 360 degrees: the last sector lies "
+            "beside the first",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class LossConfig:
     """Which loss is taken, of which pairs, and the constants of each."""
 
-    kind: Literal["multi-similarity", "contrastive", "triplet", "circle", "supcon", "fast-ap"] = (
-        "multi-similarity"
-    )
-    """The paper's multi-similarity loss, or another that the field trains with."""
+    kind: Literal[
+        "multi-similarity",
+        "contrastive",
+        "triplet",
+        "circle",
+        "supcon",
+        "fast-ap",
+        "large-margin-cosine",
+    ] = "multi-similarity"
+    """The paper's multi-similarity loss, or another that the field trains with. The last is of
+    images and classes; the others are of pairs of images."""
     miner: Literal["multi-similarity", "none"] = "multi-similarity"
     """Which pairs enter it: those that the multi-similarity loss's miner finds hard, or all."""
     epsilon: float = 0.1
@@ -112,6 +177,7 @@ class LossConfig:
     circle: CircleConfig = CircleConfig()
     supcon: SupConConfig = SupConConfig()
     fast_ap: FastAPConfig = FastAPConfig()
+    large_margin_cosine: LargeMarginCosineConfig = LargeMarginCosineConfig()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -122,3 +188,8 @@ class LossConfig:
             f"LossConfig.miner: found {self.miner!r} with the loss 'fast-ap', expected 'none': it "
             "ranks all images",
         )
+
+    @property
+    def classifies(self) -> bool:
+        """Whether it is of images and classes, which a classifier is trained for."""
+        return self.kind == "large-margin-cosine"

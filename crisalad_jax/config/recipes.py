@@ -17,7 +17,11 @@ from crisalad_jax.config.aggregators import (
 )
 from crisalad_jax.config.backbone import AdapterConfig, ViTConfig
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.losses import LossConfig, MultiSimilarityConfig
+from crisalad_jax.config.losses import (
+    LargeMarginCosineConfig,
+    LossConfig,
+    MultiSimilarityConfig,
+)
 from crisalad_jax.config.model import ModelConfig
 from crisalad_jax.config.training import LightAugmentConfig, OptimiserConfig, TrainConfig
 
@@ -140,6 +144,45 @@ def _anyloc(model: ModelConfig) -> TrainConfig:
     )
 
 
+def _cosplace(model: ModelConfig) -> TrainConfig:
+    """gmberton/CosPlace: classification; Adam at 1e-5, a batch of 32 classes, an image of each.
+
+    GSV-Cities' places are one spot and one direction each: they are the classes.
+    """
+    return _classified(model, LargeMarginCosineConfig(steps=10_000), epochs=50)
+
+
+def _eigenplaces(model: ModelConfig) -> TrainConfig:
+    """gmberton/EigenPlaces: classes of viewpoints, and a descriptor four times as long.
+
+    Each of its steps was one on lateral and one on frontal classes, which have epochs of their own
+    here, of twice the number.
+    """
+    head = dataclasses.replace(model.cosplace, dim=4 * model.cosplace.dim)
+    classes = LargeMarginCosineConfig(
+        scale=100.0, classes="viewpoints", groups=9, steps=5000, cell=15.0, spacing=3
+    )
+    config = _classified(dataclasses.replace(model, cosplace=head), classes, epochs=80)
+    return dataclasses.replace(config, min_images=5)
+
+
+def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, *, epochs: int) -> TrainConfig:
+    return TrainConfig(
+        model=dataclasses.replace(
+            model, aggregator="cosplace", encoder=dataclasses.replace(model.encoder, layers=0)
+        ),
+        loss=LossConfig(kind="large-margin-cosine", large_margin_cosine=loss),
+        optimiser=OptimiserConfig(
+            kind="adam", learning_rate=1e-5, final_fraction=1.0, weight_decay=0.0
+        ),
+        places_per_batch=32,
+        images_per_place=1,
+        batch_order="shuffled",
+        epochs=epochs,
+        patience=None,
+    )
+
+
 def _scratch(model: ModelConfig) -> TrainConfig:
     """From random weights, all of the model: ours, for `tiny`."""
     return TrainConfig(
@@ -175,6 +218,8 @@ RECIPES: Mapping[str, Callable[[ModelConfig], TrainConfig]] = {
     "transvpr": _transvpr,
     "netvlad": _netvlad,
     "anyloc": _anyloc,
+    "cosplace": _cosplace,
+    "eigenplaces": _eigenplaces,
     "scratch": _scratch,
 }
 """Named by what they reproduce. Table 2's other rows are one flag of `crisalad` each."""

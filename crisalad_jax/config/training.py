@@ -131,12 +131,13 @@ class TrainConfig:
     rand_augment: RandAugmentConfig = RandAugmentConfig()
     light_augment: LightAugmentConfig = LightAugmentConfig()
     places_per_batch: int = 48
+    """Where the loss classifies: so many classes a batch."""
     images_per_place: int = 4
     micro_batch: int | None = None
     """So many images' activations are in memory at a time: a step takes less of it and a forward
     pass longer, and is the same. None is the whole batch."""
     min_images: int = 4
-    """Places with fewer images are left out."""
+    """Places, or classes, with fewer images are left out."""
     batch_order: Literal["within-city", "shuffled"] = "within-city"
     """A batch of one city's places (hard negatives; the public loaders) or of all cities'."""
     cities: tuple[str, ...] | None = None
@@ -156,8 +157,9 @@ class TrainConfig:
         choose("TrainConfig.augment", self.augment, {"rand-augment": 0, "light": 0, "none": 0})
         choose("TrainConfig.batch_order", self.batch_order, {"within-city": 0, "shuffled": 0})
         require_positive(self, "places_per_batch", "epochs", "validate_every", "keep_best")
+        require_positive(self, "images_per_place")
         require(
-            self.images_per_place >= 2,
+            self.images_per_place >= 2 or self.loss.classifies,
             f"TrainConfig.images_per_place: found {self.images_per_place}, expected at least 2: "
             "the loss needs pairs of one place",
         )
@@ -187,6 +189,12 @@ class TrainConfig:
             f"TrainConfig.patience: found {self.patience}, expected more than 0, or None",
         )
         require(self.seed >= 0, f"TrainConfig.seed: found {self.seed}, expected at least 0")
+
+    @property
+    def min_images_of_place(self) -> int:
+        """Places with fewer images are not read: all are, where images are regrouped to classes."""
+        regroups = self.loss.classifies and self.loss.large_margin_cosine.classes != "places"
+        return 1 if regroups else self.min_images
 
     @property
     def augmentation(self) -> AugmentConfig | None:

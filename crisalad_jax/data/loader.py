@@ -95,6 +95,7 @@ def training_batches(
     augment: AugmentConfig | None,
     seed: int,
     epoch: int,
+    steps: int | None = None,
     start_step: int = 0,
     part: tuple[int, int] = (0, 1),
     on_bad_image: OnBadImage = "stop",
@@ -111,6 +112,7 @@ def training_batches(
 
     Args:
         places: what to draw from; see `epoch_batches` for the order.
+        steps: so many batches; None takes every place once.
         start_step: the first batch to give, to go on with an epoch that was interrupted.
         part: (i, n) gives the i-th of n equal parts of every batch, for the i-th of n processes.
         threads: how many decode ahead; 0 decodes in the caller's thread.
@@ -130,6 +132,7 @@ def training_batches(
         order=order,
         seed=seed,
         epoch=epoch,
+        steps=steps,
     )
     if not 0 <= start_step <= len(chosen):
         raise InputError(f"start_step: found {start_step}, expected 0 to {len(chosen)}")

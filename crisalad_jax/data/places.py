@@ -234,6 +234,7 @@ def epoch_batches(
     order: Order,
     seed: int,
     epoch: int,
+    steps: int | None = None,
 ) -> Int[np.ndarray, "steps places images"]:
     """Images of every batch of an epoch: a pure function of (seed, epoch).
 
@@ -242,15 +243,19 @@ def epoch_batches(
     city and strings the cities together in random order, so that a batch is nearly always of one
     city, whose places are hard to tell apart (the public loaders); "shuffled" mixes all.
 
+    With `steps` the epoch has so many batches: it is cut short, or drawn over and over, each time
+    anew.
+
     Raises:
         InputError: a place has fewer than `images_per_place` images, there are fewer places than
-            `places_per_batch`, an unknown order, a negative seed or epoch.
+            `places_per_batch`, an unknown order, a negative seed or epoch, less than one step.
     """
     for name, value, least in (
         ("places_per_batch", places_per_batch, 1),
         ("images_per_place", images_per_place, 1),
         ("seed", seed, 0),
         ("epoch", epoch, 0),
+        ("steps", 1 if steps is None else steps, 1),
     ):
         if value < least:
             raise InputError(f"{name}: found {value}, expected at least {least}")
@@ -266,8 +271,26 @@ def epoch_batches(
             f"{places.root}: found {len(counts)} places, expected at least places_per_batch "
             f"{places_per_batch}"
         )
-    # The spawn key keeps these numbers apart from those that the loader draws from (seed, epoch).
-    generator = np.random.default_rng(np.random.SeedSequence((seed, epoch), spawn_key=(0,)))
+    once = len(counts) // places_per_batch
+    drawn = []
+    for turn in range(1 if steps is None else -(-steps // once)):
+        # The spawn key keeps these numbers apart from those that the loader draws from (seed,
+        # epoch); the first turn's are those of an epoch without `steps`.
+        entropy = (seed, epoch, turn) if turn else (seed, epoch)
+        generator = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(0,)))
+        drawn.append(_draw(places, places_per_batch, images_per_place, order, generator))
+    return np.concatenate(drawn)[:steps]
+
+
+def _draw(
+    places: Places,
+    places_per_batch: int,
+    images_per_place: int,
+    order: Order,
+    generator: np.random.Generator,
+) -> Int[np.ndarray, "steps places images"]:
+    """Every place once."""
+    counts = places.image_counts
     if order == "within-city":
         city_rank = generator.permutation(len(places.cities))[places.place_city]
     elif order == "shuffled":

@@ -220,6 +220,33 @@ def test_epoch_is_a_function_of_seed_and_epoch():
     assert (draw(3, 5) != draw(4, 5)).any()
 
 
+def test_an_epoch_of_so_many_steps_is_drawn_over_and_over():
+    places = uneven(1, 6)
+
+    def draw(steps: int | None) -> np.ndarray:
+        return epoch_batches(
+            places,
+            places_per_batch=4,
+            images_per_place=2,
+            order="shuffled",
+            seed=0,
+            epoch=1,
+            steps=steps,
+        )
+
+    once, often = draw(None), draw(120)
+    assert (len(once), len(often)) == (1, 120)  # of six places a batch of four is one
+    np.testing.assert_array_equal(often[:1], once)
+    np.testing.assert_array_equal(often[:7], draw(7))
+    labels = places.image_place[often]
+    assert (labels == labels[..., :1]).all()
+    for batch in labels[..., 0]:
+        assert len(set(batch.tolist())) == 4
+    assert len({tuple(batch) for batch in labels[..., 0].tolist()}) > 100  # of 360
+    # 120 draws of four of six: 80 each, give or take 5 standard deviations of 5.2.
+    assert (abs(np.bincount(labels[..., 0].ravel()) - 80) < 26).all()
+
+
 def test_every_image_is_sampled_equally_often():
     places = uneven(1, 6)
     seen = np.zeros(len(places.files))
@@ -271,6 +298,7 @@ def test_within_city_shuffles_places_and_cities():
         ({"places_per_batch": 7}, "found 6 places, expected at least places_per_batch 7"),
         ({"places_per_batch": 0}, "places_per_batch: found 0"),
         ({"seed": -1}, "seed: found -1"),
+        ({"steps": 0}, "steps: found 0, expected at least 1"),
         ({"order": "random"}, "order: found 'random', expected one of shuffled, within-city"),
     ],
 )
