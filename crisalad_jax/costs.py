@@ -46,7 +46,7 @@ def _part_of(name: str) -> str:
 
 def _macs(config: ModelConfig, images: int) -> dict[str, int]:
     backbone, encoder = config.backbone, config.encoder
-    patches = math.prod(config.image_size) // PATCH_SIZE**2
+    patches = config.patches
     tokens = 1 + backbone.registers + patches
     dim, hidden, depth = backbone.dim, backbone.hidden, backbone.depth
     products = 3 if backbone.ffn == "swiglu" else 2
@@ -56,7 +56,7 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
         "backbone embedding, norm": patches * 3 * PATCH_SIZE**2 * dim,
         "backbone blocks": depth * block,
         "adapters": 0,
-        "aggregator": _salad_macs(config, patches) if config.aggregator == "salad" else 0,
+        "aggregator": aggregator_macs(config),
         "cross-image encoder": 0,
     }
     if backbone.adapter.kind != "none":
@@ -70,8 +70,43 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
     return costs
 
 
-def _salad_macs(config: ModelConfig, patches: int) -> int:
-    dim, salad = config.backbone.dim, config.salad
+def aggregator_macs(config: ModelConfig) -> int:
+    """Multiply-accumulates an image of the aggregator; pooling and sums of classes have none.
+
+    What BoQ's queries say to each other is the same for all images, computed once, and left out.
+    """
+    counts = {
+        "salad": _salad_macs,
+        "conv-ap": _conv_ap_macs,
+        "cosplace": lambda config: config.backbone.dim * config.cosplace.dim,
+        "mixvpr": _mixvpr_macs,
+        "boq": _boq_macs,
+    }
+    return counts[config.aggregator](config) if config.aggregator in counts else 0
+
+
+def _conv_ap_macs(config: ModelConfig) -> int:
+    """As we compute it: the regions' means first, then the convolution."""
+    return config.conv_ap.side**2 * config.backbone.dim * config.conv_ap.channels
+
+
+def _mixvpr_macs(config: ModelConfig) -> int:
+    dim, patches, mixvpr = config.backbone.dim, config.patches, config.mixvpr
+    mixers = mixvpr.depth * dim * 2 * patches**2
+    return mixers + patches * mixvpr.channels * (dim + mixvpr.rows)
+
+
+def _boq_macs(config: ModelConfig) -> int:
+    patches, boq = config.patches, config.boq
+    width, queries = boq.channels, boq.queries
+    layer = patches * 12 * width**2 + 2 * patches**2 * width
+    asking = patches * 2 * width**2 + 2 * queries * patches * width + queries * width**2
+    convolution = patches * 9 * config.backbone.dim * width
+    return convolution + boq.layers * (layer + asking + queries * boq.rows * width)
+
+
+def _salad_macs(config: ModelConfig) -> int:
+    dim, salad, patches = config.backbone.dim, config.salad, config.patches
     networks = salad.hidden * (2 * dim + salad.cluster_dim + salad.scores)
     sums = salad.clusters * salad.cluster_dim
     return salad.hidden * (dim + salad.token_dim) + patches * (networks + sums)
@@ -80,7 +115,7 @@ def _salad_macs(config: ModelConfig, patches: int) -> int:
 def adapter_macs(config: ModelConfig) -> int:
     """True multiply-accumulates of one adapter and one image: linears at every token."""
     backbone = config.backbone
-    patches = math.prod(config.image_size) // PATCH_SIZE**2
+    patches = config.patches
     tokens = 1 + backbone.registers + patches
     width = backbone.adapter_dim
     return 2 * tokens * backbone.dim * width + patches * _convolution_macs(config)
@@ -89,7 +124,7 @@ def adapter_macs(config: ModelConfig) -> int:
 def paper_adapter_macs(config: ModelConfig) -> int:
     """The paper's count (Table 3: 39.223 M): convolutions at every patch, each linear only once."""
     backbone = config.backbone
-    patches = math.prod(config.image_size) // PATCH_SIZE**2
+    patches = config.patches
     return 2 * backbone.dim * backbone.adapter_dim + patches * _convolution_macs(config)
 
 

@@ -115,6 +115,20 @@ def _cricavpr(model: ModelConfig) -> TrainConfig:
     )
 
 
+def _comparable(aggregator: Any) -> Callable[[ModelConfig], TrainConfig]:
+    """Another aggregator in the place of CriSALAD's head, and all else as the paper trains.
+
+    The backbone stays frozen, with the adapters beside it, so that methods differ in nothing but
+    what they make of its features. An image's descriptor owes nothing to others.
+    """
+
+    def train(model: ModelConfig) -> TrainConfig:
+        encoder = dataclasses.replace(model.encoder, layers=0)
+        return TrainConfig(model=dataclasses.replace(model, aggregator=aggregator, encoder=encoder))
+
+    return train
+
+
 def _scratch(model: ModelConfig) -> TrainConfig:
     """From random weights, all of the model: ours, for `tiny`."""
     return TrainConfig(
@@ -147,6 +161,10 @@ RECIPES: Mapping[str, Callable[[ModelConfig], TrainConfig]] = {
     "crisalad-step": _varied(schedule="step"),
     "salad": _salad,
     "cricavpr": _cricavpr,
+    "gem": _comparable("gem"),
+    "conv-ap": _comparable("conv-ap"),
+    "mixvpr": _comparable("mixvpr"),
+    "boq": _comparable("boq"),
     "scratch": _scratch,
 }
 """Named by what they reproduce. Table 2's other rows are one flag of `crisalad` each."""

@@ -8,7 +8,11 @@ import numpy as np
 
 from crisalad_jax.config import (
     AdapterConfig,
+    BoqConfig,
+    ConvApConfig,
+    CosPlaceConfig,
     CrossImageConfig,
+    MixVprConfig,
     ModelConfig,
     SaladConfig,
     SinkhornConfig,
@@ -41,6 +45,11 @@ def _model(
         ),
         aggregator=aggregator,
         salad=SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0),
+        conv_ap=ConvApConfig(channels=20),
+        cosplace=CosPlaceConfig(dim=20),
+        mixvpr=MixVprConfig(channels=20, rows=3, depth=2),
+        # Two heads.
+        boq=BoqConfig(channels=128, queries=5, rows=3),
         encoder=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
     )
 
@@ -59,6 +68,14 @@ DINO_SALAD = _model()
 CRICAVPR = _model("multi-resolution", encoder=1, aggregator="gem-pyramid")
 TWO_LAYERS = _model(encoder=2)
 CLASS_TOKEN = _model(aggregator="class-token")
+HEADS = {
+    "GeM": "gem",
+    "Conv-AP": "conv-ap",
+    "CosPlace's head": "cosplace",
+    "MixVPR": "mixvpr",
+    "BoQ": "boq",
+}
+"""What they are called in the table."""
 
 
 def normal(*shape: int, scale: float = 1.0) -> Draw:
@@ -186,6 +203,17 @@ CASES: tuple[Case, ...] = (
     *_sinkhorn_cases(),
     Case("SALAD", PLAIN, parts.AGGREGATE, FEATURES, smooth=False),
     Case("GeM pyramid", CRICAVPR, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
+    *(
+        Case(
+            name,
+            _model(aggregator=aggregator),
+            parts.AGGREGATE,
+            FEATURES,
+            bfloat16=aggregator != "gem",
+            smooth=aggregator == "conv-ap",
+        )
+        for name, aggregator in HEADS.items()
+    ),
     Case("cross-image encoder", TWO_LAYERS, parts.ENCODER, SEQUENCES),
     Case(
         "cross-image encoder, masked",

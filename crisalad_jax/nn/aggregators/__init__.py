@@ -11,14 +11,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ModelConfig, choose
-from crisalad_jax.nn.aggregators import gem_pyramid
+from crisalad_jax.nn.aggregators import boq, conv_ap, cosplace, gem, gem_pyramid, mixvpr
+from crisalad_jax.nn.aggregators.boq import Boq
+from crisalad_jax.nn.aggregators.conv_ap import ConvAp
+from crisalad_jax.nn.aggregators.cosplace import CosPlace
+from crisalad_jax.nn.aggregators.gem import Gem
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid
+from crisalad_jax.nn.aggregators.mixvpr import MixVpr
 from crisalad_jax.nn.layers import Keys, l2_normalise, widen
 from crisalad_jax.nn.salad import Salad, init_salad, published_order, salad
-from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.tokens import Tokens, global_alone
 from crisalad_jax.nn.vit import Features
 
-Aggregator = Salad | GemPyramid
+Aggregator = Salad | GemPyramid | Gem | ConvAp | CosPlace | MixVpr | Boq
 
 
 class Method(NamedTuple):
@@ -53,13 +58,18 @@ def _class_token(
     *,
     key: Keys | None,
 ) -> Tokens:
-    return Tokens(widen(features.class_token), widen(features.patches)[..., :0, :])
+    return global_alone(widen(features.class_token))
 
 
 _METHODS = {
     "salad": Method(_init_salad, _salad, published_order),
     "gem-pyramid": Method(gem_pyramid.init, gem_pyramid.apply),
     "class-token": Method(lambda key, config: None, _class_token),
+    "gem": Method(gem.init, gem.apply),
+    "conv-ap": Method(conv_ap.init, conv_ap.apply, published_order),
+    "cosplace": Method(cosplace.init, cosplace.apply),
+    "mixvpr": Method(mixvpr.init, mixvpr.apply, published_order),
+    "boq": Method(boq.init, boq.apply, published_order),
 }
 
 
