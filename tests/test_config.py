@@ -9,12 +9,16 @@ from crisalad_jax.config import (
     PRESETS,
     RECIPES,
     AdapterConfig,
+    BoqConfig,
     CircleConfig,
     ContrastiveConfig,
+    ConvApConfig,
+    CosPlaceConfig,
     CrossImageConfig,
     FastAPConfig,
     LightAugmentConfig,
     LossConfig,
+    MixVprConfig,
     ModelConfig,
     MultiSimilarityConfig,
     OptimiserConfig,
@@ -91,6 +95,20 @@ def test_the_recipes_are_their_papers():
         assert recipe("b14", name) == dataclasses.replace(paper, optimiser=varied)
     assert recipe("b14", "crisalad") == paper
     assert recipe("tiny", "scratch") == recipe("tiny")
+
+
+@pytest.mark.parametrize(
+    ("name", "width"),
+    # The published descriptors of b14: BoQ's, and 4,096 of MixVPR and Conv-AP.
+    [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288)],
+)
+def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int):
+    found, paper = recipe("b14", name), recipe("b14")
+    assert found.model.aggregator == name
+    assert found.model.descriptor_dim == width
+    assert found.model.encoder.layers == 0
+    as_paper = dataclasses.replace(found.model, aggregator="salad", encoder=paper.model.encoder)
+    assert dataclasses.replace(found, model=as_paper) == paper
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -187,6 +205,19 @@ def test_one_patch_more_than_clusters_is_enough():
             "cross-image encoder's 5 heads",
         ),
         (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
+        (
+            ModelConfig,
+            {"aggregator": "conv-ap", "conv_ap": ConvApConfig(side=3), "image_size": (28, 56)},
+            "found 28 x 56, expected at least 42 x 42, a patch for every region",
+        ),
+        (
+            BoqConfig,
+            {"channels": 200},
+            "BoqConfig.channels: found 200, expected a multiple of its heads, 3: one for every 64",
+        ),
+        (MixVprConfig, {"rows": 0}, "MixVprConfig.rows: found 0"),
+        (ConvApConfig, {"side": 0}, "ConvApConfig.side: found 0"),
+        (CosPlaceConfig, {"dim": -1}, "CosPlaceConfig.dim: found -1"),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (SinkhornConfig, {"epsilon": -1.0}, "SinkhornConfig.epsilon: found -1.0"),
         (SinkhornConfig, {"epsilon": float("nan")}, "SinkhornConfig.epsilon: found nan"),

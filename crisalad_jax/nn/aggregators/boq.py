@@ -69,13 +69,13 @@ def init(key: PRNGKeyArray, config: ModelConfig) -> Boq:
 
 
 def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
-    layer_key, queries_key, *attention_keys = jax.random.split(key, 6)
+    layer_key, queries_key, *keys = jax.random.split(key, 6)
     return BoqBlock(
         encoder=init_encoder_layer(layer_key, channels, 4 * channels),
         queries=jax.random.normal(queries_key, (queries, channels)),
-        self_attn=init_torch_attention(*attention_keys[:2], channels),
+        self_attn=init_torch_attention(keys[0], keys[1], channels),
         norm_q=init_layer_norm(channels),
-        cross_attn=init_torch_attention(*attention_keys[2:], channels),
+        cross_attn=init_torch_attention(keys[2], keys[3], channels),
         norm_out=init_layer_norm(channels),
     )
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ModelConfig
-from crisalad_jax.nn.aggregators.gem import START, generalised_mean
+from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
 from crisalad_jax.nn.layers import Keys, Linear, init_linear, linear, widen
 from crisalad_jax.nn.tokens import Tokens, global_alone
 from crisalad_jax.nn.vit import Features
@@ -34,5 +34,5 @@ def apply(
     key: Keys | None,
 ) -> Tokens:
     """Unit patches, their generalised mean, a linear layer; the descriptor's length comes last."""
-    mean = generalised_mean(widen(features.patches), params.p)
+    mean = generalised_mean(log_units(widen(features.patches)), params.p, axis=-2)
     return global_alone(widen(linear(params.fc, mean.astype(features.patches.dtype))))

@@ -1,5 +1,8 @@
 """Generalised mean of an image's patches (GeM; Radenovic et al., TPAMI 2018)."""
 
+import math
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -36,22 +39,26 @@ def apply(
     key: Keys | None,
 ) -> Tokens:
     """The mean of all patches, a global token as wide as the backbone."""
-    return global_alone(generalised_mean(widen(features.patches), params.p))
+    return global_alone(generalised_mean(log_units(widen(features.patches)), params.p, axis=-2))
 
 
-def generalised_mean(
-    patches: Float[Array, "*batch patch dim"], p: Float[Array, ""]
-) -> Float[Array, "*batch dim"]:
-    """(mean of x^p)^(1/p) over unit patches, channel by channel (Radenovic et al., Eq. 3)."""
-    return unit_powers(patches, p).mean(axis=-2) ** (1 / p)
-
-
-def unit_powers(
-    patches: Float[Array, "*batch patch dim"], p: Float[Array, ""]
-) -> Float[Array, "*batch patch dim"]:
-    """Each patch scaled to length 1, every number above the floor, to the power of `p`.
+def log_units(patches: Float[Array, "*batch patch dim"]) -> Float[Array, "*batch patch dim"]:
+    """Logarithms of unit patches, every number above the floor.
 
     Unit length and floor are those of CosPlace, CricaVPR and the benchmark of Berton et al. (CVPR
     2022).
     """
-    return jnp.maximum(l2_normalise(patches), GEM_FLOOR) ** p
+    return jnp.log(jnp.maximum(l2_normalise(patches), GEM_FLOOR))
+
+
+def generalised_mean(
+    logs: Float[Array, "*shape"], p: Float[Array, ""], *, axis: int | tuple[int, ...]
+) -> Float[Array, "*rest"]:
+    """(mean of x^p)^(1/p) along `axis`, of the logarithms of x (Radenovic et al., Eq. 3).
+
+    By way of logarithms, for in float32 the floor's power is 0 from an exponent of 6.4 on, and a
+    mean of zeros has no gradient.
+    """
+    axes = (axis,) if isinstance(axis, int) else axis
+    count = math.prod(logs.shape[i] for i in axes)
+    return jnp.exp((jax.nn.logsumexp(p * logs, axis=axis) - math.log(count)) / p)
