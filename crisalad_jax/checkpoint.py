@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors
 
-from crisalad_jax.config import ModelConfig
+from crisalad_jax.config import AGGREGATORS, ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import check_source, write_safetensors
 from crisalad_jax.model import Crisalad, init_crisalad
@@ -26,9 +26,17 @@ FORMAT = "crisalad-jax 1"
 EXTRA = "extra."
 """What names of arrays begin with that are kept for the way back to a public checkpoint alone."""
 
-_FREE = ("image_size", "compute_dtype", "keeps")
 _FREE_OF_PARTS = (("salad", "dropout"), ("encoder", "dropout"))
-"""What a model is asked for: the same parameters serve whatever these are."""
+
+
+def _free(config: ModelConfig) -> tuple[str, ...]:
+    """What a model is asked for: the same parameters serve whatever these are.
+
+    So they do whatever the aggregators are that it does not have.
+    """
+    other = (field for name, field in AGGREGATORS.items() if name != config.aggregator)
+    size = () if config.one_size else ("image_size",)
+    return (*size, "compute_dtype", "keeps", *other)
 
 
 def save_weights(
@@ -76,7 +84,7 @@ def load_weights(
     Args:
         path: the file.
         expected: if given, the configuration that the file must have, except for what parameters
-            do not depend on: image size, dropout, compute type, what is kept.
+            do not depend on: image size (but MixVPR's do), dropout, compute type, what is kept.
 
     Raises:
         InputError: the file is missing, cut short or no such file; its parameters do not fit its
@@ -126,14 +134,16 @@ def _with_free_fields_of(other: ModelConfig, config: ModelConfig) -> ModelConfig
         )
         for part, field in _FREE_OF_PARTS
     }
-    return dataclasses.replace(config, **{f: getattr(other, f) for f in _FREE}, **parts)
+    parts |= {field: getattr(other, field) for field in _free(config)}
+    return dataclasses.replace(config, **parts)
 
 
 def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:
     # Said before a template is made of sizes that any text may claim; small ones are listed below.
     largest = max(n for n in jax.tree.leaves(to_plain(config)) if type(n) is int)
+    layers = config.encoder.layers + config.aggregator_layers
     if largest > max(2**20, sum(array.size for array in found.values())) or (
-        config.encoder.layers > max(64, len(found))
+        layers > max(64, len(found))
     ):
         raise InputError(
             f"{path}: found {len(found)} arrays, far from the sizes that its configuration says, "
@@ -162,15 +172,16 @@ def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path)
 def model_hash(params: Crisalad, config: ModelConfig) -> str:
     """A digest of everything that descriptors are a function of, besides image size and rounding.
 
-    Of parameters by name, type, shape and value, and of the configuration without the image size,
-    the type that is computed in, what is kept for the gradient, and dropout: the same for a file of
-    weights and for its copy in another layout.
+    Of parameters by name, type, shape and value, and of the configuration without the image size
+    (unless parameters belong to it), the type that is computed in, what is kept for the gradient,
+    dropout, and aggregators that the model does not have: the same for a file of weights and for
+    its copy in another layout.
     """
     plain = to_plain(config)
-    for field in _FREE:
-        plain.pop(field)
     for part, field in _FREE_OF_PARTS:
         plain[part].pop(field)
+    for field in _free(config):
+        plain.pop(field)
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
     for name, leaf in sorted(named_leaves(params).items()):
         array = np.ascontiguousarray(leaf)

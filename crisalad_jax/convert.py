@@ -67,11 +67,12 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
     layout = "reference"
     if config is None:
         layout, config = infer(state, source=str(path))
-    elif config.backbone.depth + config.encoder.layers > len(state):
+    elif config.backbone.depth + config.encoder.layers + config.aggregator_layers > len(state):
         # Said before a table of names is made for a depth that any text may claim.
         raise InputError(
             f"{path}: found {len(state)} tensors, expected those of {config.backbone.depth} "
-            f"blocks and {config.encoder.layers} encoder layers, as its configuration says"
+            f"blocks, {config.encoder.layers} encoder layers and {config.aggregator_layers} of the "
+            "aggregator, as its configuration says"
         )
     state = {name: _float32(name, array, path) for name, array in state.items()}
     params, extras = to_params(state, config, layout, source=str(path))

@@ -46,7 +46,7 @@ def _part_of(name: str) -> str:
 
 def _macs(config: ModelConfig, images: int) -> dict[str, int]:
     backbone, encoder = config.backbone, config.encoder
-    patches = math.prod(config.image_size) // PATCH_SIZE**2
+    patches = config.patches
     tokens = 1 + backbone.registers + patches
     dim, hidden = backbone.dim, backbone.hidden
     depth, part_block = _blocks_run(config)
@@ -57,7 +57,7 @@ def _macs(config: ModelConfig, images: int) -> dict[str, int]:
         "backbone embedding, norm": patches * 3 * PATCH_SIZE**2 * dim,
         "backbone blocks": depth * block + part_block * tokens * dim**2,
         "adapters": 0,
-        "aggregator": _aggregator_macs(config, patches),
+        "aggregator": aggregator_macs(config),
         "cross-image encoder": 0,
     }
     if backbone.adapter.kind != "none":
@@ -82,26 +82,58 @@ def _blocks_run(config: ModelConfig) -> tuple[int, int]:
     return (number + 1, 0) if config.anyloc.facet == "token" else (number, 1)
 
 
-def _aggregator_macs(config: ModelConfig, patches: int) -> int:
-    if config.aggregator == "salad":
-        return _salad_macs(config, patches)
-    if config.aggregator in ("netvlad", "anyloc"):
-        # A product to share patches out, and one to sum them up.
-        return 2 * patches * config.shape.tokens * config.backbone.dim
-    if config.aggregator == "transvpr":
-        return _transvpr_macs(config, patches)
-    return 0
+def aggregator_macs(config: ModelConfig) -> int:
+    """Multiply-accumulates an image of the aggregator; pooling and sums of classes have none.
+
+    What BoQ's queries say to each other is the same for all images, computed once, and left out.
+    """
+    counts = {
+        "salad": _salad_macs,
+        "conv-ap": _conv_ap_macs,
+        "cosplace": lambda config: config.backbone.dim * config.cosplace.dim,
+        "mixvpr": _mixvpr_macs,
+        "boq": _boq_macs,
+        "netvlad": _vlad_macs,
+        "anyloc": _vlad_macs,
+        "transvpr": _transvpr_macs,
+    }
+    return counts[config.aggregator](config) if config.aggregator in counts else 0
 
 
-def _salad_macs(config: ModelConfig, patches: int) -> int:
-    dim, salad = config.backbone.dim, config.salad
+def _vlad_macs(config: ModelConfig) -> int:
+    """A product to share patches out, and one to sum them up."""
+    return 2 * config.patches * config.shape.tokens * config.backbone.dim
+
+
+def _conv_ap_macs(config: ModelConfig) -> int:
+    """As we compute it: the regions' means first, then the convolution."""
+    return config.conv_ap.side**2 * config.backbone.dim * config.conv_ap.channels
+
+
+def _mixvpr_macs(config: ModelConfig) -> int:
+    dim, patches, mixvpr = config.backbone.dim, config.patches, config.mixvpr
+    mixers = mixvpr.depth * dim * 2 * patches**2
+    return mixers + patches * mixvpr.channels * (dim + mixvpr.rows)
+
+
+def _boq_macs(config: ModelConfig) -> int:
+    patches, boq = config.patches, config.boq
+    width, queries = boq.channels, boq.queries
+    layer = patches * 12 * width**2 + 2 * patches**2 * width
+    asking = patches * 2 * width**2 + 2 * queries * patches * width + queries * width**2
+    convolution = patches * 9 * config.backbone.dim * width
+    return convolution + boq.layers * (layer + asking + queries * boq.rows * width)
+
+
+def _salad_macs(config: ModelConfig) -> int:
+    dim, salad, patches = config.backbone.dim, config.salad, config.patches
     networks = salad.hidden * (2 * dim + salad.cluster_dim + salad.scores)
     sums = salad.clusters * salad.cluster_dim
     return salad.hidden * (dim + salad.token_dim) + patches * (networks + sums)
 
 
-def _transvpr_macs(config: ModelConfig, patches: int) -> int:
-    transvpr = config.transvpr
+def _transvpr_macs(config: ModelConfig) -> int:
+    transvpr, patches = config.transvpr, config.patches
     wide = transvpr.levels * config.backbone.dim
     return patches * wide * (transvpr.levels + 1) + wide * transvpr.dim
 
@@ -109,7 +141,7 @@ def _transvpr_macs(config: ModelConfig, patches: int) -> int:
 def adapter_macs(config: ModelConfig) -> int:
     """True multiply-accumulates of one adapter and one image: linears at every token."""
     backbone = config.backbone
-    patches = math.prod(config.image_size) // PATCH_SIZE**2
+    patches = config.patches
     tokens = 1 + backbone.registers + patches
     width = backbone.adapter_dim
     return 2 * tokens * backbone.dim * width + patches * _convolution_macs(config)
@@ -118,7 +150,7 @@ def adapter_macs(config: ModelConfig) -> int:
 def paper_adapter_macs(config: ModelConfig) -> int:
     """The paper's count (Table 3: 39.223 M): convolutions at every patch, each linear only once."""
     backbone = config.backbone
-    patches = math.prod(config.image_size) // PATCH_SIZE**2
+    patches = config.patches
     return 2 * backbone.dim * backbone.adapter_dim + patches * _convolution_macs(config)
 
 

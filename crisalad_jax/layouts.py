@@ -17,8 +17,11 @@ import jax
 import numpy as np
 
 from crisalad_jax.config import (
+    AGGREGATORS,
     AdapterConfig,
+    BoqConfig,
     CrossImageConfig,
+    MixVprConfig,
     ModelConfig,
     SaladConfig,
     ViTConfig,
@@ -195,12 +198,23 @@ def hugging_face_lines(config: ViTConfig) -> Iterator[Entry | Extra]:
 
 
 def aggregator_lines(config: ModelConfig) -> Iterator[Entry]:
-    """SALAD under serizba/salad's names, the GeM pyramid under CricaVPR's; others in their manner.
+    """Each aggregator under the names of its public checkpoint; TransVPR's and AnyLoc's are ours.
 
-    NetVLAD's leaves have the names of Nanne/pytorch-NetVlad.
+    Those are serizba/salad, Lu-Feng/CricaVPR, gmberton/CosPlace (and EigenPlaces), amaralibey's
+    gsv-cities, MixVPR and Bag-of-Queries, and Nanne/pytorch-NetVlad.
     """
-    if config.aggregator == "gem-pyramid":
+    if config.aggregator in ("gem-pyramid", "gem", "cosplace"):
         yield Entry(("aggregator.p",), ("aggregation.1.p",), _FIRST)
+    if config.aggregator == "cosplace":
+        yield from _affine("aggregator.fc", "aggregation.3", _LINEAR)
+    if config.aggregator == "conv-ap":
+        yield from _affine("aggregator.channel_pool", "aggregator.channel_pool", _POINTWISE)
+    if config.aggregator == "mixvpr":
+        yield from mixvpr_lines(config.mixvpr)
+    if config.aggregator == "boq":
+        yield from boq_lines(config.boq)
+    if config.aggregator == "salad":
+        yield from salad_lines(config.salad)
     if config.aggregator == "transvpr":
         yield from _affine("aggregator.attention", "aggregator.attention", _LINEAR, bias=False)
         yield from _affine("aggregator.reduction", "aggregator.reduction", _LINEAR)
@@ -210,9 +224,36 @@ def aggregator_lines(config: ModelConfig) -> Iterator[Entry]:
     if config.aggregator == "anyloc":
         yield Entry(("aggregator.words",), ("aggregator.words",), _SAME)
         yield Entry(("aggregator.backbone",), ("aggregator.backbone",), _SAME)
-    if config.aggregator != "salad":
-        return
-    if config.salad.sinkhorn.dustbin not in ("none", "token"):
+
+
+def mixvpr_lines(config: MixVprConfig) -> Iterator[Entry]:
+    """MixVPR under amaralibey/MixVPR's names: mixers are layer norm, linear, ReLU, linear."""
+    for i in range(config.depth):
+        ours, theirs = f"aggregator.mix.{i}", f"aggregator.mix.{i}.mix"
+        yield from _affine(f"{ours}.norm", f"{theirs}.0", _SAME)
+        yield from _affine(f"{ours}.fc1", f"{theirs}.1", _LINEAR)
+        yield from _affine(f"{ours}.fc2", f"{theirs}.3", _LINEAR)
+    for name in ("channel_proj", "row_proj"):
+        yield from _affine(f"aggregator.{name}", f"aggregator.{name}", _LINEAR)
+
+
+def boq_lines(config: BoqConfig) -> Iterator[Entry]:
+    """BoQ under amaralibey/Bag-of-Queries' names."""
+    yield from _affine("aggregator.proj_c", "aggregator.proj_c", _CONV)
+    yield from _affine("aggregator.norm_input", "aggregator.norm_input", _SAME)
+    for i in range(config.layers):
+        here = f"aggregator.boqs.{i}"
+        yield Entry((f"{here}.queries",), (f"{here}.queries",), _FIRST)
+        yield from _layer_lines(f"{here}.encoder")
+        for attention, norm in (("self_attn", "norm_q"), ("cross_attn", "norm_out")):
+            yield from _attention_lines(f"{here}.{attention}", f"{here}.{attention}")
+            yield from _affine(f"{here}.{norm}", f"{here}.{norm}", _SAME)
+    yield from _affine("aggregator.fc", "aggregator.fc", _LINEAR)
+
+
+def salad_lines(config: SaladConfig) -> Iterator[Entry]:
+    """SALAD under serizba/salad's names."""
+    if config.sinkhorn.dustbin not in ("none", "token"):
         yield Entry(("aggregator.dust_bin",), ("aggregator.dust_bin",), _SAME)
     for name, second, form in (
         ("token_features", 2, _LINEAR),
@@ -226,17 +267,26 @@ def aggregator_lines(config: ModelConfig) -> Iterator[Entry]:
 def encoder_lines(config: CrossImageConfig) -> Iterator[Entry]:
     """The cross-image encoder under torch.nn.TransformerEncoder's names."""
     for i in range(config.layers):
-        here = f"encoder.layers.{i}"
-        for leaf, form in (("weight", _LINEAR), ("bias", _SAME)):
-            yield Entry((f"{here}.attn.qkv.{leaf}",), (f"{here}.self_attn.in_proj_{leaf}",), form)
-        yield from _affine(f"{here}.attn.proj", f"{here}.self_attn.out_proj", _LINEAR)
-        for name, form in (
-            ("linear1", _LINEAR),
-            ("linear2", _LINEAR),
-            ("norm1", _SAME),
-            ("norm2", _SAME),
-        ):
-            yield from _affine(f"{here}.{name}", f"{here}.{name}", form)
+        yield from _layer_lines(f"encoder.layers.{i}")
+
+
+def _layer_lines(here: str) -> Iterator[Entry]:
+    """One layer, under torch.nn.TransformerEncoderLayer's names."""
+    yield from _attention_lines(f"{here}.attn", f"{here}.self_attn")
+    for name, form in (
+        ("linear1", _LINEAR),
+        ("linear2", _LINEAR),
+        ("norm1", _SAME),
+        ("norm2", _SAME),
+    ):
+        yield from _affine(f"{here}.{name}", f"{here}.{name}", form)
+
+
+def _attention_lines(ours: str, theirs: str) -> Iterator[Entry]:
+    """One attention, under torch.nn.MultiheadAttention's names."""
+    for leaf, form in (("weight", _LINEAR), ("bias", _SAME)):
+        yield Entry((f"{ours}.qkv.{leaf}",), (f"{theirs}.in_proj_{leaf}",), form)
+    yield from _affine(f"{ours}.proj", f"{theirs}.out_proj", _LINEAR)
 
 
 def table(config: ModelConfig, layout: str) -> list[Entry | Extra]:
@@ -316,12 +366,15 @@ def _told(config: ModelConfig) -> ModelConfig:
         layer_scale_start=ViTConfig.layer_scale_start,
         adapter=adapter,
     )
-    salad = config.salad if config.aggregator == "salad" else SaladConfig()
+    others = {
+        f: type(getattr(config, f))() for n, f in AGGREGATORS.items() if n != config.aggregator
+    }
+    config = dataclasses.replace(config, **others)
     encoder = config.encoder if config.encoder.layers else CrossImageConfig(layers=0)
     return dataclasses.replace(
         config,
         backbone=backbone,
-        salad=dataclasses.replace(salad, dropout=0.0),
+        salad=dataclasses.replace(config.salad, dropout=0.0),
         encoder=dataclasses.replace(encoder, dropout=0.0),
         compute_dtype=ModelConfig.compute_dtype,
     )

@@ -20,6 +20,7 @@ NAMES = [what.name for what in (*CASES, *RUNS)]
 SLOW = {
     "Sinkhorn: 100 iterations, epsilon 1.0",
     "DINO-SALAD",  # a part of CriSALAD
+    "BoQ",  # tests/nn compares a smaller one
     "training CriSALAD's adapters and head",  # quick in float64
     "training CriSALAD's last block and head",
     "training CricaVPR's adapters and head",

@@ -37,9 +37,10 @@ from crisalad_jax.config import (
 from crisalad_jax.errors import InputError
 from parity.reference.adapter import ConvNorm, MultiResolutionAdapter
 from parity.reference.cross_image import CrossImageEncoder
+from parity.reference.gem import UnitPatches
 from parity.reference.losses import mine, multi_similarity_loss
 from parity.reference.model import Crisalad
-from parity.reference.pyramid import GemPyramid, UnitPatches
+from parity.reference.pyramid import GemPyramid
 from parity.reference.salad import Salad
 from parity.reference.sinkhorn import assign
 from parity.reference.tokens import Tokens

@@ -13,7 +13,7 @@ import safetensors.numpy
 
 import crisalad_jax
 from crisalad_jax.checkpoint import load_weights, model_hash, save_weights
-from crisalad_jax.config import PRESETS
+from crisalad_jax.config import PRESETS, BoqConfig, MixVprConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import to_plain
@@ -80,6 +80,27 @@ def test_only_what_parameters_do_not_depend_on_is_free(shared):
     assert "image_size" not in str(error.value)
 
 
+def test_parameters_of_one_image_size_keep_it(tmp_path):
+    config = dataclasses.replace(
+        WITHOUT_ENCODER, aggregator="mixvpr", mixvpr=MixVprConfig(channels=8, rows=2, depth=1)
+    )
+    params, path = random_params(config), tmp_path / "w.safetensors"
+    save_weights(path, params, config)
+    found, _ = load_weights(path, expected=dataclasses.replace(config, compute_dtype="bfloat16"))
+    assert_equal(found, params)
+    # As many patches, in another grid: every array would fit.
+    turned = dataclasses.replace(config, image_size=(56, 42))
+    with pytest.raises(InputError, match=r"another model: image_size: found .*42, 56.*56, 42"):
+        load_weights(path, expected=turned)
+    assert model_hash(params, turned) != model_hash(params, config)
+
+
+def test_aggregators_that_a_model_does_not_have_are_free(shared):
+    other = dataclasses.replace(MODEL, boq=BoqConfig(queries=8))
+    params, config = load_weights(shared / "weights.safetensors", expected=other)
+    assert model_hash(params, other) == model_hash(params, config)
+
+
 def rewrite(shared: pathlib.Path, path: pathlib.Path, change, metadata=None) -> None:
     """The shared weights with changed arrays, or other metadata."""
     arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
@@ -125,6 +146,10 @@ def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words)
         ({"crisalad-jax 1": "[" * 10**5}, "found no configuration in its metadata"),
         ({"crisalad-jax 1": '{"encoder": {"layers": 99999999999}}'}, "of up to 99999999999"),
         ({"crisalad-jax 1": '{"encoder": {"layers": 900}}'}, "far from the sizes"),
+        (
+            {"crisalad-jax 1": '{"aggregator": "boq", "boq": {"layers": 900}}'},
+            "far from the sizes",
+        ),
         ({"crisalad-jax 1": '{"backbone": {"dim": 9000000000000}}'}, "of up to 9000000000000"),
     ],
 )

@@ -10,13 +10,17 @@ from crisalad_jax.config import (
     RECIPES,
     AdapterConfig,
     AnyLocConfig,
+    BoqConfig,
     CircleConfig,
     ContrastiveConfig,
+    ConvApConfig,
+    CosPlaceConfig,
     CrossImageConfig,
     FastAPConfig,
     LargeMarginCosineConfig,
     LightAugmentConfig,
     LossConfig,
+    MixVprConfig,
     ModelConfig,
     MultiSimilarityConfig,
     NetVladConfig,
@@ -133,6 +137,20 @@ def test_a_classification_needs_no_second_image_of_a_place():
         TrainConfig(loss=classified.loss, images_per_place=0)
 
 
+@pytest.mark.parametrize(
+    ("name", "width"),
+    # The published descriptors of b14: BoQ's, and 4,096 of MixVPR and Conv-AP.
+    [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288)],
+)
+def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int):
+    found, paper = recipe("b14", name), recipe("b14")
+    assert found.model.aggregator == name
+    assert found.model.descriptor_dim == width
+    assert found.model.encoder.layers == 0
+    as_paper = dataclasses.replace(found.model, aggregator="salad", encoder=paper.model.encoder)
+    assert dataclasses.replace(found, model=as_paper) == paper
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", RECIPES)
 def test_every_recipe_fits_every_preset(preset: str, name: str):
@@ -154,8 +172,10 @@ def test_equal_configurations_name_one_program():
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
         recipe("b16")
-    with pytest.raises(InputError, match=r"^recipe: found 'boq', expected one of .*cricavpr, c"):
-        recipe("b14", "boq")
+    with pytest.raises(
+        InputError, match=r"^recipe: found 'dbow', expected one of boq, c.*, crisal"
+    ):
+        recipe("b14", "dbow")
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})
 
@@ -242,6 +262,19 @@ def test_one_patch_more_than_clusters_is_enough():
             {"aggregator": "anyloc"},
             "CrossImageConfig.layers: found 2 for aggregator anyloc, with which nothing trains",
         ),
+        (
+            ModelConfig,
+            {"aggregator": "conv-ap", "conv_ap": ConvApConfig(side=3), "image_size": (28, 56)},
+            "found 28 x 56, expected at least 42 x 42, a patch for every region",
+        ),
+        (
+            BoqConfig,
+            {"channels": 200},
+            "BoqConfig.channels: found 200, expected a multiple of its heads, 3: one for every 64",
+        ),
+        (MixVprConfig, {"rows": 0}, "MixVprConfig.rows: found 0"),
+        (ConvApConfig, {"side": 0}, "ConvApConfig.side: found 0"),
+        (CosPlaceConfig, {"dim": -1}, "CosPlaceConfig.dim: found -1"),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (SinkhornConfig, {"epsilon": -1.0}, "SinkhornConfig.epsilon: found -1.0"),
         (SinkhornConfig, {"epsilon": float("nan")}, "SinkhornConfig.epsilon: found nan"),

@@ -12,13 +12,19 @@ from crisalad_jax.config import (
     PRESETS,
     AdapterConfig,
     AnyLocConfig,
+    BoqConfig,
+    ConvApConfig,
+    CosPlaceConfig,
     CrossImageConfig,
+    MixVprConfig,
     ModelConfig,
     TransVprConfig,
     ViTConfig,
 )
-from crisalad_jax.costs import adapter_macs, paper_adapter_macs, part_costs
+from crisalad_jax.costs import adapter_macs, aggregator_macs, paper_adapter_macs, part_costs
 from crisalad_jax.model import alone, describe, init_crisalad
+from crisalad_jax.nn.aggregators import aggregate, init_aggregator
+from crisalad_jax.nn.vit import Features
 
 
 def with_adapter(kind: str) -> ModelConfig:
@@ -77,6 +83,10 @@ SMALL = ModelConfig(
     image_size=(84, 126),
     backbone=ViTConfig(dim=32, depth=3, heads=2, position_grid=4),
     salad=dataclasses.replace(PRESETS["tiny"].salad, clusters=8),
+    conv_ap=ConvApConfig(channels=20, side=3),
+    cosplace=CosPlaceConfig(dim=20),
+    mixvpr=MixVprConfig(channels=20, rows=3, depth=3),
+    boq=BoqConfig(channels=128, queries=7, rows=5),
     encoder=CrossImageConfig(heads=2, feedforward=24),
 )
 PLAIN = dataclasses.replace(
@@ -84,6 +94,36 @@ PLAIN = dataclasses.replace(
     backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="none")),
     encoder=CrossImageConfig(layers=0),
 )
+
+
+@pytest.mark.parametrize(
+    ("aggregator", "once"),
+    [
+        ("salad", 0),
+        ("gem", 0),
+        ("conv-ap", 0),
+        ("cosplace", 0),
+        ("mixvpr", 0),
+        # Of each block's 7 queries: inputs and outputs, scores and sums, and questions.
+        ("boq", 2 * (5 * 7 * 128**2 + 2 * 7**2 * 128)),
+    ],
+)
+def test_an_aggregators_count_is_its_programs(aggregator: Any, once: int) -> None:
+    """`once` is what does not depend on the image: not counted."""
+    images, (rows, columns) = 3, (6, 9)
+    config = dataclasses.replace(SMALL, aggregator=aggregator, encoder=CrossImageConfig(layers=0))
+    params = jax.eval_shape(lambda key: init_aggregator(key, config), jax.random.key(0))
+    features = Features(
+        jax.ShapeDtypeStruct((images, 32), jnp.float32),
+        jax.ShapeDtypeStruct((images, rows * columns, 32), jnp.float32),
+    )
+    program = jax.make_jaxpr(
+        lambda params, features: aggregate(params, features, (rows, columns), config, key=None)
+    )(params, features)
+    # The 3 x 3 convolution is no dot_general.
+    convolution = rows * columns * 9 * 32 * 128 if aggregator == "boq" else 0
+    counted = _products(program.jaxpr) + images * convolution
+    assert counted == images * aggregator_macs(config) + once
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,15 @@ from jax import export
 
 from crisalad_jax import platform
 from crisalad_jax.checkpoint import model_hash
-from crisalad_jax.config import PRESETS, ModelConfig, SinkhornConfig
+from crisalad_jax.config import (
+    PRESETS,
+    BoqConfig,
+    ConvApConfig,
+    CosPlaceConfig,
+    MixVprConfig,
+    ModelConfig,
+    SinkhornConfig,
+)
 from crisalad_jax.data.images import list_images, read_image, resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.export import (
@@ -207,8 +215,13 @@ def test_a_script_refuses_a_file_that_was_changed(
                 ),
             ),
         ),
+        dataclasses.replace(MODEL, aggregator="gem"),
+        dataclasses.replace(MODEL, aggregator="conv-ap", conv_ap=ConvApConfig(channels=16)),
+        dataclasses.replace(MODEL, aggregator="cosplace", cosplace=CosPlaceConfig(dim=16)),
+        dataclasses.replace(MODEL, aggregator="mixvpr", mixvpr=MixVprConfig(16, 2, 2)),
+        dataclasses.replace(MODEL, aggregator="boq", boq=BoqConfig(16, 3, 2, 5)),
     ],
-    ids=["bfloat16", "pyramid", "newton"],
+    ids=["bfloat16", "pyramid", "newton", "GeM", "Conv-AP", "CosPlace", "MixVPR", "BoQ"],
 )
 def test_other_models_for_all_platforms(config: ModelConfig):
     """Newton's steps solve linear systems, by another library on every platform."""

@@ -10,7 +10,11 @@ from crisalad_jax.config import (
     PRESETS,
     AdapterConfig,
     AnyLocConfig,
+    BoqConfig,
+    ConvApConfig,
+    CosPlaceConfig,
     CrossImageConfig,
+    MixVprConfig,
     ModelConfig,
     SaladConfig,
     SinkhornConfig,
@@ -97,6 +101,11 @@ MODELS = {
             MODEL.backbone, adapter=AdapterConfig(kind="multi-resolution")
         ),
     ),
+    "GeM": dataclasses.replace(MODEL, aggregator="gem"),
+    "Conv-AP": dataclasses.replace(MODEL, aggregator="conv-ap", conv_ap=ConvApConfig(16)),
+    "CosPlace": dataclasses.replace(MODEL, aggregator="cosplace", cosplace=CosPlaceConfig(16)),
+    "MixVPR": dataclasses.replace(MODEL, aggregator="mixvpr", mixvpr=MixVprConfig(16, 3, 2)),
+    "BoQ": dataclasses.replace(MODEL, aggregator="boq", boq=BoqConfig(16, 3, 2, 5)),
 }
 
 
@@ -113,6 +122,49 @@ def test_any_model_survives_the_reference_layout_bit_for_bit(name: str) -> None:
     for key, array in found.items():
         np.testing.assert_array_equal(array, wanted[key])
         assert array.dtype == wanted[key].dtype
+
+
+# As they are in the public checkpoints, of torch's modules in the public order.
+PUBLIC_HEADS = {
+    "GeM": {"aggregation.1.p": (1,)},
+    "Conv-AP": {
+        "aggregator.channel_pool.weight": (16, 32, 1, 1),
+        "aggregator.channel_pool.bias": (16,),
+    },
+    "CosPlace": {
+        "aggregation.1.p": (1,),
+        "aggregation.3.weight": (16, 32),
+        "aggregation.3.bias": (16,),
+    },
+    "MixVPR": {
+        **{
+            f"aggregator.mix.{i}.mix.{j}.{leaf}": (12, 12) if j and leaf == "weight" else (12,)
+            for i in (0, 1)
+            for j in (0, 1, 3)
+            for leaf in ("weight", "bias")
+        },
+        "aggregator.channel_proj.weight": (16, 32),
+        "aggregator.channel_proj.bias": (16,),
+        "aggregator.row_proj.weight": (3, 12),
+        "aggregator.row_proj.bias": (3,),
+    },
+}
+
+
+@pytest.mark.parametrize("name", PUBLIC_HEADS)
+def test_heads_have_their_public_names(name: str) -> None:
+    """BoQ's are tested beside torch's modules in tests/nn/aggregators."""
+    shapes = public_shapes(MODELS[name], "reference")
+    head = {key: shape for key, shape in shapes.items() if key.startswith("aggregat")}
+    assert list(head.items()) == list(PUBLIC_HEADS[name].items())
+
+
+def test_parts_that_a_model_does_not_have_go_to_any_layout() -> None:
+    """A preset says how large every method's parts are, whichever is chosen."""
+    _, published = expected("dinov2_vitb14")
+    check_holds(
+        dataclasses.replace(published, boq=BoqConfig(queries=8), salad=MODEL.salad), "dinov2"
+    )
 
 
 def test_every_number_has_its_own_place() -> None:

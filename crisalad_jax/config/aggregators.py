@@ -243,13 +243,11 @@ class MixVprConfig:
     rows: int = 4
     """Numbers that are left of each channel."""
     depth: int = 4
-    """Feature mixers."""
-    mlp_ratio: float = 1.0
-    """Hidden width of a mixer over the number of patches."""
+    """Feature mixers, as wide inside as there are patches."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "channels", "rows", "depth", "mlp_ratio")
+        require_positive(self, "channels", "rows", "depth")
 
     def shape(self, dim: int) -> TokenShape:
         """A token for each row."""
@@ -298,10 +296,11 @@ class BoqConfig:
     channels: int = 384
     """Channels that a 3 x 3 convolution leaves of the backbone's."""
     queries: int = 64
-    """Learnt queries of a layer."""
+    """Learnt queries of a block."""
     layers: int = 2
+    """Blocks, of an encoder layer and its queries each."""
     rows: int = 32
-    """Rows that a linear layer leaves of all layers' answers."""
+    """Rows that a linear layer leaves of all blocks' answers."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -309,13 +308,13 @@ class BoqConfig:
         require(
             self.channels % self.heads == 0,
             f"BoqConfig.channels: found {self.channels}, expected a multiple of its heads, "
-            f"{self.heads}: one for every 32 channels",
+            f"{self.heads}: one for every 64 channels",
         )
 
     @property
     def heads(self) -> int:
         """Heads of every attention, as the public code has them."""
-        return max(1, self.channels // 32)
+        return max(1, self.channels // 64)
 
     def shape(self, dim: int) -> TokenShape:
         """A token for each row."""

@@ -1,6 +1,7 @@
 """A whole model."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Literal
 
@@ -22,6 +23,7 @@ from crisalad_jax.config.aggregators import (
 )
 from crisalad_jax.config.backbone import PATCH_SIZE, ViTConfig
 from crisalad_jax.config.checks import choose, require, require_choice
+from crisalad_jax.errors import InputError
 
 AGGREGATORS: Mapping[str, str] = {
     "salad": "salad",
@@ -37,6 +39,15 @@ AGGREGATORS: Mapping[str, str] = {
     "transvpr": "transvpr",
 }
 """The field of `ModelConfig` that describes each."""
+
+_WIDTHS = {
+    "salad": "SaladConfig.cluster_dim",
+    "conv-ap": "ConvApConfig.channels",
+    "cosplace": "CosPlaceConfig.dim",
+    "mixvpr": "MixVprConfig.channels",
+    "boq": "BoqConfig.channels",
+}
+"""What sets the width of the tokens; of the others the backbone does."""
 
 
 AggregatorConfig = (
@@ -134,13 +145,12 @@ class ModelConfig:
 
     def _check_encoder(self) -> None:
         shape, heads = self.shape, self.encoder.heads
-        salad = self.aggregator == "salad"
         width, name = shape.token_dim, f"aggregator {self.aggregator}"
+        field = _WIDTHS.get(self.aggregator)
         require(
             width % heads == 0,
-            f"{'SaladConfig.cluster_dim' if salad else name}: found "
-            f"{width if salad else f'tokens of {width} numbers'}, expected a multiple of the "
-            f"cross-image encoder's {heads} heads",
+            f"{field or name}: found {width if field else f'tokens of {width} numbers'}, expected "
+            f"a multiple of the cross-image encoder's {heads} heads",
         )
         require(
             not self.encoder.global_token or shape.global_dim % width == 0,
@@ -170,13 +180,34 @@ class ModelConfig:
         shape = self.shape
         return shape.global_dim + shape.tokens * shape.token_dim
 
+    @property
+    def patches(self) -> int:
+        """How many there are in an image of `image_size`."""
+        return math.prod(self.image_size) // PATCH_SIZE**2
+
+    @property
+    def aggregator_layers(self) -> int:
+        """Layers of the aggregator, of which each has parameters of its own; 0 if it is fixed."""
+        return {"mixvpr": self.mixvpr.depth, "boq": self.boq.layers}.get(self.aggregator, 0)
+
+    @property
+    def one_size(self) -> bool:
+        """Whether the parameters belong to the patches of `image_size`, and serve no other."""
+        return self.aggregator == "mixvpr"
+
     def check_image_size(self, image_size: tuple[int, int]) -> None:
         """Check that this model can describe images of this height and width.
 
         Raises:
-            InputError: a side is no multiple of 14, or there are too few patches for the
-                aggregator.
+            InputError: a side is no multiple of 14, there are too few patches for the aggregator,
+                or its parameters are for another size.
         """
+        if self.one_size and tuple(image_size) != self.image_size:
+            found, expected = (f"{h} x {w}" for h, w in (image_size, self.image_size))
+            raise InputError(
+                f"image size: found {found}, expected {expected}: aggregator {self.aggregator} has "
+                "parameters for every patch, and was made for images of this size alone"
+            )
         if self.aggregator == "salad":
             # Where the dustbin's mass is what patches are more than clusters.
             differs = self.salad.sinkhorn.dustbin in ("column", "token")

@@ -119,18 +119,6 @@ def _cricavpr(model: ModelConfig) -> TrainConfig:
     )
 
 
-def _transvpr(model: ModelConfig) -> TrainConfig:
-    """TransVPR over adapted DINOv2, by our loss in place of its triplets (docs/methods.md)."""
-    encoder = dataclasses.replace(model.encoder, layers=0)
-    return TrainConfig(model=dataclasses.replace(model, aggregator="transvpr", encoder=encoder))
-
-
-def _netvlad(model: ModelConfig) -> TrainConfig:
-    """NetVLAD over adapted DINOv2, trained as the paper trains what it compares with."""
-    encoder = dataclasses.replace(model.encoder, layers=0)
-    return TrainConfig(model=dataclasses.replace(model, aggregator="netvlad", encoder=encoder))
-
-
 def _anyloc(model: ModelConfig) -> TrainConfig:
     """AnyLoc over DINOv2 as it is: of use for its model alone, for nothing of it trains."""
     return TrainConfig(
@@ -183,6 +171,20 @@ def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, *, epochs: in
     )
 
 
+def _comparable(aggregator: Any) -> Callable[[ModelConfig], TrainConfig]:
+    """Another aggregator in the place of CriSALAD's head, and all else as the paper trains.
+
+    The backbone stays frozen, with the adapters beside it, so that methods differ in nothing but
+    what they make of its features. An image's descriptor owes nothing to others.
+    """
+
+    def train(model: ModelConfig) -> TrainConfig:
+        encoder = dataclasses.replace(model.encoder, layers=0)
+        return TrainConfig(model=dataclasses.replace(model, aggregator=aggregator, encoder=encoder))
+
+    return train
+
+
 def _scratch(model: ModelConfig) -> TrainConfig:
     """From random weights, all of the model: ours, for `tiny`."""
     return TrainConfig(
@@ -215,11 +217,15 @@ RECIPES: Mapping[str, Callable[[ModelConfig], TrainConfig]] = {
     "crisalad-step": _varied(schedule="step"),
     "salad": _salad,
     "cricavpr": _cricavpr,
-    "transvpr": _transvpr,
-    "netvlad": _netvlad,
+    "transvpr": _comparable("transvpr"),
+    "netvlad": _comparable("netvlad"),
     "anyloc": _anyloc,
     "cosplace": _cosplace,
     "eigenplaces": _eigenplaces,
+    "gem": _comparable("gem"),
+    "conv-ap": _comparable("conv-ap"),
+    "mixvpr": _comparable("mixvpr"),
+    "boq": _comparable("boq"),
     "scratch": _scratch,
 }
 """Named by what they reproduce. Table 2's other rows are one flag of `crisalad` each."""

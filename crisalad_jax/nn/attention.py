@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.nn.layers import Linear, dropout, linear
+from crisalad_jax.nn.layers import Linear, dropout, init_linear, linear
 from crisalad_jax.platform import has_fused_attention
 from crisalad_jax.pytree import params
 
@@ -22,6 +22,14 @@ class Attention:
 
     qkv: Linear
     proj: Linear
+
+
+def init_torch_attention(qkv_key: PRNGKeyArray, proj_key: PRNGKeyArray, dim: int) -> Attention:
+    """Start as torch's `nn.MultiheadAttention` does: Glorot-uniform inputs, zero biases."""
+    bound = math.sqrt(6 / (dim + 3 * dim))
+    qkv = jax.random.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound)
+    proj = init_linear(proj_key, dim, dim).weight
+    return Attention(Linear(qkv, jnp.zeros(3 * dim)), Linear(proj, jnp.zeros(dim)))
 
 
 def attention(
@@ -65,6 +73,29 @@ def attention(
     return linear(params.proj, jnp.moveaxis(mixed, -1, -3).reshape(x.shape))
 
 
+def cross_attention(
+    params: Attention,
+    queries: Float[Array, "query dim"],
+    x: Float[Array, "*batch token dim"],
+    heads: int,
+) -> Float[Array, "*batch query dim"]:
+    """Queries, the same for a whole batch, look at the tokens of `x` and not at each other.
+
+    As `attention` otherwise: the same scores, softmax and parameters.
+    """
+    *batch, tokens, dim = x.shape
+    weight, bias = params.qkv.weight, params.qkv.bias
+    assert bias is not None
+    asked = linear(Linear(weight[:, :dim], bias[:dim]), queries) / math.sqrt(dim // heads)
+    offered = linear(Linear(weight[:, dim:], bias[dim:]), x)
+    offered = offered.reshape(*batch, tokens, 2 * heads, dim // heads)
+    keys, values = jnp.split(jnp.moveaxis(offered, -3, -2), 2, axis=-3)
+    columns = jnp.moveaxis(asked.reshape(-1, heads, dim // heads), 0, -1)
+    columns = jnp.broadcast_to(columns, (*batch, *columns.shape))
+    mixed = jnp.moveaxis(_mix(columns, keys, values, None, None), -1, -3)
+    return linear(params.proj, mixed.reshape(*batch, len(queries), dim))
+
+
 def _wide(x: Array) -> Any:
     return jnp.promote_types(x.dtype, jnp.float32)
 
@@ -75,12 +106,12 @@ def _product(formula: str, a: Array, b: Array) -> Array:
 
 @jax.custom_vjp
 def _mix(
-    queries: Float[Array, "*batch head dim token"],
+    queries: Float[Array, "*batch head dim query"],
     keys: Float[Array, "*batch head token dim"],
     values: Float[Array, "*batch head token dim"],
-    mask: Bool[Array, "token token"] | None,
-    kept: Float[Array, "*batch head token token"] | None,
-) -> Float[Array, "*batch head dim token"]:
+    mask: Bool[Array, "token query"] | None,
+    kept: Float[Array, "*batch head token query"] | None,
+) -> Float[Array, "*batch head dim query"]:
     """Every query's mean of the values, weighted by the softmax of its scores, times `kept`.
 
     The gradient is written out: by itself JAX would make the result once more for it, and take the
@@ -96,7 +127,7 @@ def _mix(
 
 def _softmax(
     queries: Array, keys: Array, mask: Array | None
-) -> tuple[Float[Array, "*batch head token token"], Float[Array, "*batch head 1 token"]]:
+) -> tuple[Float[Array, "*batch head token query"], Float[Array, "*batch head 1 query"]]:
     """Exponentials of the scores, keys down the columns, and what to divide a column by."""
     scores = _product("...jd,...di->...ji", keys, queries)
     if mask is not None:

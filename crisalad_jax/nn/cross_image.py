@@ -3,14 +3,11 @@
 Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact GELU.
 """
 
-import math
-
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config import CrossImageConfig
-from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.attention import Attention, attention, init_torch_attention
 from crisalad_jax.nn.layers import (
     LayerNorm,
     Linear,
@@ -48,19 +45,14 @@ class CrossImageEncoder:
 def init_cross_image(key: PRNGKeyArray, dim: int, config: CrossImageConfig) -> CrossImageEncoder:
     """Start as torch does: Glorot-uniform attention with zero biases, default linears."""
     keys = jax.random.split(key, config.layers)
-    return CrossImageEncoder(tuple(_init_layer(k, dim, config.feedforward) for k in keys))
+    return CrossImageEncoder(tuple(init_encoder_layer(k, dim, config.feedforward) for k in keys))
 
 
-def _init_layer(key: PRNGKeyArray, dim: int, feedforward: int) -> EncoderLayer:
+def init_encoder_layer(key: PRNGKeyArray, dim: int, feedforward: int) -> EncoderLayer:
+    """Start as torch's `nn.TransformerEncoderLayer` does."""
     qkv_key, proj_key, first, second = jax.random.split(key, 4)
-    bound = math.sqrt(6 / (dim + 3 * dim))
-    qkv = Linear(
-        jax.random.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound),
-        jnp.zeros(3 * dim),
-    )
-    proj = Linear(init_linear(proj_key, dim, dim).weight, jnp.zeros(dim))
     return EncoderLayer(
-        attn=Attention(qkv, proj),
+        attn=init_torch_attention(qkv_key, proj_key, dim),
         linear1=init_linear(first, dim, feedforward),
         linear2=init_linear(second, feedforward, dim),
         norm1=init_layer_norm(dim),

@@ -128,5 +128,5 @@ def _statistics(result: SinkhornResult, clusters: int) -> TransportStatistics:
 def published_order(
     clusters: Float[Array, "cluster cluster_dim"],
 ) -> Float[Array, "cluster_dim cluster"]:
-    """The order of the public descriptor: all clusters' first dimension, then all their second."""
+    """The order of public descriptors: all clusters' first dimension, then all their second."""
     return clusters.T

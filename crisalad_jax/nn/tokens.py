@@ -26,6 +26,16 @@ class Tokens(NamedTuple):
     """An image's; None where there is no transport, or other images have been looked at since."""
 
 
+def global_alone(token: Float[Array, "*batch dim"]) -> Tokens:
+    """A global token, and no local ones of its width."""
+    return Tokens(token, token[..., None, :][..., :0, :])
+
+
+def local_alone(tokens: Float[Array, "*batch token dim"]) -> Tokens:
+    """Local tokens, and a global one of no numbers."""
+    return Tokens(tokens[..., 0, :0], tokens)
+
+
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "token dim"]:
     """The local tokens, behind the global one cut to their width if it takes part."""
     if not global_token:

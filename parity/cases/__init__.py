@@ -9,7 +9,11 @@ import numpy as np
 from crisalad_jax.config import (
     AdapterConfig,
     AnyLocConfig,
+    BoqConfig,
+    ConvApConfig,
+    CosPlaceConfig,
     CrossImageConfig,
+    MixVprConfig,
     ModelConfig,
     NetVladConfig,
     SaladConfig,
@@ -47,6 +51,11 @@ def _model(
         anyloc=AnyLocConfig(clusters=5, layer=-1, facet="token"),
         salad=SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0),
         transvpr=TransVprConfig(levels=2, dim=24),
+        conv_ap=ConvApConfig(channels=20),
+        cosplace=CosPlaceConfig(dim=20),
+        mixvpr=MixVprConfig(channels=20, rows=3, depth=2),
+        # Two heads.
+        boq=BoqConfig(channels=128, queries=5, rows=3),
         encoder=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
     )
 
@@ -68,6 +77,14 @@ TRANSVPR = _model(aggregator="transvpr")
 NETVLAD = _model(aggregator="netvlad")
 ANYLOC = _model(aggregator="anyloc")
 CLASS_TOKEN = _model(aggregator="class-token")
+HEADS = {
+    "GeM": "gem",
+    "Conv-AP": "conv-ap",
+    "CosPlace's head": "cosplace",
+    "MixVPR": "mixvpr",
+    "BoQ": "boq",
+}
+"""What they are called in the table."""
 
 
 def normal(*shape: int, scale: float = 1.0) -> Draw:
@@ -197,6 +214,17 @@ CASES: tuple[Case, ...] = (
     Case("GeM pyramid", CRICAVPR, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
     Case("NetVLAD", NETVLAD, parts.AGGREGATE, FEATURES, bfloat16=False),
     Case("AnyLoc", ANYLOC, parts.AGGREGATE, FEATURES, bfloat16=False, smooth=False),
+    *(
+        Case(
+            name,
+            _model(aggregator=aggregator),
+            parts.AGGREGATE,
+            FEATURES,
+            bfloat16=aggregator != "gem",
+            smooth=aggregator == "conv-ap",
+        )
+        for name, aggregator in HEADS.items()
+    ),
     Case("cross-image encoder", TWO_LAYERS, parts.ENCODER, SEQUENCES),
     Case(
         "TransVPR",

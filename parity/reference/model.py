@@ -3,28 +3,29 @@
 DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
 """
 
-from collections.abc import Callable, Mapping
-
 import torch
 from torch import Tensor, nn
 
 from crisalad_jax.config import ModelConfig
+from parity.reference.boq import Boq
+from parity.reference.conv_ap import ConvAp
+from parity.reference.cosplace import CosPlace
 from parity.reference.cross_image import CrossImageEncoder
+from parity.reference.gem import GeM, UnitPatches
 from parity.reference.layers import l2_normalise, widen
-from parity.reference.pyramid import GemPyramid, UnitPatches
+from parity.reference.mixvpr import MixVpr
+from parity.reference.pyramid import GemPyramid
 from parity.reference.salad import Salad, published_order
-from parity.reference.tokens import Tokens, as_sequence, from_sequence
+from parity.reference.tokens import (
+    Tokens,
+    as_sequence,
+    from_sequence,
+    global_alone,
+    local_alone,
+)
 from parity.reference.transvpr import TransVpr
 from parity.reference.vit import Features, ViT
 from parity.reference.vlad import AnyLoc, NetVlad
-
-AGGREGATORS: Mapping[str, Callable[[ModelConfig], nn.Module]] = {
-    "salad": lambda config: Salad(config.backbone.dim, config.salad),
-    "netvlad": lambda config: NetVlad(config.backbone.dim, config.netvlad.clusters),
-    "anyloc": lambda config: AnyLoc(config.backbone.dim, config.anyloc.clusters),
-    "transvpr": lambda config: TransVpr(config.backbone.dim, config.transvpr),
-}
-"""Those that are called `aggregator` in a state."""
 
 
 class Crisalad(nn.Module):
@@ -40,11 +41,8 @@ class Crisalad(nn.Module):
         self.config = config
         self.compute_dtype: torch.dtype = getattr(torch, config.compute_dtype)
         self.backbone = ViT(config.backbone)
-        kind = config.aggregator
-        self.aggregator = AGGREGATORS[kind](config) if kind in AGGREGATORS else None
-        self.aggregation = (
-            nn.Sequential(UnitPatches(), GemPyramid()) if kind == "gem-pyramid" else None
-        )
+        self.aggregator = _aggregator(config)
+        self.aggregation = _aggregation(config)
         self.encoder = (
             CrossImageEncoder(config.shape.token_dim, config.encoder)
             if config.encoder.layers
@@ -81,12 +79,17 @@ class Crisalad(nn.Module):
 
     def aggregate(self, features: Features) -> Tokens:
         """From a backbone's features to the images' tokens, in float32 at least."""
-        if self.aggregator is not None:
+        if isinstance(self.aggregator, Salad | NetVlad | AnyLoc | TransVpr):
             return self.aggregator(features)
+        if self.aggregator is not None:
+            return local_alone(self.aggregator(features.patches))
+        if isinstance(self.aggregation, CosPlace):
+            return global_alone(self.aggregation(features.patches))
         class_token, patches = widen(features.class_token), widen(features.patches)
-        if self.aggregation is not None:
-            return Tokens(class_token, self.aggregation(patches))
-        return Tokens(class_token, class_token.new_zeros(len(class_token), 0, patches.shape[1]))
+        if self.aggregation is None:
+            return global_alone(class_token)
+        pooled = self.aggregation(patches)
+        return global_alone(pooled) if pooled.ndim == 2 else Tokens(class_token, pooled)
 
     def relate(self, tokens: Tokens, mask: Tensor | None = None) -> Tensor:
         """The second half: images look at each other, then become descriptors."""
@@ -99,6 +102,35 @@ class Crisalad(nn.Module):
 
     def join(self, tokens: Tokens) -> Tensor:
         """One unit descriptor: the global token, then the local ones in the published order."""
-        salad = self.config.aggregator == "salad"
-        local = published_order(tokens.local) if salad else tokens.local
+        transposed = self.config.aggregator in ("salad", "conv-ap", "mixvpr", "boq")
+        local = published_order(tokens.local) if transposed else tokens.local
         return l2_normalise(torch.cat([tokens.global_token, local.flatten(1)], dim=1))
+
+
+def _aggregator(config: ModelConfig) -> nn.Module | None:
+    """What is called `aggregator` in a state, as most public checkpoints have it."""
+    dim = config.backbone.dim
+    conv_ap, mixvpr = config.conv_ap, config.mixvpr
+    if config.aggregator == "salad":
+        return Salad(dim, config.salad)
+    if config.aggregator == "conv-ap":
+        return ConvAp(dim, conv_ap.channels, conv_ap.side)
+    if config.aggregator == "transvpr":
+        return TransVpr(dim, config.transvpr)
+    if config.aggregator == "netvlad":
+        return NetVlad(dim, config.netvlad.clusters)
+    if config.aggregator == "anyloc":
+        return AnyLoc(dim, config.anyloc.clusters)
+    if config.aggregator == "mixvpr":
+        return MixVpr(dim, config.patches, mixvpr.channels, mixvpr.rows, mixvpr.depth)
+    return Boq(dim, config.boq) if config.aggregator == "boq" else None
+
+
+def _aggregation(config: ModelConfig) -> nn.Module | None:
+    """What others name `aggregation`."""
+    if config.aggregator == "cosplace":
+        return CosPlace(config.backbone.dim, config.cosplace.dim)
+    pools = {"gem": GeM, "gem-pyramid": GemPyramid}
+    if config.aggregator not in pools:
+        return None
+    return nn.Sequential(UnitPatches(), pools[config.aggregator]())

@@ -15,6 +15,16 @@ class Tokens(NamedTuple):
     """(batch, token, dim)."""
 
 
+def global_alone(token: Tensor) -> Tokens:
+    """(batch, dim), and no local tokens of that width."""
+    return Tokens(token, token.new_zeros(len(token), 0, token.shape[1]))
+
+
+def local_alone(tokens: Tensor) -> Tokens:
+    """(batch, token, dim), and a global one of no numbers."""
+    return Tokens(tokens.new_zeros(len(tokens), 0), tokens)
+
+
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Tensor:
     """The local tokens, behind the global one cut to their width if it takes part."""
     if not global_token:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.nn.attention import Attention, _mix, attention
+from crisalad_jax.nn.attention import Attention, _mix, attention, cross_attention
 from crisalad_jax.nn.layers import init_linear
 
 TOKENS, DIM, HEADS = 7, 12, 3
@@ -42,6 +42,35 @@ def test_equals_torch_with_and_without_mask() -> None:
         # Two products of 12 terms of order 1 in float32.
         np.testing.assert_allclose(ours, expected.detach().numpy(), atol=2e-6)
         np.testing.assert_allclose(one, expected[1].detach().numpy(), atol=2e-6)
+
+
+def test_queries_of_their_own_are_torchs_cross_attention() -> None:
+    params, x, theirs = make()
+    tokens, queries = jnp.stack([x, 1 - x, 2 * x]), x[:4] + 0.5
+
+    def found(params: Attention, queries: jax.Array, tokens: jax.Array) -> jax.Array:
+        return cross_attention(params, queries, tokens, HEADS)
+
+    asked = torch.tensor(np.asarray(queries), requires_grad=True)
+    seen = torch.tensor(np.asarray(tokens), requires_grad=True)
+    expected = theirs(asked.expand(3, -1, -1), seen, seen, need_weights=False)[0]
+    ours, back = jax.vjp(found, params, queries, tokens)
+    assert ours.shape == (3, 4, DIM)
+    np.testing.assert_allclose(ours, expected.detach(), atol=2e-6)
+    one = cross_attention(params, queries, tokens[2], HEADS)
+    np.testing.assert_allclose(one, expected[2].detach(), atol=2e-6)
+
+    slope = np.random.default_rng(0).normal(size=ours.shape).astype(np.float32)
+    expected.backward(torch.tensor(slope))
+    to_params, to_queries, to_tokens = back(jnp.asarray(slope))
+    for mine, other in (
+        (to_queries, asked.grad),
+        (to_tokens, seen.grad),
+        (to_params.qkv.weight.T, theirs.in_proj_weight.grad),
+        (to_params.qkv.bias, theirs.in_proj_bias.grad),
+    ):
+        # Sums of some hundred products of order 1.
+        np.testing.assert_allclose(mine, other, atol=2e-5)
 
 
 def test_a_masked_token_has_no_influence_and_no_gradient() -> None:

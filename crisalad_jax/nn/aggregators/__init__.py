@@ -11,17 +11,34 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ModelConfig, choose
-from crisalad_jax.nn.aggregators import anyloc, gem_pyramid, netvlad, transvpr
+from crisalad_jax.nn.aggregators import (
+    anyloc,
+    boq,
+    conv_ap,
+    cosplace,
+    gem,
+    gem_pyramid,
+    mixvpr,
+    netvlad,
+    transvpr,
+)
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
+from crisalad_jax.nn.aggregators.boq import Boq
+from crisalad_jax.nn.aggregators.conv_ap import ConvAp
+from crisalad_jax.nn.aggregators.cosplace import CosPlace
+from crisalad_jax.nn.aggregators.gem import Gem
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid
+from crisalad_jax.nn.aggregators.mixvpr import MixVpr
 from crisalad_jax.nn.aggregators.netvlad import NetVlad
 from crisalad_jax.nn.aggregators.transvpr import TransVpr
 from crisalad_jax.nn.layers import Keys, l2_normalise, widen
 from crisalad_jax.nn.salad import Salad, init_salad, published_order, salad
-from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.tokens import Tokens, global_alone
 from crisalad_jax.nn.vit import Features
 
-Aggregator = Salad | GemPyramid | NetVlad | AnyLoc | TransVpr
+Aggregator = (
+    Salad | GemPyramid | Gem | NetVlad | ConvAp | CosPlace | MixVpr | AnyLoc | Boq | TransVpr
+)
 
 
 class Method(NamedTuple):
@@ -56,7 +73,7 @@ def _class_token(
     *,
     key: Keys | None,
 ) -> Tokens:
-    return Tokens(widen(features.class_token), widen(features.patches)[..., :0, :])
+    return global_alone(widen(features.class_token))
 
 
 _METHODS = {
@@ -66,6 +83,11 @@ _METHODS = {
     "anyloc": Method(anyloc.init, anyloc.apply),
     "class-token": Method(lambda key, config: None, _class_token),
     "transvpr": Method(transvpr.init, transvpr.apply),
+    "gem": Method(gem.init, gem.apply),
+    "conv-ap": Method(conv_ap.init, conv_ap.apply, published_order),
+    "cosplace": Method(cosplace.init, cosplace.apply),
+    "mixvpr": Method(mixvpr.init, mixvpr.apply, published_order),
+    "boq": Method(boq.init, boq.apply, published_order),
 }
 
 

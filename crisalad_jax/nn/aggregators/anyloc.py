@@ -11,7 +11,7 @@ from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.nn.aggregators.netvlad import residual_sums
 from crisalad_jax.nn.layers import Keys, l2_normalise, widen
-from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.tokens import Tokens, local_alone
 from crisalad_jax.nn.vit import Features, ViT
 from crisalad_jax.pytree import named_leaves, params
 
@@ -74,7 +74,7 @@ def apply(
 
     The features are those of `config.anyloc.facet`.
     """
-    return Tokens(widen(features.class_token)[..., :0], hard_vlad(params.words, features.patches))
+    return local_alone(hard_vlad(params.words, features.patches))
 
 
 def hard_vlad(

@@ -6,13 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import PYRAMID_LEVELS, ModelConfig
-from crisalad_jax.nn.layers import Keys, l2_normalise, widen
+from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
+from crisalad_jax.nn.layers import Keys, widen
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.vit import Features
 from crisalad_jax.pytree import params
-
-GEM_FLOOR = 1e-6
-"""What a generalised mean takes smaller numbers for."""
 
 
 @params
@@ -24,7 +22,7 @@ class GemPyramid:
 
 def init(key: PRNGKeyArray, config: ModelConfig) -> GemPyramid:
     """Start as the public implementation, at an exponent of 3."""
-    return GemPyramid(jnp.full((), 3.0))
+    return GemPyramid(jnp.full((), START))
 
 
 def apply(
@@ -48,15 +46,15 @@ def gem_pyramid(
     Regions come level by level in row order. A side of n patches is cut at round(i n / level):
     CricaVPR's 8, and 5 and 11, for the 16 x 16 grid that it was published for and fixed to.
     """
-    cells = jnp.maximum(l2_normalise(patches), GEM_FLOOR) ** params.p
+    cells = log_units(patches)
     cells = cells.reshape(*cells.shape[:-2], *grid, cells.shape[-1])
     means = [
-        cells[..., top:bottom, left:right, :].mean(axis=(-3, -2))
+        generalised_mean(cells[..., top:bottom, left:right, :], params.p, axis=(-3, -2))
         for level in PYRAMID_LEVELS
         for top, bottom in _cuts(grid[0], level)
         for left, right in _cuts(grid[1], level)
     ]
-    return jnp.stack(means, axis=-2) ** (1 / params.p)
+    return jnp.stack(means, axis=-2)
 
 
 def _cuts(side: int, level: int) -> list[tuple[int, int]]:

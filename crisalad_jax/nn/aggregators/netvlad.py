@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.nn.layers import Keys, Linear, init_linear, l2_normalise, linear, widen
-from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.tokens import Tokens, local_alone
 from crisalad_jax.nn.vit import Features
 from crisalad_jax.pytree import params
 
@@ -77,7 +77,7 @@ def apply(
     key: Keys | None,
 ) -> Tokens:
     """A sum of residuals for each cluster, of length 1; no global token."""
-    return Tokens(widen(features.class_token)[..., :0], netvlad(params, features.patches))
+    return local_alone(netvlad(params, features.patches))
 
 
 def netvlad(

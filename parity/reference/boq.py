@@ -1,0 +1,59 @@
+"""Bag of queries (Ali-bey et al., CVPR 2024), of torch's own transformer modules."""
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from crisalad_jax.config import BoqConfig
+from parity.reference.layers import Conv2d, LayerNorm, Linear, widen
+
+
+class BoqBlock(nn.Module):
+    """An encoder layer over the patches, and queries that look at each other, then at them."""
+
+    def __init__(self, config: BoqConfig) -> None:
+        """Queries start normal of deviation 1."""
+        super().__init__()
+        width, heads = config.channels, config.heads
+        self.encoder = nn.TransformerEncoderLayer(
+            width, heads, dim_feedforward=4 * width, dropout=0.0, batch_first=True
+        )
+        self.queries = nn.Parameter(torch.randn(1, config.queries, width))
+        self.self_attn = nn.MultiheadAttention(width, heads, batch_first=True)
+        self.norm_q = LayerNorm(width)
+        self.cross_attn = nn.MultiheadAttention(width, heads, batch_first=True)
+        self.norm_out = LayerNorm(width)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(batch, patch, channel) to the same for the next block, and (batch, query, channel)."""
+        x = _cast(self.encoder, x)
+        queries = self.queries.to(x.dtype).expand(len(x), -1, -1)
+        queries = self.norm_q(queries + _cast(self.self_attn, queries, queries, queries)[0])
+        return x, self.norm_out(_cast(self.cross_attn, queries, x, x)[0])
+
+
+class Boq(nn.Module):
+    """Fewer channels, the blocks in order, then rows of all their answers."""
+
+    def __init__(self, dim: int, config: BoqConfig) -> None:
+        """For feature maps of `dim` channels."""
+        super().__init__()
+        self.proj_c = Conv2d(dim, config.channels, 3, padding=1)
+        self.norm_input = LayerNorm(config.channels)
+        self.boqs = nn.ModuleList(BoqBlock(config) for _ in range(config.layers))
+        self.fc = Linear(config.layers * config.queries, config.rows)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """(batch, dim, rows, columns) to (batch, row, channel)."""
+        x = self.norm_input(self.proj_c(patches).flatten(2).mT)
+        answers = []
+        for block in self.boqs:
+            x, answer = block(x)
+            answers.append(answer)
+        return widen(self.fc(torch.cat(answers, dim=1).mT)).mT
+
+
+def _cast(module: nn.Module, *inputs: Tensor) -> Tensor:
+    """What a module of torch's own makes of its inputs, its parameters in their type."""
+    cast = {name: parameter.to(inputs[0].dtype) for name, parameter in module.named_parameters()}
+    return functional_call(module, cast, inputs)

@@ -1,0 +1,19 @@
+"""The head of CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023)."""
+
+from torch import Tensor, nn
+
+from parity.reference.gem import GeM, UnitPatches
+from parity.reference.layers import Linear, widen
+
+
+class CosPlace(nn.Sequential):
+    """Unit patches, their generalised mean, and a linear layer; length 1 comes with the join."""
+
+    def __init__(self, dim: int, descriptor: int) -> None:
+        """From `dim` channels to `descriptor` numbers."""
+        super().__init__(UnitPatches(), GeM(), nn.Identity(), Linear(dim, descriptor))
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """(batch, dim, rows, columns) to (batch, descriptor)."""
+        unit, mean, _, fc = self
+        return widen(fc(mean(unit(widen(patches))).to(patches.dtype)))

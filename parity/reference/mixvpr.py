@@ -1,0 +1,42 @@
+"""MixVPR: networks that mix all positions of a feature map (Ali-bey et al., WACV 2023)."""
+
+from torch import Tensor, nn
+
+from parity.reference.layers import LayerNorm, Linear, widen
+
+
+class FeatureMixer(nn.Module):
+    """Layer norm and a network of one hidden layer, over all positions of a channel."""
+
+    def __init__(self, positions: int) -> None:
+        """As wide inside as outside; zero biases."""
+        super().__init__()
+        self.mix = nn.Sequential(
+            LayerNorm(positions),
+            Linear(positions, positions),
+            nn.ReLU(),
+            Linear(positions, positions),
+        )
+        for layer in (self.mix[1], self.mix[3]):
+            nn.init.trunc_normal_(layer.weight, std=0.02)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """(batch, channel, position) to the same."""
+        return maps + self.mix(maps)
+
+
+class MixVpr(nn.Module):
+    """Mixers, then fewer channels, then fewer rows."""
+
+    def __init__(self, dim: int, positions: int, channels: int, rows: int, depth: int) -> None:
+        """For feature maps of `dim` channels and so many positions."""
+        super().__init__()
+        self.mix = nn.Sequential(*(FeatureMixer(positions) for _ in range(depth)))
+        self.channel_proj = Linear(dim, channels)
+        self.row_proj = Linear(positions, rows)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """(batch, dim, rows, columns) to (batch, row, channel)."""
+        maps = self.mix(patches.flatten(2))
+        return widen(self.row_proj(self.channel_proj(maps.mT).mT)).mT

@@ -1,0 +1,39 @@
+"""A model whose parameters are for one image size, asked for another: one line, no work done."""
+
+import dataclasses
+import pathlib
+
+import pytest
+
+from crisalad_jax.checkpoint import save_weights
+from crisalad_jax.config import CrossImageConfig, MixVprConfig
+from tests.conftest import MODEL, random_params
+from tests.test_cli import fails
+
+CONFIG = dataclasses.replace(
+    MODEL,
+    aggregator="mixvpr",
+    mixvpr=MixVprConfig(channels=8, rows=2, depth=1),
+    encoder=CrossImageConfig(layers=0),
+)
+
+
+def test_every_command_that_describes_refuses_it(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    weights, out = tmp_path / "w.safetensors", tmp_path / "out.npy"
+    save_weights(weights, random_params(CONFIG), CONFIG)
+    images = shared / "town" / "images" / "test" / "database"
+    for command in (
+        ("evaluate", "--data", shared / "town", "--out", out),
+        ("extract", "--images", images, "--out", out),
+        ("index", "--images", images, "--out", out),
+        ("export", "--out", out),
+        ("info",),
+    ):
+        fails(
+            capfd,
+            *(*command, "--weights", weights, "--image-size", "56", "42"),
+            words=("image size: found 56 x 42, expected 42 x 56: aggregator mixvpr",),
+        )
+        assert not out.exists()

@@ -1,0 +1,50 @@
+"""CosPlace's head against torch's modules in the published order."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from crisalad_jax.config import CosPlaceConfig, CrossImageConfig, ModelConfig, ViTConfig
+from crisalad_jax.nn.aggregators import aggregate, init_aggregator, join
+from crisalad_jax.nn.aggregators.cosplace import CosPlace
+from crisalad_jax.nn.layers import Linear
+from crisalad_jax.nn.vit import Features
+
+CONFIG = ModelConfig(
+    aggregator="cosplace",
+    backbone=ViTConfig(dim=12, heads=1),
+    cosplace=CosPlaceConfig(dim=7),
+    encoder=CrossImageConfig(layers=0),
+)
+
+
+@pytest.mark.parametrize("p", [3.0, 1.6])
+def test_the_descriptor_is_torchs(p: float) -> None:
+    rng = np.random.default_rng(0)
+    patches = rng.normal(size=(2, 6, 12)).astype(np.float32)
+    weight, bias = rng.normal(size=(7, 12)).astype(np.float32), np.arange(7, dtype=np.float32)
+    unit = F.normalize(torch.tensor(patches).mT, dim=1).clamp(min=1e-6)
+    # A sum of powers over the 6 patches, where the head has their mean.
+    mean = F.lp_pool1d(unit, p, kernel_size=6)[..., 0] / 6 ** (1 / p)
+    expected = F.normalize(F.linear(mean, torch.tensor(weight), torch.tensor(bias)), dim=1)
+
+    params = CosPlace(jnp.asarray(p), Linear(jnp.asarray(weight.T), jnp.asarray(bias)))
+    features = Features(jnp.zeros((2, 12)), jnp.asarray(patches))
+    tokens = aggregate(params, features, (2, 3), CONFIG, key=None)
+    assert tokens.local.shape == (2, 0, 7)
+    found = jax.vmap(lambda one: join(one, CONFIG))(tokens)
+    # Two powers of a few roundings and 12 products, scaled below 1.
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_it_starts_as_published() -> None:
+    params = init_aggregator(jax.random.key(0), CONFIG)
+    assert isinstance(params, CosPlace)
+    assert float(params.p) == 3.0
+    bound = 12**-0.5  # torch's nn.Linear
+    assert 0.7 * bound < jnp.abs(params.fc.weight).max() <= bound
+    assert params.fc.bias is not None
+    assert params.fc.bias.any()  # EigenPlaces and CosPlace alike have a bias

@@ -1,0 +1,106 @@
+"""MixVPR against torch's modules as published, by hand, and bound to its grid."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from crisalad_jax.config import CrossImageConfig, MixVprConfig, ModelConfig, ViTConfig
+from crisalad_jax.nn.aggregators import aggregate, init_aggregator, join
+from crisalad_jax.nn.aggregators.mixvpr import FeatureMixer, MixVpr
+from crisalad_jax.nn.layers import LayerNorm, Linear
+from crisalad_jax.nn.vit import Features
+
+CONFIG = ModelConfig(
+    image_size=(28, 42),
+    aggregator="mixvpr",
+    backbone=ViTConfig(dim=12, heads=1),
+    mixvpr=MixVprConfig(channels=5, rows=3, depth=2),
+    encoder=CrossImageConfig(layers=0),
+)
+PATCHES = np.random.default_rng(0).normal(size=(2, 6, 12)).astype(np.float32)
+
+
+def descriptors(params: MixVpr, patches: np.ndarray) -> jax.Array:
+    features = Features(jnp.zeros((len(patches), 12)), jnp.asarray(patches))
+    tokens = aggregate(params, features, (2, 3), CONFIG, key=None)
+    return jax.vmap(lambda one: join(one, CONFIG))(tokens)
+
+
+def linear_of(layer: nn.Module) -> Linear:
+    assert isinstance(layer, nn.Linear)
+    return Linear(jnp.asarray(layer.weight.detach().T.numpy()), jnp.asarray(layer.bias.detach()))
+
+
+def test_the_descriptor_is_torchs() -> None:
+    torch.manual_seed(0)
+    mixers = [
+        nn.Sequential(nn.LayerNorm(6), nn.Linear(6, 6), nn.ReLU(), nn.Linear(6, 6))
+        for _ in range(2)
+    ]
+    channels, rows = nn.Linear(12, 5), nn.Linear(6, 3)
+    maps = torch.tensor(PATCHES).mT
+    for mixer in mixers:
+        nn.init.uniform_(mixer[0].weight, 0.5, 1.5)
+        nn.init.uniform_(mixer[0].bias, -0.5, 0.5)
+        maps = maps + mixer(maps)
+    maps = channels(maps.permute(0, 2, 1)).permute(0, 2, 1)
+    expected = F.normalize(rows(maps).flatten(1), dim=1).detach()
+
+    params = MixVpr(
+        mix=tuple(
+            FeatureMixer(
+                LayerNorm(jnp.asarray(one[0].weight.detach()), jnp.asarray(one[0].bias.detach())),
+                linear_of(one[1]),
+                linear_of(one[3]),
+            )
+            for one in mixers
+        ),
+        channel_proj=linear_of(channels),
+        row_proj=linear_of(rows),
+    )
+    found = descriptors(params, PATCHES)
+    assert found.shape == (2, CONFIG.descriptor_dim) == (2, 15)
+    # Four products of at most 12 terms after one another, scaled below 1.
+    np.testing.assert_allclose(found, expected, atol=2e-6)
+
+
+def test_mixers_of_no_effect_leave_chosen_numbers_by_channel() -> None:
+    """Channels 2, 4, ... of patches 1, 3 and 5: all rows of a channel, then the next channel."""
+    mixer = FeatureMixer(
+        LayerNorm(jnp.ones(6), jnp.zeros(6)),
+        Linear(jnp.ones((6, 6)), jnp.ones(6)),
+        Linear(jnp.zeros((6, 6)), jnp.zeros(6)),
+    )
+    channels, rows = np.zeros((12, 5), np.float32), np.zeros((6, 3), np.float32)
+    channels[[2, 4, 6, 8, 10], range(5)] = 1
+    rows[[1, 3, 5], range(3)] = 1
+    params = MixVpr(
+        (mixer, mixer),
+        Linear(jnp.asarray(channels), jnp.zeros(5)),
+        Linear(jnp.asarray(rows), jnp.zeros(3)),
+    )
+    chosen = np.array([[PATCHES[0, n, c] for n in (1, 3, 5)] for c in (2, 4, 6, 8, 10)]).ravel()
+    found = descriptors(params, PATCHES)[0]
+    np.testing.assert_allclose(found, chosen / np.linalg.norm(chosen), atol=1e-6)
+
+
+def test_it_starts_as_published() -> None:
+    config = ModelConfig(aggregator="mixvpr", encoder=CrossImageConfig(layers=0))
+    assert config.descriptor_dim == 4096
+    params = jax.eval_shape(lambda key: init_aggregator(key, config), jax.random.key(0))
+    assert len(params.mix) == 4
+    config = dataclasses.replace(CONFIG, image_size=(224, 224))
+    params = init_aggregator(jax.random.key(0), config)
+    assert isinstance(params, MixVpr)
+    for mixer in params.mix:
+        for layer in (mixer.fc1, mixer.fc2):
+            assert layer.weight.shape == (256, 256)
+            # The deviation of 65,536 draws is known to 0.3 %.
+            np.testing.assert_allclose(jnp.std(layer.weight), 0.02, rtol=0.01)
+            assert layer.bias is not None
+            assert not layer.bias.any()

@@ -1,0 +1,159 @@
+"""What holds for every method of docs/methods.md, as a whole model."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.config import (
+    AGGREGATORS,
+    AdapterConfig,
+    AnyLocConfig,
+    BoqConfig,
+    ConvApConfig,
+    CosPlaceConfig,
+    CrossImageConfig,
+    MixVprConfig,
+    ModelConfig,
+    NetVladConfig,
+    TransVprConfig,
+)
+from crisalad_jax.errors import InputError
+from crisalad_jax.model import Crisalad, alone, describe, init_crisalad, relate, tokenise
+from crisalad_jax.nn.aggregators import _METHODS
+from crisalad_jax.nn.cross_image import init_cross_image
+from tests.conftest import MODEL, random_params
+
+SMALL = dataclasses.replace(
+    MODEL,
+    backbone=dataclasses.replace(MODEL.backbone, adapter=AdapterConfig(kind="none")),
+    netvlad=NetVladConfig(clusters=4),
+    conv_ap=ConvApConfig(channels=16),
+    cosplace=CosPlaceConfig(dim=16),
+    mixvpr=MixVprConfig(channels=16, rows=2, depth=2),
+    anyloc=AnyLocConfig(clusters=4, layer=-1),
+    boq=BoqConfig(channels=16, queries=3, rows=2),
+    transvpr=TransVprConfig(levels=2, dim=16),
+    encoder=CrossImageConfig(layers=0),
+)
+METHODS = [
+    # tests/test_model.py and others have enough of these.
+    pytest.param(name, marks=pytest.mark.slow)
+    if name in {"salad", "gem-pyramid", "class-token"}
+    else name
+    for name in _METHODS
+]
+RELATED = CrossImageConfig(layers=1, heads=2, feedforward=16, dropout=0.0)
+# Float32 sums of one program, in another place of the batch.
+TOLERANCE = 2e-6
+
+
+def pictures(*seeds: int) -> np.ndarray:
+    draws = [np.random.default_rng(seed).integers(0, 256, (42, 56, 3)) for seed in seeds]
+    return np.stack(draws).astype(np.uint8)
+
+
+def model(aggregator: Any) -> tuple[Crisalad, ModelConfig]:
+    config = dataclasses.replace(SMALL, aggregator=aggregator)
+    return random_params(config), config
+
+
+@pytest.mark.parametrize("aggregator", METHODS)
+def test_descriptors_of_every_method(aggregator: str) -> None:
+    """Unit vectors that owe nothing to the batch; near the same in bfloat16."""
+    params, config = model(aggregator)
+    described = describe(params, pictures(0, 1, 2), config)
+    assert described.shape == (3, config.descriptor_dim)
+    assert described.dtype == jnp.float32
+    np.testing.assert_allclose(jnp.linalg.norm(described, axis=1), 1, atol=1e-6)
+    moved = describe(params, pictures(3, 4, 0), config)
+    np.testing.assert_allclose(moved[2], described[0], atol=TOLERANCE)
+    assert np.abs(described[1] - described[0]).max() > 100 * TOLERANCE
+
+    half = describe(
+        params, pictures(0, 1, 2), dataclasses.replace(config, compute_dtype="bfloat16")
+    )
+    assert half.dtype == jnp.float32
+    np.testing.assert_allclose(jnp.linalg.norm(half, axis=1), 1, atol=1e-6)
+    # 8 bits of mantissa through two blocks and a head: each rounding turns a vector by 2^-9.
+    assert (half * described).sum(axis=1).min() > 0.999
+    assert np.abs(half - described).max() > 1e-5  # it did compute in bfloat16
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("aggregator", _METHODS)
+def test_a_batch_is_its_images_one_by_one(aggregator: str) -> None:
+    params, config = model(aggregator)
+    together = describe(params, pictures(0, 1), config)
+    one_by_one = [describe(params, pictures(seed), config)[0] for seed in (0, 1)]
+    np.testing.assert_allclose(together, np.stack(one_by_one), atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("aggregator", METHODS)
+def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
+    """Every method's tokens fit it; under `alone` it leaves them to themselves."""
+    params, config = model(aggregator)
+    config = dataclasses.replace(config, encoder=RELATED)
+    generator = np.random.default_rng(0)
+    shape = config.shape
+    tokens = jax.tree.map(
+        lambda leaf: jnp.asarray(generator.normal(size=(3, *leaf.shape[1:])), jnp.float32),
+        jax.eval_shape(functools.partial(tokenise, config=config), params, pictures(0)),
+    )._replace(transport=None)
+    assert tokens.global_token.shape == (3, shape.global_dim)
+    assert tokens.local.shape == (3, shape.tokens, shape.token_dim)
+    encoder = init_cross_image(jax.random.key(0), shape.token_dim, RELATED)
+    params = dataclasses.replace(params, encoder=encoder)
+    other = jax.tree.map(lambda leaf: leaf.at[2].add(1.0), tokens)
+
+    among, changed = (relate(params, each, config) for each in (tokens, other))
+    assert np.abs(among[0] - changed[0]).max() > 100 * TOLERANCE
+    lonely, same = (relate(params, each, config, mask=alone(3)) for each in (tokens, other))
+    np.testing.assert_array_equal(lonely[0], same[0])
+    np.testing.assert_allclose(jnp.linalg.norm(among, axis=1), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("aggregator", "part", "words"),
+    [
+        ("conv-ap", ConvApConfig(channels=100), "ConvApConfig.channels: found 100"),
+        ("cosplace", CosPlaceConfig(dim=500), "CosPlaceConfig.dim: found 500"),
+        ("mixvpr", MixVprConfig(channels=1000), "MixVprConfig.channels: found 1000"),
+        ("boq", BoqConfig(channels=72), "BoqConfig.channels: found 72"),
+    ],
+)
+def test_tokens_that_do_not_fit_the_encoder(aggregator: Any, part: Any, words: str) -> None:
+    field = {AGGREGATORS[aggregator]: part}
+    with pytest.raises(InputError, match=f"^{words}, expected a multiple of .* 16 heads$"):
+        ModelConfig(aggregator=aggregator, **field)
+    bare = ModelConfig(aggregator=aggregator, **field, encoder=CrossImageConfig(layers=0))
+    assert bare.part == part
+
+
+def test_a_global_token_alone_cannot_stay_out_of_the_encoder() -> None:
+    for aggregator in ("gem", "cosplace", "class-token"):
+        with pytest.raises(InputError, match=f"False for aggregator {aggregator}, which has no"):
+            ModelConfig(aggregator=aggregator, encoder=CrossImageConfig(global_token=False))
+
+
+def test_mixvpr_describes_images_of_its_own_size_alone() -> None:
+    config = dataclasses.replace(SMALL, aggregator="mixvpr")
+    params = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
+    # As many patches, and others.
+    for size in ((56, 42), (84, 84)):
+        words = (
+            f"^image size: found {size[0]} x {size[1]}, expected 42 x 56: aggregator mixvpr has "
+            "parameters for every patch, and was made for images of this size alone"
+        )
+        with pytest.raises(InputError, match=words):
+            config.check_image_size(size)
+        images = jax.ShapeDtypeStruct((2, *size, 3), jnp.uint8)
+        with pytest.raises(InputError, match=words):
+            jax.eval_shape(lambda p, x: describe(p, x, config), params, images)
+    for found in (43, 57), (42, 57):
+        with pytest.raises(InputError, match="multiples of 14"):
+            dataclasses.replace(config, image_size=found)
