@@ -20,6 +20,8 @@ NAMES = [what.name for what in (*CASES, *RUNS)]
 SLOW = {
     "Sinkhorn: 100 iterations, epsilon 1.0",
     "DINO-SALAD",  # a part of CriSALAD
+    "NetVLAD's descriptor",  # the aggregators have rows of their own
+    "AnyLoc's descriptor",
     "training CriSALAD's adapters and head",  # quick in float64
     "training CriSALAD's last block and head",
     "training CricaVPR's adapters and head",
