@@ -26,6 +26,8 @@ from crisalad_jax.pytree import named_leaves
 HEAD, ADAPTERS_AND_HEAD, ALL = "head", "adapters+head", "all"
 STATISTICS = (".running_mean", ".running_var")
 """Batch-norm statistics, which never train: they are measured, not learnt."""
+WORDS = ("aggregator.words", "aggregator.backbone")
+"""AnyLoc's vocabulary, which never trains."""
 _LAST_BLOCKS = re.compile(r"last-(\d+)-blocks\+head")
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
 """Weights of linear layers, which `layers.linear` casts to the type of what they multiply."""
@@ -74,7 +76,7 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     and the head). Where some of the blocks train, their stack is cut in two, and `merge_params`
     makes it one again: no gradient passes the frozen blocks before the last N, nor all of a first
     block whose adapter alone trains.
-    Batch-norm statistics stay frozen in every case.
+    Batch-norm statistics stay frozen in every case, and so does AnyLoc's vocabulary.
 
     Raises:
         InputError: an unknown name, or more blocks than there are.
@@ -101,7 +103,8 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
     names = iter(named_leaves(params))
 
     def learns(name: str) -> bool:
-        return name.startswith(prefixes) and not name.endswith(STATISTICS)
+        constant = name.endswith(STATISTICS) or name in WORDS
+        return name.startswith(prefixes) and not constant
 
     chosen = jax.tree.map(lambda _: learns(next(names)), params)
     return eqx.partition(params, chosen)

@@ -54,8 +54,9 @@ def assert_close(found: np.ndarray, expected: np.ndarray) -> None:
     assert error < OUTPUT_BOUND  # that of all stored outputs: roundings along two blocks
 
 
-@pytest.mark.parametrize("number", [0, 1])
-@pytest.mark.parametrize("kind", [Kind(0, gated=False), Kind(4, gated=True)], ids=str)
+@pytest.mark.parametrize(
+    ("kind", "number"), [(Kind(0, gated=False), 1), (Kind(4, gated=True), 0)], ids=str
+)
 def test_facets_are_transformers(kind: Kind, number: int, tmp_path: pathlib.Path) -> None:
     model = hugging_face(kind)
     checkpoint = read_checkpoint(saved(model, tmp_path))

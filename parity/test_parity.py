@@ -21,6 +21,8 @@ SLOW = {
     "Sinkhorn: 100 iterations, epsilon 1.0",
     "DINO-SALAD",  # a part of CriSALAD
     "BoQ",  # tests/nn compares a smaller one
+    "NetVLAD's descriptor",  # the aggregators have rows of their own
+    "AnyLoc's descriptor",
     "training CriSALAD's adapters and head",  # quick in float64
     "training CriSALAD's last block and head",
     "training CricaVPR's adapters and head",

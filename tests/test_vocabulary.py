@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from crisalad_jax.model import Crisalad, unit_features
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.aggregators.netvlad import NetVlad
 from crisalad_jax.serial import to_plain
+from crisalad_jax.training import split_params
 from crisalad_jax.vocabulary import needs_vocabulary, with_vocabulary
 from tests.conftest import BATCH, MODEL, RECIPE, assert_equal, random_params
 from tests.test_cli import extract, fails, succeeds
@@ -38,7 +40,7 @@ CONFIGS = pytest.mark.parametrize("config", [ANYLOC, NETVLAD], ids=["anyloc", "n
 
 @pytest.fixture(scope="module")
 def fresh() -> Crisalad:
-    """AnyLoc without a vocabulary. Drawn by numpy: to compile `init_crisalad` takes longer."""
+    """AnyLoc without a vocabulary."""
     params = random_params(ANYLOC)
     return dataclasses.replace(params, aggregator=AnyLoc(jnp.ones((4, 32)), jnp.zeros(())))
 
@@ -203,6 +205,15 @@ def test_vocabulary_of_a_preset_and_a_backbone(capfd, shared, tmp_path) -> None:
     assert_equal(found.backbone, params.backbone)
 
 
+@pytest.fixture
+def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random parameters by numpy, for the commands too: to compile `init_crisalad` takes longer."""
+    for command in ("train", "vocabulary"):
+        name = f"crisalad_jax.cli.{command}.init_crisalad"
+        monkeypatch.setattr(name, lambda _, config: random_params(config))
+
+
+@pytest.mark.usefixtures("quick_start")
 def test_bad_input_of_vocabulary_is_one_line(capfd, shared, tmp_path) -> None:
     out, weights = tmp_path / "w.safetensors", shared / "weights.safetensors"
     start = ("vocabulary", "--images", shared / "town", "--out")
@@ -225,6 +236,7 @@ def test_bad_input_of_vocabulary_is_one_line(capfd, shared, tmp_path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.usefixtures("quick_start")
 def test_training_netvlad_starts_from_the_training_images(
     capfd, shared, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -263,7 +275,9 @@ def test_training_netvlad_starts_from_the_training_images(
     fails(capfd, *begin, words=("full: found files but no run",))
 
 
-def test_anyloc_does_not_train(capfd, shared, tmp_path) -> None:
+def test_anyloc_does_not_train(capfd, fresh, shared, tmp_path) -> None:
+    trainable, _ = split_params(fresh, "head")
+    assert not jax.tree.leaves(trainable)
     config = dataclasses.replace(RECIPE, model=ANYLOC)
     words = "aggregator: found anyloc, with which nothing trains, expected another"
     with pytest.raises(InputError, match=words):

@@ -83,7 +83,7 @@ def _unboxed(box: str) -> str:
 
 def _usage() -> str:
     lines = ["usage: crisalad COMMAND [--help] ...", "", "commands:"]
-    lines += [f"  {name:<10}{kind.__doc__}" for name, (kind, _) in _COMMANDS.items()]
+    lines += [f"  {name:<12}{kind.__doc__}" for name, (kind, _) in _COMMANDS.items()]
     return "\n".join(lines)
 
 

@@ -19,10 +19,7 @@ from crisalad_jax.vocabulary import IMAGES, needs_vocabulary, with_vocabulary
 
 @dataclasses.dataclass(frozen=True)
 class Vocabulary:
-    """Build the vocabulary of AnyLoc or NetVLAD from a folder of images: a whole model.
-
-    AnyLoc is then complete. NetVLAD can train from it, which `train` also does by itself.
-    """
+    """Build AnyLoc's vocabulary from a folder of images: a whole model; or NetVLAD's, to train."""
 
     images: pathlib.Path
     """Folder, searched with its subfolders; not of images that are evaluated on."""

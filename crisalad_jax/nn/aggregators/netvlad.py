@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.errors import InputError
-from crisalad_jax.nn.layers import Keys, Linear, init_linear, l2_normalise, linear, widen
+from crisalad_jax.nn.layers import Keys, Linear, init_linear, l2_normalise, widen
 from crisalad_jax.nn.tokens import Tokens, local_alone
 from crisalad_jax.nn.vit import Features
 from crisalad_jax.pytree import params
@@ -85,10 +85,12 @@ def netvlad(
 ) -> Float[Array, "*batch cluster dim"]:
     """The paper's Eq. 4 on unit patches, then intra-normalisation (Arandjelovic, Zisserman 2013).
 
-    All in float32 at least: what rounds scores is multiplied by alpha.
+    All in float32 at least, and as exact as the hardware is: what rounds scores is multiplied by
+    alpha.
     """
     patches = l2_normalise(widen(patches))
-    shares = jax.nn.softmax(linear(params.conv, patches), axis=-1)
+    scores = jnp.matmul(patches, params.conv.weight, precision="highest")
+    shares = jax.nn.softmax(scores, axis=-1)
     return l2_normalise(residual_sums(shares, patches, params.centroids))
 
 
@@ -101,5 +103,5 @@ def residual_sums(
 
     That is the sum of the patches, less the centroid times the sum of the shares.
     """
-    sums = jnp.einsum("...pk,...pd->...kd", shares, patches)
+    sums = jnp.einsum("...pk,...pd->...kd", shares, patches, precision="highest")
     return sums - shares.sum(axis=-2)[..., None] * centroids

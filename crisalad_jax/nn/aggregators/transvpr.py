@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config import ModelConfig
 from crisalad_jax.nn.layers import Keys, Linear, init_linear, l2_normalise, linear, widen
-from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.tokens import Tokens, global_alone
 from crisalad_jax.nn.vit import Features
 from crisalad_jax.pytree import params
 
@@ -49,7 +49,7 @@ def apply(
     pooled = jnp.einsum("...nl,...nld->...ld", weights, by_level)
     pooled = l2_normalise(pooled.reshape(*pooled.shape[:-2], -1))
     descriptor = l2_normalise(linear(params.reduction, pooled))
-    return Tokens(descriptor, descriptor[..., None, :][..., :0, :])
+    return global_alone(descriptor)
 
 
 def attentions(
