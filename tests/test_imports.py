@@ -28,6 +28,7 @@ LAYERS = (
     ("indexing",),
     ("fit",),
     ("demo",),
+    ("comparison",),
     ("cli",),
     ("__main__",),
 )
