@@ -52,9 +52,10 @@ class Ablation(NamedTuple):
         # What is frozen stays frozen: without adapters the head alone trains.
         trains = "head" if self.adapter == "none" else config.trains
         config = dataclasses.replace(config, model=model, trains=trains)
+        rate = self.learning_rate
         if from_nothing:
             config = from_scratch(config)
-        rate = config.optimiser.learning_rate * self.learning_rate / OptimiserConfig.learning_rate
+            rate *= config.optimiser.learning_rate / OptimiserConfig.learning_rate
         optimiser = dataclasses.replace(
             config.optimiser, learning_rate=rate, schedule=self.schedule
         )

@@ -246,11 +246,12 @@ def _fitted(
         training = dataclasses.replace(training, epochs=config.epochs)
     training = dataclasses.replace(training, patience=None)
     if config.backbone is not None:
+        training = dataclasses.replace(
+            training, places_per_batch=min(training.places_per_batch, places), micro_batch=None
+        )
         if training.images_per_place <= views:
             return training
-        return dataclasses.replace(
-            training, images_per_place=views, min_images=views, micro_batch=None
-        )
+        return dataclasses.replace(training, images_per_place=views, min_images=views)
     size = min(training.places_per_batch * training.images_per_place // views, places)
     epochs = config.epochs or EPOCHS
     optimiser = training.optimiser

@@ -216,17 +216,12 @@ def _notes(
         + (" Ranking anew comes on top." if any(v.rerank for v in prepared.variants) else ""),
     ]
     if any(v.trains for v in prepared.variants):
-        one = next(v for v in prepared.variants if v.trains).training
         notes.append(
             "Training time: steps x the median time of a step"
             + ("" if measured["absolute"] else f", over {title}'s")
             + ", without compiling; runs are not interleaved."
         )
-        start = "a pretrained backbone" if config.backbone else "nothing, by the recipe scratch"
-        notes.append(
-            f"Trained from {start}: {one.epochs} epochs of {config.train}, batches of "
-            f"{one.places_per_batch} places x {one.images_per_place} images."
-        )
+        notes.append(_training_note(prepared))
     resumed = sorted({row.labels[0] for row in rows if row.sittings > 1})
     if resumed:
         notes.append(
@@ -246,6 +241,19 @@ def _notes(
             "three epochs."
         )
     return notes
+
+
+def _training_note(prepared: Prepared) -> str:
+    """From what, on what, and how long; the last two where that is the same for all."""
+    config = prepared.config
+    trained = [v.training for v in prepared.variants if v.trains]
+    start = "a given backbone" if config.backbone else "nothing, by the recipe scratch"
+    words = f"Trained from {start} on {pathlib.Path(config.train or '').name}: "
+    found = {(t.epochs, t.places_per_batch, t.images_per_place) for t in trained}
+    if len(found) > 1:
+        return words + "epochs and batches of each method's recipe."
+    ((epochs, places, images),) = found
+    return words + f"epochs: {epochs}, batches of {places} places x {images} images."
 
 
 def _method_notes(prepared: Prepared) -> list[str]:
