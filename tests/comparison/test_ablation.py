@@ -57,7 +57,8 @@ def test_from_nothing_rates_are_in_the_papers_proportion():
     assert {row.trains for row in rows.values()} == {"all"}
 
 
-def test_ablate(flags, shared, capfd, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("quick")
+def test_ablate(flags, capfd, tmp_path, monkeypatch):
     """The row of the whole model is trained as `compare` trains CriSALAD."""
     timed = [cost._replace(time=(1.0, 1.0, 1.0)) for cost in adapter_costs(measure=False)]
     monkeypatch.setattr(ablation, "adapter_costs", lambda: timed)

@@ -11,11 +11,11 @@ from tests.test_cli import fails
 
 
 def test_batches_fit_the_training_set(config):
-    """Eight places of three images: all of them in a batch, and a fifth of two steps to warm up."""
+    """Eight places of three images: all in one batch, a fifth of three steps to warm up."""
     (variant,) = prepare(config).variants
     training = variant.training
     assert (training.places_per_batch, training.images_per_place) == (8, 3)
-    assert (training.min_images, training.epochs, training.patience) == (3, 2, None)
+    assert (training.min_images, training.epochs, training.patience) == (3, 3, None)
     assert training.optimiser.warmup_steps == 0
     assert (training.trains, training.augment) == ("all", "light")
     assert training.optimiser.learning_rate == recipe("tiny").optimiser.learning_rate
@@ -37,7 +37,7 @@ def test_from_a_backbone_recipes_are_as_they_are(settings, shared):
     expected = recipe("tiny", "crisalad")
     assert variant.training == dataclasses.replace(
         expected,
-        epochs=2,
+        epochs=3,
         patience=None,
         places_per_batch=8,
         images_per_place=3,

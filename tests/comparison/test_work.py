@@ -16,8 +16,10 @@ from crisalad_jax.cli import main
 from crisalad_jax.comparison import METHODS, ComparedMethod, ComparisonConfig, work
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.model import init_crisalad
-from tests.conftest import BATCH, assert_equal
+from tests.conftest import BATCH, STEPS, assert_equal
 from tests.test_cli import fails, succeeds
+
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 def run(config: ComparisonConfig, out) -> comparison.Summary:
@@ -143,7 +145,7 @@ def test_a_run_that_was_cut_short_goes_on(finished, flags, capfd, tmp_path):
     out = succeeds(capfd, *flags, "--out", finished)
     assert "Resumed, so that its steps' times are of several calls: CriSALAD." in out
     assert (folder / "run" / "last.safetensors").read_bytes() == weights
-    assert json.loads((folder / "training.json").read_text())["steps"] == 2
+    assert json.loads((folder / "training.json").read_text())["steps"] == STEPS
 
 
 def test_a_file_of_results_that_is_cut_short(finished, flags, capfd):
