@@ -208,7 +208,7 @@ def _notes(
     notes = [
         "Recalls in percent of all queries: the mean over the seeds ± their standard deviation, "
         "and 95 % by bootstrap over the queries, as if they were independent. "
-        f"{config.seeds} seeds of everything that is trained; weights after the last step, nothing "
+        f"Seeds of all but models from files: {config.seeds}. Weights after the last step, nothing "
         "selected on a test set.",
         f"Images/s: describing batches of {measured['batch_size']} alone, all models in turns, on "
         f"{measured['device']}"
