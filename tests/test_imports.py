@@ -29,6 +29,7 @@ LAYERS = (
     ("indexing",),
     ("fit",),
     ("demo",),
+    ("comparison",),
     ("cli",),
     ("__main__",),
 )

@@ -14,6 +14,8 @@ import tyro
 
 from crisalad_jax import platform
 from crisalad_jax.cli import (
+    ablate,
+    compare,
     convert,
     demo,
     evaluate,
@@ -36,6 +38,8 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "train": (train.Train, train.run),
     "convert": (convert.Convert, convert.run),
     "evaluate": (evaluate.Evaluate, evaluate.run),
+    "compare": (compare.Compare, compare.run),
+    "ablate": (ablate.Ablate, ablate.run),
     "extract": (extract.Extract, extract.run),
     "index": (index.Index, index.run),
     "query": (query.Query, query.run),

@@ -68,6 +68,7 @@ from crisalad_jax.config.model import ModelConfig as ModelConfig
 from crisalad_jax.config.model import check_image_size as check_image_size
 from crisalad_jax.config.recipes import PRESETS as PRESETS
 from crisalad_jax.config.recipes import RECIPES as RECIPES
+from crisalad_jax.config.recipes import from_scratch as from_scratch
 from crisalad_jax.config.recipes import recipe as recipe
 from crisalad_jax.config.training import AugmentConfig as AugmentConfig
 from crisalad_jax.config.training import LightAugmentConfig as LightAugmentConfig

@@ -187,10 +187,22 @@ def _comparable(aggregator: Any) -> Callable[[ModelConfig], TrainConfig]:
 
 def _scratch(model: ModelConfig) -> TrainConfig:
     """From random weights, all of the model: ours, for `tiny`."""
-    return TrainConfig(
-        model=model,
-        # base 0.5: from a cold start base 0 drives all similarities to 0 together.
-        loss=LossConfig(multi_similarity=MultiSimilarityConfig(base=0.5)),
+    return from_scratch(TrainConfig(model=model))
+
+
+def from_scratch(config: TrainConfig) -> TrainConfig:
+    """Another recipe's model and kind of loss, trained from random weights as `scratch` trains.
+
+    What is kept of the recipe is what makes its method: the parts of the model, and what is
+    learnt. The optimiser, the losses' constants, the augmentation and the batches are ours, in
+    float32, and all of the model trains.
+    """
+    # base 0.5: from a cold start base 0 drives all similarities to 0 together.
+    loss = dataclasses.replace(config.loss, multi_similarity=MultiSimilarityConfig(base=0.5))
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, compute_dtype="float32"),
+        loss=loss,
         optimiser=OptimiserConfig(
             learning_rate=1e-3,
             final_fraction=0.02,
@@ -202,6 +214,7 @@ def _scratch(model: ModelConfig) -> TrainConfig:
         trains="all",
         augment="light",
         light_augment=LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6),
+        places_per_batch=TrainConfig.places_per_batch,
         images_per_place=2,
         min_images=2,
         batch_order="shuffled",

@@ -85,8 +85,8 @@ def write_report(
     return path
 
 
-def render(context: Mapping[str, Any]) -> str:
-    """The page's text. Everything in the context is escaped: names of files are anyone's."""
+def render(context: Mapping[str, Any], template: str = "page.html") -> str:
+    """The text of a page. Everything in the context is escaped: names of files are anyone's."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -97,7 +97,7 @@ def render(context: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
     )
     environment.filters["percent"] = percent
-    return environment.get_template("page.html").render(context)
+    return environment.get_template(template).render(context)
 
 
 def percent(value: float) -> str:

@@ -1,0 +1,287 @@
+"""The work of a comparison: runs, evaluations and a race, each done once and kept in its folder.
+
+OUT/config.json                       what is compared
+OUT/NAME/seed-S/run/                  a training run, which goes on by itself
+OUT/NAME/seed-S/start.safetensors     what it starts from, where a vocabulary was built
+OUT/NAME/seed-S/training.json         what training took
+OUT/NAME/seed-S/test-N.json           an evaluation, on the N-th set
+OUT/speed.json                        the race of all models
+"""
+
+import dataclasses
+import json
+import pathlib
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from crisalad_jax.checkpoint import load_weights, save_weights
+from crisalad_jax.comparison.plan import ComparisonConfig, Prepared, Variant
+from crisalad_jax.comparison.speed import Race, describing, is_absolute, machine, race
+from crisalad_jax.config import ModelConfig, TrainConfig
+from crisalad_jax.convert import read_backbone
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.errors import InputError
+from crisalad_jax.evaluation import evaluate
+from crisalad_jax.files import check_target, write_json
+from crisalad_jax.fit import fit
+from crisalad_jax.metrics import read_metrics
+from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.results import GroupingResult
+from crisalad_jax.scores import right_retrievals
+from crisalad_jax.serial import differences, read_config, to_plain
+
+_ROUNDS = 5
+
+Say = Callable[[str], None]
+
+
+def claim(out: pathlib.Path, config: ComparisonConfig) -> None:
+    """Make `out` the folder of this comparison, or check that it is.
+
+    Raises:
+        InputError: it holds another comparison, or files but none.
+    """
+    path = out / "config.json"
+    check_target(path)
+    if path.exists():
+        found = read_config(ComparisonConfig, path)
+        wrong = differences(config, found)
+        if wrong:
+            raise InputError(
+                f"{out}: holds another comparison: {'; '.join(wrong)}; give the same to go on with "
+                "it, or another folder"
+            )
+    elif out.exists() and any(not each.name.startswith(".") for each in out.iterdir()):
+        raise InputError(
+            f"{out}: found files but no comparison, expected one or a new or empty folder"
+        )
+    else:
+        write_json(path, to_plain(config))
+
+
+def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = False) -> None:
+    """Do what is left of a comparison, and leave its results in `out`.
+
+    What was done is not done again, in a call that was killed or in an earlier one.
+
+    Args:
+        prepared: what to do.
+        out: the folder, of this comparison or new.
+        say: is given a line before each run: which of how many, and how long the rest may take.
+        quiet: no progress bars.
+
+    Raises:
+        InputError: what `claim`, `fit` and `evaluate` raise; a result that is not whole, or of
+            another set than is given now.
+        Stopped: what `fit` raises; the same call goes on.
+    """
+    claim(out, prepared.config)
+    left = [unit for unit in prepared.units if not _is_done(prepared, out, *unit)]
+    total, started = len(prepared.units), time.monotonic()
+    for number, (variant, seed) in enumerate(left):
+        line = (
+            f"{variant.name}, seed {seed}: method {_place(prepared, variant)} of "
+            f"{len(prepared.variants)}, {total - len(left) + number} of {total} runs done"
+        )
+        if number:
+            rest = (time.monotonic() - started) / number * (len(left) - number)
+            line += f", about {_words(rest)} left"
+        say(line)
+        _one(prepared, out, variant, seed, quiet)
+    if not (out / "speed.json").exists():
+        say("images described a second, all models in turns")
+        write_json(out / "speed.json", _race(prepared, out))
+
+
+def _place(prepared: Prepared, variant: Variant) -> int:
+    return prepared.variants.index(variant) + 1
+
+
+def _words(seconds: float) -> str:
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
+
+
+def folder_of(out: pathlib.Path, name: str, seed: int) -> pathlib.Path:
+    """Where a run's or a variant's files are."""
+    return out / name / f"seed-{seed}"
+
+
+def result_path(out: pathlib.Path, variant: Variant, seed: int, number: int) -> pathlib.Path:
+    """The file of a variant's evaluation on the set of this number, from 0."""
+    return folder_of(out, variant.name, seed) / f"test-{number}.json"
+
+
+def _is_done(prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int) -> bool:
+    results = [result_path(out, variant, seed, n) for n in range(len(prepared.benchmarks))]
+    trained = folder_of(out, variant.run, seed) / "training.json"
+    return all(path.exists() for path in results) and (not variant.trains or trained.exists())
+
+
+def _one(prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int, quiet: bool) -> None:
+    """A run and its evaluations, as far as they are missing."""
+    params = _model(prepared, out, variant, seed, quiet)
+    for number, benchmark in enumerate(prepared.benchmarks):
+        path = result_path(out, variant, seed, number)
+        if not path.exists():
+            write_json(path, _evaluated(prepared.config, variant, params, benchmark, seed))
+
+
+def _evaluated(
+    config: ComparisonConfig, variant: Variant, params: Crisalad, benchmark: Benchmark, seed: int
+) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    if variant.rerank is not None:
+        from crisalad_jax.reranking import parse_reranking  # pyright: ignore
+
+        options["rerank"] = parse_reranking(variant.rerank)
+    started = time.monotonic()
+    results = evaluate(
+        params,
+        variant.model,
+        benchmark,
+        groupings=config.grouping.split(","),
+        batch_size=config.batch_size,
+        seed=seed,
+        seeds=1,
+        quiet=True,
+        **options,
+    )
+    return {
+        "benchmark": benchmark.name,
+        "queries": len(benchmark.queries),
+        "database": len(benchmark.database),
+        "seconds": round(time.monotonic() - started, 2),
+        "groupings": {result.grouping: _ranks(result, benchmark) for result in results},
+    }
+
+
+def _ranks(result: GroupingResult, benchmark: Benchmark) -> list[int]:
+    """The rank of each query's first right retrieval, from 1; 0 where none is right."""
+    right = right_retrievals(result.neighbours.indices, benchmark.ground_truth())
+    return np.where(right.any(axis=1), right.argmax(axis=1) + 1, 0).tolist()
+
+
+def _model(
+    prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int, quiet: bool
+) -> Crisalad:
+    """A variant's parameters: from its file, as it starts, or trained."""
+    if variant.weights is not None:
+        return load_weights(variant.weights)[0]
+    folder = folder_of(out, variant.run, seed)
+    trained, last = folder / "training.json", folder / "run" / "last.safetensors"
+    if variant.learns and trained.exists():
+        return load_weights(last, expected=variant.model)[0]
+    start = _start(prepared, folder, variant, seed, quiet)
+    if not variant.learns:
+        return start
+    training = dataclasses.replace(variant.training, seed=seed)
+    assert prepared.places is not None
+    _count_sitting(folder)
+    result = fit(training, prepared.places, folder / "run", initial=start, quiet=quiet)
+    write_json(trained, _training_record(folder, training, result.steps))
+    return result.params
+
+
+def _start(
+    prepared: Prepared, folder: pathlib.Path, variant: Variant, seed: int, quiet: bool
+) -> Crisalad:
+    """What a run starts from, always the same for its seed."""
+    path = folder / "start.safetensors"
+    if path.exists():
+        return load_weights(path, expected=variant.model)[0]
+    # The same half of the seed's key as `fit` takes where nothing else is given.
+    key, _ = jax.random.split(jax.random.key(seed))
+    params = init_crisalad(key, variant.model)
+    if prepared.config.backbone is not None:
+        backbone = read_backbone(prepared.config.backbone, variant.model.backbone, params.backbone)
+        params = dataclasses.replace(params, backbone=backbone)
+    if needs_vocabulary(variant.model):
+        params = _with_vocabulary(prepared, params, variant.model, seed, quiet)
+        save_weights(path, params, variant.model)
+    return params
+
+
+def needs_vocabulary(model: ModelConfig) -> bool:
+    """Whether a model's clusters are those of features, found before anything else."""
+    from crisalad_jax.vocabulary import needs_vocabulary  # pyright: ignore
+
+    return needs_vocabulary(model)
+
+
+def _with_vocabulary(
+    prepared: Prepared, params: Crisalad, model: ModelConfig, seed: int, quiet: bool
+) -> Crisalad:
+    from crisalad_jax.vocabulary import with_vocabulary  # pyright: ignore
+
+    assert prepared.places is not None
+    places = prepared.places
+    paths = [places.path(image) for image in range(len(places.files))]
+    return with_vocabulary(params, model, paths, seed=seed, quiet=quiet)
+
+
+def _count_sitting(folder: pathlib.Path) -> None:
+    """Note that training begins or goes on."""
+    path = folder / "sittings.json"
+    write_json(path, read_json(path) + 1 if path.exists() else 1)
+
+
+def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) -> dict[str, Any]:
+    """What training took, by the times of its steps: what was lost and done again counts once."""
+    images = training.places_per_batch * training.images_per_place
+    records = read_metrics(folder / "run" / "metrics.jsonl")
+    seconds = [images / r["images_per_second"] for r in records if "images_per_second" in r]
+    return {
+        "steps": steps,
+        "images": images,
+        "step_seconds": statistics.median(seconds),
+        "seconds_of_steps": sum(seconds),
+        "sittings": read_json(folder / "sittings.json"),
+        "device": machine(),
+    }
+
+
+def _race(prepared: Prepared, out: pathlib.Path) -> dict[str, Any]:
+    """Seconds a batch of every model, in turns; models that several variants share run once."""
+    size = prepared.config.batch_size
+    models = {variant.run: variant for variant in prepared.variants}
+    calls = {
+        name: describing(_any_params(prepared, out, variant), variant.model, size)
+        for name, variant in models.items()
+    }
+    return {
+        "device": machine(),
+        "absolute": is_absolute(),
+        "batch_size": size,
+        "rounds": race(calls, _ROUNDS).rounds,
+    }
+
+
+def _any_params(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Crisalad:
+    return _model(prepared, out, variant, variant.seeds(1)[0], quiet=True)
+
+
+def read_race(out: pathlib.Path) -> tuple[Race, dict[str, Any]]:
+    """The race that `carry_out` left, and all else that it noted of it."""
+    found = read_json(out / "speed.json")
+    return Race(found["rounds"]), found
+
+
+def read_json(path: pathlib.Path) -> Any:
+    """What a file of results holds.
+
+    Raises:
+        InputError: it cannot be read, or is no JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot read this result: {error}; delete it, and the same command makes it "
+            "anew"
+        ) from error
