@@ -125,6 +125,13 @@ def test_table_3_in_markdown():
     )
 
 
+def test_what_the_paper_prints_and_no_count_gives():
+    cost = AdapterCost("mlp", 590_976, 590_976, 1_180_800, 151_584_768, None)
+    assert tables.adapter_cells(cost) == [
+        *("mlp", "590,976 (printed: 2,356,080)", "590,976", "1.181", "2.362", "151.6", "-")
+    ]
+
+
 def test_a_table_in_a_page(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- city -->\nold\n<!-- end of city -->\nafter\n")
