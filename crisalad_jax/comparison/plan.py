@@ -17,6 +17,7 @@ from crisalad_jax.convert import read_backbone
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.errors import InputError
+from crisalad_jax.fit import groups_of
 from crisalad_jax.groupings import check_grouping, parse_groupings
 from crisalad_jax.model import init_crisalad
 from crisalad_jax.training import split_params
@@ -144,14 +145,15 @@ def prepare(config: ComparisonConfig) -> Prepared:
         training = draft.training
         if places is not None and draft.run not in weights:
             training = _fitted(training, config, len(places.place_id), views)
-            epoch_batches(
-                places,
-                places_per_batch=training.places_per_batch,
-                images_per_place=training.images_per_place,
-                order=training.batch_order,
-                seed=0,
-                epoch=0,
-            )
+            for group in groups_of(training, places):
+                epoch_batches(
+                    group,
+                    places_per_batch=training.places_per_batch,
+                    images_per_place=training.images_per_place,
+                    order=training.batch_order,
+                    seed=0,
+                    epoch=0,
+                )
         file = weights.get(draft.run)
         model = training.model if file is None else _checked(draft, file, config)
         variants.append(dataclasses.replace(draft, training=training, weights=file, model=model))

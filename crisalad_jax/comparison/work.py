@@ -31,9 +31,11 @@ from crisalad_jax.files import check_target, write_json
 from crisalad_jax.fit import fit
 from crisalad_jax.metrics import read_metrics
 from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.reranking import parse_reranking
 from crisalad_jax.results import GroupingResult
 from crisalad_jax.scores import right_retrievals
 from crisalad_jax.serial import differences, read_config, to_plain
+from crisalad_jax.vocabulary import needs_vocabulary, with_vocabulary
 
 _ROUNDS = 5
 
@@ -137,8 +139,6 @@ def _evaluated(
 ) -> dict[str, Any]:
     options: dict[str, Any] = {}
     if variant.rerank is not None:
-        from crisalad_jax.reranking import parse_reranking  # pyright: ignore
-
         options["rerank"] = parse_reranking(variant.rerank)
     started = time.monotonic()
     results = evaluate(
@@ -207,18 +207,9 @@ def _start(
     return params
 
 
-def needs_vocabulary(model: ModelConfig) -> bool:
-    """Whether a model's clusters are those of features, found before anything else."""
-    from crisalad_jax.vocabulary import needs_vocabulary  # pyright: ignore
-
-    return needs_vocabulary(model)
-
-
 def _with_vocabulary(
     prepared: Prepared, params: Crisalad, model: ModelConfig, seed: int, quiet: bool
 ) -> Crisalad:
-    from crisalad_jax.vocabulary import with_vocabulary  # pyright: ignore
-
     assert prepared.places is not None
     places = prepared.places
     paths = [places.path(image) for image in range(len(places.files))]
