@@ -31,6 +31,7 @@ from crisalad_jax.config import (
     OptimiserConfig,
     SaladConfig,
     TrainConfig,
+    TransVprConfig,
     ViTConfig,
 )
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
@@ -45,6 +46,7 @@ MODEL = ModelConfig(
     image_size=(42, 56),
     backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),
     salad=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
+    transvpr=TransVprConfig(levels=2),
     encoder=CrossImageConfig(heads=2, feedforward=16),
 )
 # Eight places make two batches of three an epoch: six steps in all. The dropouts of MODEL and the

@@ -4,8 +4,6 @@ import dataclasses
 import json
 import shutil
 import statistics
-import sys
-import types
 
 import jax
 import pytest
@@ -199,11 +197,8 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
             params, aggregator=jax.tree.map(lambda x: x + 1, params.aggregator)
         )
 
-    stub = types.SimpleNamespace(
-        needs_vocabulary=lambda config: config.aggregator == "salad",
-        with_vocabulary=with_vocabulary,
-    )
-    monkeypatch.setitem(sys.modules, "crisalad_jax.vocabulary", stub)
+    monkeypatch.setattr(work, "needs_vocabulary", lambda config: config.aggregator == "salad")
+    monkeypatch.setattr(work, "with_vocabulary", with_vocabulary)
     untaught = ComparedMethod("Untaught", "salad", learns=False)
     monkeypatch.setitem(METHODS, "untaught", untaught)
     monkeypatch.delattr(work, "fit")
@@ -226,8 +221,7 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
 def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
     """The second one re-ranks; how is another module's, which is given its words."""
     monkeypatch.setitem(METHODS, "ranked", ComparedMethod("Ranked", "crisalad", rerank="by-name"))
-    stub = types.SimpleNamespace(parse_reranking=lambda text: f"parsed {text}")
-    monkeypatch.setitem(sys.modules, "crisalad_jax.reranking", stub)
+    monkeypatch.setattr(work, "parse_reranking", lambda text: f"parsed {text}")
     seen = []
     real = work.evaluate
 
