@@ -24,6 +24,7 @@ import pytest
 from crisalad_jax import platform
 from crisalad_jax.checkpoint import save_weights
 from crisalad_jax.config import (
+    AnyLocConfig,
     CrossImageConfig,
     LossConfig,
     ModelConfig,
@@ -46,6 +47,7 @@ MODEL = ModelConfig(
     image_size=(42, 56),
     backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),
     salad=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
+    anyloc=AnyLocConfig(layer=-1),
     transvpr=TransVprConfig(levels=2),
     encoder=CrossImageConfig(heads=2, feedforward=16),
 )
