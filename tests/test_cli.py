@@ -135,11 +135,11 @@ def test_no_command_prints_the_usage(capfd):
     [
         (
             "tran --data d --out o",
-            "command: found 'tran', expected one of convert, demo, evaluate, exp",
+            "command: found 'tran', expected one of ablate, compare, convert",
         ),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
         ("train --data d --out o --preset b16", "preset: found 'b16'"),
-        ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of boq"),
+        ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
         ("train --data d --out o --recipe salad --config c", "--recipe: found beside --config"),
         ("train --data d --out o --micro-batch 5", "micro_batch: found 5, expected a divisor of"),
         ("train --data d --out o --loss.kind fast-ap", "expected 'none': it ranks all images"),

@@ -173,7 +173,7 @@ def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
         recipe("b16")
     with pytest.raises(
-        InputError, match=r"^recipe: found 'dbow', expected one of boq, c.*, crisal"
+        InputError, match=r"^recipe: found 'dbow', expected one of anyloc, boq, c.*, crisal"
     ):
         recipe("b14", "dbow")
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):

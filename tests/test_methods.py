@@ -93,9 +93,9 @@ def test_a_batch_is_its_images_one_by_one(aggregator: str) -> None:
     np.testing.assert_allclose(together, np.stack(one_by_one), atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("aggregator", METHODS)
+@pytest.mark.parametrize("aggregator", [name for name in METHODS if name != "anyloc"])
 def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
-    """Every method's tokens fit it; under `alone` it leaves them to themselves."""
+    """Tokens of every method that trains fit it; under `alone` it leaves them to themselves."""
     params, config = model(aggregator)
     config = dataclasses.replace(config, encoder=RELATED)
     generator = np.random.default_rng(0)
