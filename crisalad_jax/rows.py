@@ -95,6 +95,29 @@ def blocks(
         start += len(buffer)
 
 
+def views(array: Float32[np.ndarray, "n d"], name: str, size: int) -> Generator[Block, None, None]:
+    """The array's rows as they lie in memory, `size` at a time; the last block may have fewer.
+
+    Raises:
+        InputError: a row is not finite, or not of unit length.
+    """
+    for start in range(0, len(array), size):
+        rows = array[start : start + size]
+        check_rows(rows, name, range(start, len(array)), unit=True)
+        yield Block(start, rows, len(rows))
+
+
+def is_mapped(array: np.ndarray) -> bool:
+    """Whether it is part of a file that is mapped into memory."""
+    return isinstance(_owner(array), np.memmap)
+
+
+def _owner(array: np.ndarray) -> np.ndarray:
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
+
+
 def gathered(
     array: Float[np.ndarray, "n d"], places: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m d"]:
@@ -181,9 +204,7 @@ def aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
 
 def _let_go(rows: np.ndarray) -> None:
     """Give pages of a memory-mapped file back, or all that were read would stay in memory."""
-    owner: Any = rows
-    while isinstance(owner.base, np.ndarray):
-        owner = owner.base
+    owner: Any = _owner(rows)
     # What is written to a copy-on-write map is nowhere but in memory.
     if not isinstance(owner, np.memmap) or owner.mode == "c" or not hasattr(mmap, "MADV_DONTNEED"):
         return
