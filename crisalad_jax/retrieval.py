@@ -6,7 +6,8 @@ The protocol is the public one of visual place recognition: exact nearest neighb
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import cycle
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Float32, Int, Int32, Int64
 
 from crisalad_jax import platform
+from crisalad_jax.cores import usable_cores
 from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.errors import InputError
 from crisalad_jax.progress import progress_bar
@@ -114,7 +116,6 @@ def _search(
     size = min(_QUERY_CHUNK, len(queries))
     fresh = (aligned((size, queries.shape[1]), WIDE) for _ in itertools.count())
     parts = [_Part(block, k) for block in blocks(queries, "queries", fresh)]
-    namer = _OnHost(chunk, size) if on_host else _OnDevices(parts, chunk, k)
     if on_host and database.dtype == WIDE and not is_mapped(database):
         stream = views(database, "database", chunk)
     else:
@@ -123,10 +124,11 @@ def _search(
         buffers = [aligned((chunk, database.shape[1]), dtype) for _ in range(3)]
         stream = blocks(database, "database", cycle(buffers))
     with progress_bar(label, count, "rows", quiet=quiet) as bar:
-        for block, name in namer.each(one_ahead(stream)):
-            for part in parts:
-                part.take(block, name(part), database)
-            bar.advance(block.valid)
+        name = _on_host if on_host else _on_devices
+        for block, part, pairs in name(parts, one_ahead(stream), chunk):
+            part.take(block, pairs(), database)
+            if part is parts[-1]:
+                bar.advance(block.valid)
         found = [part.neighbours(database) for part in parts]
     return Neighbours(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
 
@@ -228,89 +230,85 @@ class _Part:
         )
 
 
+_Named = Iterator[tuple[Block, _Part, Callable[[], _Pairs]]]
+"""Every block for each part of the queries, and what gives their pairs."""
+
+
 def _largest(values: Float32[np.ndarray, "line m"], k: int) -> Float32[np.ndarray, " line"]:
     """The k-th largest value of each line."""
     return np.partition(values, -k, axis=1)[:, -k]
 
 
-class _OnHost:
-    """Names candidates by numpy."""
+def _on_host(parts: Sequence[_Part], stream: Iterator[Block], chunk: int) -> _Named:
+    """By numpy, which multiplies while what it found before is sorted in."""
+    size = len(parts[0].queries)
+    # Kept: memory that is new each time takes longer than what is written to it.
+    memory = cycle([np.empty(chunk * size, np.float32) for _ in range(2)])
 
-    def __init__(self, chunk: int, queries: int) -> None:
-        """Of blocks of `chunk` rows, for so many queries at a time."""
-        # Kept: memory that is new each time takes longer than what is written to it.
-        self._products = np.empty((chunk, queries), np.float32)
-
-    def each(self, stream: Iterator[Block]) -> Iterator[tuple[Block, Callable[[_Part], _Pairs]]]:
-        """Every block, and what names its candidates."""
+    def multiply() -> Generator[tuple[Block, _Part, Float32[np.ndarray, "rows q"]], None, None]:
         for block in stream:
-            yield block, functools.partial(self._name, block)
-
-    def _name(self, block: Block, part: _Part) -> _Pairs:
-        rows = block.rows[: block.valid].astype(np.float32, copy=False)
-        # The queries on the right: the product takes a tenth less time so.
-        products = self._products.reshape(-1)[: len(rows) * len(part.queries)]
-        products = products.reshape(len(rows), len(part.queries))
-        np.matmul(rows, part.queries.T, out=products)
-        least, k = part.least(), part.k
-        fresh = np.isneginf(least)
-        if fresh.any() and len(rows) >= k:
-            least[fresh] = _largest(products.T[fresh], k) - np.float32(2 * part.error)
-        row, query = np.nonzero(products >= least)
-        order = np.argsort(query, kind="stable")
-        row, query = row[order], query[order]
-        return query, row, products[row, query]
-
-
-class _OnDevices:
-    """Names candidates by the devices, over which the rows of a block are spread."""
-
-    def __init__(self, parts: Sequence[_Part], chunk: int, k: int) -> None:
-        """Of blocks of `chunk` rows."""
-        self._devices = platform.devices_for(chunk)
-        self._queries = {id(part): self._devices.share(part.block.rows) for part in parts}
-        mesh = self._devices.mesh
-        self._program = _program(mesh, min(k + _SPARE, chunk // mesh.size))
-
-    def each(self, stream: Iterator[Block]) -> Iterator[tuple[Block, Callable[[_Part], _Pairs]]]:
-        """Every block; while the devices are at one, the one before is given."""
-        before = None
-        for block in stream:
-            rows, valid = self._devices.spread(block.rows), np.int32(block.valid)
-            found = {
-                name: self._program(rows, valid, queries) for name, queries in self._queries.items()
-            }
-            if before is not None:
-                yield before
-            before = block, functools.partial(self._name, block, found)
-        if before is not None:
-            yield before
-
-    @staticmethod
-    def _name(block: Block, found: Mapping[int, tuple[Array, Array]], part: _Part) -> _Pairs:
-        count = len(part.queries)
-        values, places = (np.asarray(array)[:, :count] for array in found[id(part)])
-        least = part.least()
-        all_values = np.concatenate(values, axis=1)
-        if all_values.shape[1] >= part.k:
-            largest = _largest(all_values, part.k)
-            least = np.maximum(least, largest - np.float32(2 * part.error))
-        wanted = (all_values >= least[:, None]) & np.isfinite(all_values)
-        # Where the last that a device named is wanted, it may have left out others.
-        last = values[:, :, -1]
-        crowded = ((last >= least) & np.isfinite(last)).any(axis=0)
-        wanted[crowded] = False
-        query, column = np.nonzero(wanted)
-        row, value = np.concatenate(places, axis=1)[query, column], all_values[query, column]
-        if crowded.any():
             rows = block.rows[: block.valid].astype(np.float32, copy=False)
-            products = part.queries[crowded] @ rows.T
-            also, there = np.nonzero(products >= least[crowded, None])
-            query = np.concatenate([query, np.flatnonzero(crowded)[also]])
-            row = np.concatenate([row, there])
-            value = np.concatenate([value, products[also, there]])
-        order = np.lexsort((row, query))
-        return query[order], row[order], value[order]
+            for part in parts:
+                shape = len(rows), len(part.queries)
+                products = next(memory)[: math.prod(shape)].reshape(shape)
+                # The queries on the right: the product takes a tenth less time so.
+                yield block, part, np.matmul(rows, part.queries.T, out=products)
+
+    for block, part, products in one_ahead(multiply()):
+        yield block, part, functools.partial(_of_products, part, products)
+
+
+def _of_products(part: _Part, products: Float32[np.ndarray, "rows q"]) -> _Pairs:
+    least, k = part.least(), part.k
+    fresh = np.isneginf(least)
+    if fresh.any() and len(products) >= k:
+        least[fresh] = _largest(products.T[fresh], k) - np.float32(2 * part.error)
+    row, query = np.nonzero(products >= least)
+    order = np.argsort(query, kind="stable")
+    row, query = row[order], query[order]
+    return query, row, products[row, query]
+
+
+def _on_devices(parts: Sequence[_Part], stream: Iterator[Block], chunk: int) -> _Named:
+    """By the devices, over which a block's rows are spread; they are at the next meanwhile."""
+    devices = platform.devices_for(chunk)
+    queries = [devices.share(part.block.rows) for part in parts]
+    program = _program(devices.mesh, min(parts[0].k + _SPARE, chunk // devices.mesh.size))
+    before: list[tuple[Block, _Part, Callable[[], _Pairs]]] = []
+    for block in stream:
+        rows, valid = devices.spread(block.rows), np.int32(block.valid)
+        found = [program(rows, valid, each) for each in queries]
+        yield from before
+        before = [
+            (block, part, functools.partial(_of_candidates, part, block, *arrays))
+            for part, arrays in zip(parts, found, strict=True)
+        ]
+    yield from before
+
+
+def _of_candidates(part: _Part, block: Block, *found: Array) -> _Pairs:
+    values, places = (np.asarray(array)[:, : len(part.queries)] for array in found)
+    least = part.least()
+    all_values = np.concatenate(values, axis=1)
+    if all_values.shape[1] >= part.k:
+        largest = _largest(all_values, part.k)
+        least = np.maximum(least, largest - np.float32(2 * part.error))
+    wanted = (all_values >= least[:, None]) & np.isfinite(all_values)
+    # Where the last that a device named is wanted, it may have left out others.
+    last = values[:, :, -1]
+    crowded = ((last >= least) & np.isfinite(last)).any(axis=0)
+    wanted[crowded] = False
+    query, column = np.nonzero(wanted)
+    row, value = np.concatenate(places, axis=1)[query, column], all_values[query, column]
+    if crowded.any():
+        rows = block.rows[: block.valid].astype(np.float32, copy=False)
+        products = part.queries[crowded] @ rows.T
+        also, there = np.nonzero(products >= least[crowded, None])
+        query = np.concatenate([query, np.flatnonzero(crowded)[also]])
+        row = np.concatenate([row, there])
+        value = np.concatenate([value, products[also, there]])
+    order = np.lexsort((row, query))
+    return query[order], row[order], value[order]
 
 
 def rounding(length: int) -> float:
@@ -349,9 +347,13 @@ def _similarities_of(
     similarities = np.empty(len(query), np.float32)
     order = np.argsort(index, kind="stable")
     size = max(1, _READ // queries.shape[1])
-    for start in range(0, len(order), size):
+
+    def fill(start: int) -> None:
         piece = order[start : start + size]
         rows, place = np.unique(index[piece], return_inverse=True)
         read = gathered(database, rows)
         similarities[piece] = exact_similarities(queries, read, query[piece], place)
+
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        list(threads.map(fill, range(0, len(order), size)))
     return similarities
