@@ -121,11 +121,14 @@ def _table(groupings: Sequence[GroupingResult]) -> tuple[list[str], list[list[_C
         headers.append("same place, queries / database")
         for row, pair in zip(rows, shares, strict=True):
             row.append(_Cell(" / ".join("\N{EN DASH}" if s is None else percent(s) for s in pair)))
-    strict = [g.recall_at_full_precision for g in groupings]
-    if any(value is not None for value in strict):
-        headers.append("recall at 100 % precision")
-        for row, value in zip(rows, strict, strict=True):
-            row.append(_Cell("\N{EN DASH}" if value is None else percent(value)))
+    for header, values in {
+        "AP": [g.average_precision for g in groupings],
+        "recall at 100 % precision": [g.recall_at_full_precision for g in groupings],
+    }.items():
+        if any(value is not None for value in values):
+            headers.append(header)
+            for row, value in zip(rows, values, strict=True):
+                row.append(_Cell("\N{EN DASH}" if value is None else percent(value)))
     return headers, rows
 
 
@@ -150,6 +153,8 @@ def _notes(groupings: Sequence[GroupingResult]) -> str:
         notes.append(
             "Same place: of the images in sight, in percent, those that show the image's own place."
         )
+    if any(g.average_precision is not None for g in groupings):
+        notes.append("AP: the area under precision and recall of the first retrievals.")
     return " ".join(notes)
 
 
