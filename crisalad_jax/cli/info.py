@@ -32,7 +32,7 @@ class Info:
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of 14; by default the model's."""
     trains: str | None = None
-    """adapters+head, last-N-blocks+head or all; by default the recipe's."""
+    """head, adapters+head, last-N-blocks+head or all; by default the recipe's."""
     batch_size: int = 16
     """Images that look at each other in the cross-image encoder."""
     json: pathlib.Path | None = None

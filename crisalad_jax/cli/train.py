@@ -42,8 +42,8 @@ class Train:
     """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
     recipe: str | None = None
     """How it trains: crisalad (the paper; the default), crisalad-1e-4 or crisalad-step (its Table
-    2), salad, cricavpr, netvlad, transvpr, cosplace, eigenplaces, or scratch (the default of tiny,
-    from random weights)."""
+    2), salad, cricavpr, netvlad, transvpr, gem, conv-ap, mixvpr, boq, cosplace, eigenplaces, or
+    scratch (the default of tiny, from random weights)."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     image_size: tuple[int, int] | None = None
