@@ -20,6 +20,7 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.fit import groups_of
 from crisalad_jax.groupings import check_grouping, parse_groupings
 from crisalad_jax.model import init_crisalad
+from crisalad_jax.reranking import parse_reranking
 from crisalad_jax.training import split_params
 
 EPOCHS = 6
@@ -71,9 +72,10 @@ class ComparisonConfig:
                 raise InputError(
                     f"{flag}: found {', '.join(values) or 'none'}, expected at least one, each once"
                 )
-        for flag, value in (("--epochs", self.epochs), ("--rerank", self.rerank)):
-            if value is not None and value < 1:
-                raise InputError(f"{flag}: found {value}, expected at least 1")
+        # A single retrieval has no other order.
+        for flag, value, least in (("--epochs", self.epochs, 1), ("--rerank", self.rerank, 2)):
+            if value is not None and value < least:
+                raise InputError(f"{flag}: found {value}, expected at least {least}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,7 +180,6 @@ def _drafts(config: ComparisonConfig) -> Iterator[Variant]:
             labels, run = (name, *ablation.labels(training)), name
             learns, rerank = True, None
         if config.image_size is not None:
-            training.model.check_image_size(config.image_size)
             model = dataclasses.replace(training.model, image_size=config.image_size)
             training = dataclasses.replace(training, model=model)
         yield Variant(name, labels, run, training, learns, rerank, None, training.model)
@@ -293,6 +294,8 @@ def _check(variant: Variant, config: ComparisonConfig, benchmarks: list[Benchmar
                 f"--rerank: found {config.rerank} for {variant.name}, expected at most the "
                 f"{len(benchmark.database)} database images of {benchmark.root}"
             )
+    if variant.rerank is not None:
+        parse_reranking(variant.rerank).check(variant.model)
 
 
 def labels_of(kind: str) -> tuple[str, ...]:

@@ -46,6 +46,7 @@ _WIDTHS = {
     "cosplace": "CosPlaceConfig.dim",
     "mixvpr": "MixVprConfig.channels",
     "boq": "BoqConfig.channels",
+    "transvpr": "TransVprConfig.dim",
 }
 """What sets the width of the tokens; of the others the backbone does."""
 

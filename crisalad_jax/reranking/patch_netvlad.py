@@ -11,8 +11,8 @@ from crisalad_jax import platform
 from crisalad_jax.config import PATCH_SIZE, ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, Images, unit_features
-from crisalad_jax.nn.aggregators.netvlad import NetVlad
-from crisalad_jax.nn.layers import l2_normalise, linear, widen
+from crisalad_jax.nn.aggregators.netvlad import NetVlad, shares
+from crisalad_jax.nn.layers import l2_normalise, widen
 from crisalad_jax.reranking.matching import mutual_matches, spatial_score
 
 Grid = tuple[int, int]
@@ -88,7 +88,7 @@ def describe(
     assert isinstance(aggregator, NetVlad)
     grid = config.image_size[0] // PATCH_SIZE, config.image_size[1] // PATCH_SIZE
     features = unit_features(params, images, config)
-    assignment = jax.nn.softmax(linear(aggregator.conv, features), axis=-1)
+    assignment = shares(aggregator, features)
 
     def of_one(image: tuple[Array, Array]) -> Array:
         parts = [

@@ -58,7 +58,11 @@ REFUSED = [
     (("--methods", "salad,salad"), ("--methods: found salad, salad", "each once")),
     (("--seeds", 0), ("seeds: found 0, expected at least 1",)),
     (("--epochs", 0), ("--epochs: found 0, expected at least 1",)),
-    (("--rerank", 0), ("--rerank: found 0, expected at least 1",)),
+    (("--rerank", 1), ("--rerank: found 1, expected at least 2",)),
+    (
+        ("--methods", "patch-netvlad", "--rerank", 7, "--image-size", 28, 28),
+        ("patch-netvlad: found images of 28 x 28, expected at least 42 x 42",),
+    ),
     (("--grouping", "alone"), ("grouping: found 'alone', expected one of",)),
     (("--weights", "crisalad"), ("--weights: found 'crisalad', expected NAME=FILE",)),
     (("--weights", "salad=w"), ("--weights: found 'salad', expected one of those compared",)),
@@ -119,6 +123,13 @@ def test_more_ranked_anew_than_there_are(flags, capfd, tmp_path, monkeypatch):
     monkeypatch.setitem(METHODS, "ranked", ComparedMethod("Ranked", "crisalad", rerank="any"))
     words = ("--rerank: found 20 for ranked, expected at most the 7 database images of",)
     fails(capfd, *flags, "--methods", "ranked", "--out", tmp_path / "out", words=words)
+
+
+def test_another_size_for_parameters_of_one(settings):
+    """MixVPR's parameters are for the patches of the size that is asked for, not the preset's."""
+    given = settings | {"names": ("mixvpr",), "image_size": (56, 70)}
+    (variant,) = prepare(ComparisonConfig(**given)).variants
+    assert variant.model.image_size == (56, 70)
 
 
 def test_a_page_without_a_place(flags, capfd, tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import statistics
+import types
 
 import jax
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from crisalad_jax import comparison
 from crisalad_jax.checkpoint import load_weights, model_hash
 from crisalad_jax.cli import main
-from crisalad_jax.comparison import METHODS, ComparedMethod, ComparisonConfig, work
+from crisalad_jax.comparison import METHODS, ComparedMethod, ComparisonConfig, plan, work
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.model import init_crisalad
 from tests.conftest import BATCH, STEPS, assert_equal
@@ -221,6 +222,8 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
 def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
     """The second one re-ranks; how is another module's, which is given its words."""
     monkeypatch.setitem(METHODS, "ranked", ComparedMethod("Ranked", "crisalad", rerank="by-name"))
+    anything = types.SimpleNamespace(check=lambda model: None)
+    monkeypatch.setattr(plan, "parse_reranking", lambda text: anything)
     monkeypatch.setattr(work, "parse_reranking", lambda text: f"parsed {text}")
     seen = []
     real = work.evaluate

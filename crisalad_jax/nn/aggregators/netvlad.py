@@ -89,9 +89,15 @@ def netvlad(
     alpha.
     """
     patches = l2_normalise(widen(patches))
+    return l2_normalise(residual_sums(shares(params, patches), patches, params.centroids))
+
+
+def shares(
+    params: NetVlad, patches: Float[Array, "*batch patch dim"]
+) -> Float[Array, "*batch patch cluster"]:
+    """How each of unit patches is shared out: a softmax over the clusters (the paper's Eq. 3)."""
     scores = jnp.matmul(patches, params.conv.weight, precision="highest")
-    shares = jax.nn.softmax(scores, axis=-1)
-    return l2_normalise(residual_sums(shares, patches, params.centroids))
+    return jax.nn.softmax(scores, axis=-1)
 
 
 def residual_sums(
