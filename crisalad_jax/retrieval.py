@@ -71,7 +71,8 @@ def search(
     The database may be a memory map, larger than memory: it is read once, `chunk` rows at a time,
     one chunk ahead of the one at work, and once more where the best rows are. Beyond the inputs,
     memory is that of three chunks and of their similarities to 1,024 queries, whatever the size of
-    the database; pages of a memory map are let go once they have been used.
+    the database; pages of a memory map are let go once they have been used. (Of a database with
+    many copies of one image, all of which are among the best, so are the pairs of a chunk.)
 
     Products in float32 name candidates: all rows that may be among the best, whatever the
     rounding. On a CPU numpy multiplies, elsewhere the devices. At the end a candidate's similarity

@@ -81,7 +81,7 @@ def compare(config: "ComparisonConfig", arguments: Side) -> None:
     if arguments.page is not None:
         tables.around(arguments.page, place)
     prepared = prepare(config)
-    claim(out, config)
+    claim(out, prepared)
     notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=arguments.quiet)
     notes.print(_start_words(config), soft_wrap=True, highlight=False)
 

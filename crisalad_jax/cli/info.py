@@ -32,7 +32,8 @@ class Info:
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of 14; by default the model's."""
     trains: str | None = None
-    """head, adapters+head, last-N-blocks+head or all; by default the recipe's."""
+    """head, adapters+head, last-N-blocks+head or all; by default the recipe's, of
+    a file adapters+head, or head where it has no adapter."""
     batch_size: int = 16
     """Images that look at each other in the cross-image encoder."""
     json: pathlib.Path | None = None
@@ -55,7 +56,8 @@ def run(arguments: Info) -> None:
     if arguments.weights is not None:
         _, config = load_weights(arguments.weights)
         title = str(arguments.weights)
-        trains = arguments.trains or "adapters+head"
+        adapted = config.backbone.adapter.kind != "none"
+        trains = arguments.trains or ("adapters+head" if adapted else "head")
     else:
         defaults = recipe(arguments.preset)
         config, trains = defaults.model, arguments.trains or defaults.trains

@@ -31,8 +31,8 @@ class Vocabulary:
     """Any checkpoint that `convert` reads, of which the backbone is taken."""
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14: the size of --backbone; without one the backbone is random."""
-    aggregator: Literal["anyloc", "netvlad"] = "anyloc"
-    """With --preset."""
+    aggregator: Literal["anyloc", "netvlad"] | None = None
+    """With --preset; by default anyloc."""
     clusters: int | None = None
     """Words; by default the preset's."""
     layer: int | None = None
@@ -91,7 +91,8 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
         if (value := getattr(arguments, name)) is not None
     }
     if arguments.weights is not None:
-        for name, found in (("--backbone", arguments.backbone), *((f"--{n}", n) for n in given)):
+        beside = {"--backbone": arguments.backbone, "--aggregator": arguments.aggregator}
+        for name, found in (*beside.items(), *((f"--{n}", n) for n in given)):
             if found is not None:
                 raise InputError(f"{name}: found beside --weights, expected only one of the two")
         params, config = load_weights(arguments.weights)
@@ -101,14 +102,13 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
                 "anyloc; --backbone takes the backbone of any model"
             )
         return params, resized(config, arguments.image_size)
-    config = recipe(arguments.preset, arguments.aggregator).model
+    aggregator = arguments.aggregator or "anyloc"
+    config = recipe(arguments.preset, aggregator).model
     alien = [name for name in given if not hasattr(config.part, name)]
     if alien:
         raise InputError(f"--{alien[0]}: found with --aggregator netvlad, expected anyloc")
     part = dataclasses.replace(config.part, **given)
-    config = resized(
-        dataclasses.replace(config, **{arguments.aggregator: part}), arguments.image_size
-    )
+    config = resized(dataclasses.replace(config, **{aggregator: part}), arguments.image_size)
     params = init_crisalad(jax.random.key(arguments.seed), config)
     if arguments.backbone is not None:
         backbone = read_backbone(arguments.backbone, config.backbone, params.backbone)

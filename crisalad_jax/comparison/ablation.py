@@ -198,4 +198,4 @@ def _race(kinds: tuple[AdapterKind, ...], rounds: int, images: int) -> Race:
         params = init_adapter(jax.random.key(0), backbone)
         return lambda: jax.block_until_ready(apply(params, tokens, (16, 16)))
 
-    return race({kind: call(kind) for kind in kinds}, rounds)
+    return race({kind: functools.partial(call, kind) for kind in kinds}, rounds)

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.comparison.ablation import ABLATIONS, Ablation
 from crisalad_jax.comparison.methods import METHODS
-from crisalad_jax.config import ModelConfig, TrainConfig, choose, from_scratch, recipe
+from crisalad_jax.config import LossConfig, ModelConfig, TrainConfig, choose, from_scratch, recipe
 from crisalad_jax.convert import read_backbone
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import Places, epoch_batches, read_places
@@ -20,6 +20,7 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.fit import groups_of
 from crisalad_jax.groupings import check_grouping, parse_groupings
 from crisalad_jax.model import init_crisalad
+from crisalad_jax.nn.vit import init_vit
 from crisalad_jax.reranking import parse_reranking
 from crisalad_jax.training import split_params
 
@@ -96,6 +97,9 @@ class Variant:
     """The model, where it comes from a file."""
     model: ModelConfig
     """What `weights` hold, or `training` makes."""
+    places: Places | None = None
+    """What it is trained on, where it is trained here; with small places too where its loss
+    regroups the images."""
 
     @property
     def trains(self) -> bool:
@@ -147,21 +151,40 @@ def prepare(config: ComparisonConfig) -> Prepared:
         training = draft.training
         if places is not None and draft.run not in weights:
             training = _fitted(training, config, len(places.place_id), views)
-            for group in groups_of(training, places):
-                epoch_batches(
-                    group,
-                    places_per_batch=training.places_per_batch,
-                    images_per_place=training.images_per_place,
-                    order=training.batch_order,
-                    seed=0,
-                    epoch=0,
-                )
+            own = _own_training_set(draft, training, config, places)
+        else:
+            own = None
         file = weights.get(draft.run)
         model = training.model if file is None else _checked(draft, file, config)
-        variants.append(dataclasses.replace(draft, training=training, weights=file, model=model))
+        variants.append(
+            dataclasses.replace(draft, training=training, weights=file, model=model, places=own)
+        )
     for variant in variants:
         _check(variant, config, benchmarks)
+    _check_backbone(config, variants)
     return Prepared(config, variants, places, benchmarks)
+
+
+def _own_training_set(
+    draft: Variant, training: TrainConfig, config: ComparisonConfig, places: Places
+) -> Places:
+    """What a variant is trained on, and that an epoch of it makes batches."""
+    assert config.train is not None
+    if training.min_images_of_place < training.min_images:
+        places = read_places(config.train, min_images=training.min_images_of_place)
+    try:
+        for group in groups_of(training, places):
+            epoch_batches(
+                group,
+                places_per_batch=training.places_per_batch,
+                images_per_place=training.images_per_place,
+                order=training.batch_order,
+                seed=0,
+                epoch=0,
+            )
+    except InputError as error:
+        raise InputError(f"{draft.name}: {error}") from error
+    return places
 
 
 def _drafts(config: ComparisonConfig) -> Iterator[Variant]:
@@ -252,9 +275,11 @@ def _fitted(
         training = dataclasses.replace(
             training, places_per_batch=min(training.places_per_batch, places), micro_batch=None
         )
-        if training.images_per_place <= views:
-            return training
-        return dataclasses.replace(training, images_per_place=views, min_images=views)
+        if not training.loss.classifies:
+            return _of_views(training, min(training.images_per_place, views), views)
+        if training.loss.large_margin_cosine.classes == "places":
+            return _of_views(training, training.images_per_place, views)
+        return training
     size = min(training.places_per_batch * training.images_per_place // views, places)
     epochs = config.epochs or EPOCHS
     optimiser = training.optimiser
@@ -270,9 +295,15 @@ def _fitted(
     )
 
 
-def _own_places(loss: Any) -> Any:
+def _of_views(training: TrainConfig, images: int, views: int) -> TrainConfig:
+    """So many images of a place a batch, of a set whose places have so many views."""
+    least = min(training.min_images, views)
+    return dataclasses.replace(training, images_per_place=images, min_images=least)
+
+
+def _own_places(loss: LossConfig) -> LossConfig:
     """A loss of classes takes a small set's own places for them, all in one group."""
-    if not getattr(loss, "classifies", False):
+    if not loss.classifies:
         return loss
     classes = dataclasses.replace(loss.large_margin_cosine, classes="places", groups=1, steps=None)
     return dataclasses.replace(loss, large_margin_cosine=classes)
@@ -285,9 +316,6 @@ def _check(variant: Variant, config: ComparisonConfig, benchmarks: list[Benchmar
     )
     if variant.trains:
         jax.eval_shape(lambda p: split_params(p, variant.training.trains)[0], template)
-        if config.backbone is not None:
-            fresh = init_crisalad(jax.random.key(0), variant.model)
-            read_backbone(config.backbone, variant.model.backbone, fresh.backbone)
     for benchmark in benchmarks:
         if variant.rerank is not None and config.rerank > len(benchmark.database):
             raise InputError(
@@ -296,6 +324,14 @@ def _check(variant: Variant, config: ComparisonConfig, benchmarks: list[Benchmar
             )
     if variant.rerank is not None:
         parse_reranking(variant.rerank).check(variant.model)
+
+
+def _check_backbone(config: ComparisonConfig, variants: list[Variant]) -> None:
+    """That what starts from a backbone can, one of each kind."""
+    if config.backbone is None:
+        return
+    for backbone in dict.fromkeys(v.model.backbone for v in variants if v.weights is None):
+        read_backbone(config.backbone, backbone, init_vit(jax.random.key(0), backbone))
 
 
 def labels_of(kind: str) -> tuple[str, ...]:

@@ -32,16 +32,18 @@ class Race(NamedTuple):
         return statistics.median(ratios), min(ratios), max(ratios)
 
 
-def race(contenders: Mapping[str, Callable[[], Any]], rounds: int) -> Race:
+def race(contenders: Mapping[str, Callable[[], Callable[[], Any]]], rounds: int) -> Race:
     """Time calls in turns; each does the whole of its work and waits for it.
 
-    The first call of each, which compiles, does not count, nor does the first of each turn.
+    The first call of each, which compiles, does not count, nor does the first of each turn. What a
+    contender gives is called for its turn and then let go: one model is in memory at a time.
     """
-    for call in contenders.values():
-        call()
+    for ready in contenders.values():
+        ready()()
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
-        for name, call in contenders.items():
+        for name, ready in contenders.items():
+            call = ready()
             call()
             times = []
             for _ in range(_CALLS):

@@ -9,11 +9,13 @@ OUT/speed.json                        the race of all models
 """
 
 import dataclasses
+import functools
+import hashlib
 import json
 import pathlib
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -42,13 +44,14 @@ _ROUNDS = 5
 Say = Callable[[str], None]
 
 
-def claim(out: pathlib.Path, config: ComparisonConfig) -> None:
+def claim(out: pathlib.Path, prepared: Prepared) -> None:
     """Make `out` the folder of this comparison, or check that it is.
 
     Raises:
-        InputError: it holds another comparison, or files but none.
+        InputError: it holds another comparison, or files but none; or what lies behind a name has
+            changed since it began: weights, a backbone, a set.
     """
-    path = out / "config.json"
+    config, path = prepared.config, out / "config.json"
     check_target(path)
     if path.exists():
         found = read_config(ComparisonConfig, path)
@@ -64,6 +67,37 @@ def claim(out: pathlib.Path, config: ComparisonConfig) -> None:
         )
     else:
         write_json(path, to_plain(config))
+    behind, path = _behind(prepared), out / "behind.json"
+    if path.exists():
+        changed = [name for name, digest in read_json(path).items() if behind.get(name) != digest]
+        if changed:
+            raise InputError(
+                f"{out}: {', '.join(changed)}: found changed since this comparison began, expected "
+                "the same, or another folder"
+            )
+    else:
+        write_json(path, behind)
+
+
+def _behind(prepared: Prepared) -> dict[str, str]:
+    """Digests of what the configuration only names: of files whole, of sets the images' names."""
+    files = {str(v.weights) for v in prepared.variants if v.weights is not None}
+    if prepared.config.backbone is not None:
+        files.add(prepared.config.backbone)
+    found = {}
+    for name in sorted(files):
+        with pathlib.Path(name).open("rb") as file:
+            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    if prepared.places is not None:
+        found[str(prepared.config.train)] = _digest(prepared.places.files)
+    for name, benchmark in zip(prepared.config.test, prepared.benchmarks, strict=True):
+        images = (*benchmark.database, *benchmark.queries)
+        found[name] = _digest([path.name for path in images])
+    return found
+
+
+def _digest(names: Sequence[str]) -> str:
+    return hashlib.sha256("\n".join(names).encode(errors="surrogateescape")).hexdigest()
 
 
 def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = False) -> None:
@@ -82,7 +116,7 @@ def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = 
             another set than is given now.
         Stopped: what `fit` raises; the same call goes on.
     """
-    claim(out, prepared.config)
+    claim(out, prepared)
     left = [unit for unit in prepared.units if not _is_done(prepared, out, *unit)]
     total, started = len(prepared.units), time.monotonic()
     for number, (variant, seed) in enumerate(left):
@@ -157,7 +191,11 @@ def _evaluated(
         "queries": len(benchmark.queries),
         "database": len(benchmark.database),
         "seconds": round(time.monotonic() - started, 2),
-        "groupings": {result.grouping: _ranks(result, benchmark) for result in results},
+        "groupings": {
+            result.grouping: _ranks(result, benchmark)
+            for result in results
+            if (result.rerank is None) == (variant.rerank is None)
+        },
     }
 
 
@@ -181,9 +219,9 @@ def _model(
     if not variant.learns:
         return start
     training = dataclasses.replace(variant.training, seed=seed)
-    assert prepared.places is not None
+    assert variant.places is not None
     _count_sitting(folder)
-    result = fit(training, prepared.places, folder / "run", initial=start, quiet=quiet)
+    result = fit(training, variant.places, folder / "run", initial=start, quiet=quiet)
     write_json(trained, _training_record(folder, training, result.steps))
     return result.params
 
@@ -217,9 +255,12 @@ def _with_vocabulary(
 
 
 def _count_sitting(folder: pathlib.Path) -> None:
-    """Note that training begins or goes on."""
-    path = folder / "sittings.json"
-    write_json(path, read_json(path) + 1 if path.exists() else 1)
+    """Note that training begins, or goes on after steps that it took."""
+    path, began = folder / "sittings.json", folder / "run" / "metrics.jsonl"
+    if not path.exists():
+        write_json(path, 1)
+    elif began.exists() and began.stat().st_size:
+        write_json(path, read_json(path) + 1)
 
 
 def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) -> dict[str, Any]:
@@ -242,7 +283,7 @@ def _race(prepared: Prepared, out: pathlib.Path) -> dict[str, Any]:
     size = prepared.config.batch_size
     models = {variant.run: variant for variant in prepared.variants}
     calls = {
-        name: describing(_any_params(prepared, out, variant), variant.model, size)
+        name: functools.partial(_describing, prepared, out, variant)
         for name, variant in models.items()
     }
     return {
@@ -253,8 +294,9 @@ def _race(prepared: Prepared, out: pathlib.Path) -> dict[str, Any]:
     }
 
 
-def _any_params(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Crisalad:
-    return _model(prepared, out, variant, variant.seeds(1)[0], quiet=True)
+def _describing(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Callable[[], Any]:
+    params = _model(prepared, out, variant, variant.seeds(1)[0], quiet=True)
+    return describing(params, variant.model, prepared.config.batch_size)
 
 
 def read_race(out: pathlib.Path) -> tuple[Race, dict[str, Any]]:

@@ -10,7 +10,7 @@ import jax
 import pytest
 
 from crisalad_jax import comparison
-from crisalad_jax.checkpoint import load_weights, model_hash
+from crisalad_jax.checkpoint import load_weights, model_hash, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.comparison import METHODS, ComparedMethod, ComparisonConfig, plan, work
 from crisalad_jax.evaluation import evaluate
@@ -80,7 +80,7 @@ def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
 def test_what_it_leaves(finished):
     written = {path.name for path in finished.iterdir() if path.is_file()}
     assert written == {
-        *("config.json", "speed.json", "results.json", "table.md", "table.csv"),
+        *("config.json", "behind.json", "speed.json", "results.json", "table.md", "table.csv"),
         *("index.html", "recall_0.png"),
     }
     page = (finished / "index.html").read_text()
@@ -165,6 +165,22 @@ def test_another_comparison_is_refused(finished, flags, capfd):
     fails(capfd, *flags, "--seeds", 3, "--out", finished, words=words)
 
 
+def test_weights_that_change_behind_their_name_are_refused(
+    shared, params, settings, tmp_path, monkeypatch
+):
+    """Their results would stand beside what is told of the others."""
+    monkeypatch.delattr(work, "fit")
+    weights, out = tmp_path / "weights.safetensors", tmp_path / "out"
+    _, model = load_weights(shared / "weights.safetensors")
+    save_weights(weights, params, model)
+    config = ComparisonConfig(**settings | {"train": None, "weights": (f"crisalad={weights}",)})
+    summary = run(config, out)
+    assert run(config, out).rows == summary.rows
+    save_weights(weights, jax.tree.map(lambda x: x + 1, params), model)
+    with pytest.raises(InputError, match=r"out: .*weights\.safetensors: found changed since"):
+        run(config, out)
+
+
 def test_weights_are_not_trained(shared, params, benchmark, settings, tmp_path, monkeypatch):
     """One evaluation, whatever the seeds, of just these; in every grouping that is asked for."""
     monkeypatch.delattr(work, "fit")
@@ -230,7 +246,8 @@ def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
 
     def noted(*args, rerank=None, **options):
         seen.append((options["seed"], rerank))
-        return real(*args, **options)
+        plain = real(*args, **options)
+        return [*plain, *(one._replace(rerank=rerank) for one in plain)]
 
     monkeypatch.setattr(work, "evaluate", noted)
     monkeypatch.delattr(work, "fit")
