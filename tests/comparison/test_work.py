@@ -13,6 +13,7 @@ from crisalad_jax import comparison
 from crisalad_jax.checkpoint import load_weights, model_hash, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.comparison import METHODS, ComparedMethod, ComparisonConfig, plan, work
+from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.model import init_crisalad
 from tests.conftest import BATCH, STEPS, assert_equal
