@@ -93,7 +93,15 @@ def test_a_batch_is_its_images_one_by_one(aggregator: str) -> None:
     np.testing.assert_allclose(together, np.stack(one_by_one), atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("aggregator", [name for name in METHODS if name != "anyloc"])
+@pytest.mark.parametrize(
+    "aggregator",
+    [
+        # A method with a global token alone, and one without.
+        name if name in {"gem", "boq"} else pytest.param(name, marks=pytest.mark.slow)
+        for name in _METHODS
+        if name != "anyloc"
+    ],
+)
 def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
     """Tokens of every method that trains fit it; under `alone` it leaves them to themselves."""
     params, config = model(aggregator)

@@ -30,7 +30,8 @@ def test_the_page_holds_the_numbers_of_the_json(
         shares = result["same_place"].values()
         words = ("\N{EN DASH}" if share is None else f"{100 * share:.1f}" for share in shares)
         assert next(cells) == " / ".join(words)
-        assert next(cells) == f"{100 * result['recall_at_full_precision']:.1f}"
+        for name in ("average_precision", "recall_at_full_precision"):
+            assert next(cells) == f"{100 * result[name]:.1f}"
     assert next(cells, None) is None
     names = {e["id"] for e in page.all("section")}
     assert {"recall", "map", "transport", "similarities", "settings"} <= names
