@@ -1,7 +1,6 @@
 """Files of weights: safetensors, the configuration inside."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import os
@@ -16,7 +15,7 @@ import safetensors
 from crisalad_jax.config import AGGREGATORS, ModelConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import check_source, write_safetensors
-from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.model import Crisalad, parameter_shapes
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc, check_vocabulary
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import differences, from_plain, to_plain
@@ -149,7 +148,7 @@ def _fill(config: ModelConfig, found: dict[str, np.ndarray], path: pathlib.Path)
             f"{path}: found {len(found)} arrays, far from the sizes that its configuration says, "
             f"of up to {largest}"
         )
-    template = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+    template = parameter_shapes(config)
     wanted = named_leaves(template)
     problems = [f"{name} missing" for name in wanted.keys() - found.keys()]
     problems += [f"{name} unknown" for name in found.keys() - wanted.keys()]

@@ -1,13 +1,10 @@
 """What a model costs: parameters and multiply-accumulates by part, from its configuration alone."""
 
-import functools
 import math
 from typing import NamedTuple
 
-import jax
-
 from crisalad_jax.config import PATCH_SIZE, ModelConfig
-from crisalad_jax.model import init_crisalad
+from crisalad_jax.model import parameter_shapes
 from crisalad_jax.pytree import named_leaves
 
 
@@ -27,9 +24,8 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     cost that depends on it.
     """
     macs = _macs(config, images)
-    template = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
     counts = dict.fromkeys(macs, 0)
-    for name, leaf in named_leaves(template).items():
+    for name, leaf in named_leaves(parameter_shapes(config)).items():
         counts[_part_of(name)] += math.prod(leaf.shape)
     return [PartCost(part, counts[part], macs[part]) for part in macs]
 

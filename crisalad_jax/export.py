@@ -5,7 +5,6 @@ comes out, and `weights.safetensors` lies beside them unless the weights are in 
 """
 
 import dataclasses
-import hashlib
 import os
 import pathlib
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from crisalad_jax import platform
 from crisalad_jax.checkpoint import model_hash, save_weights
 from crisalad_jax.config import ModelConfig, choose
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_folder, check_new_folder, write_json
+from crisalad_jax.files import atomic_folder, check_new_folder, sha256_of, write_json
 from crisalad_jax.model import Crisalad, alone, describe
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import to_plain
@@ -176,6 +175,4 @@ def _shape(array: Any) -> list[int | str]:
 
 
 def _file(path: pathlib.Path) -> dict[str, Any]:
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256_of(path)}

@@ -1,6 +1,7 @@
 """Writing files so that a reader never meets half of one."""
 
 import contextlib
+import hashlib
 import json
 import os
 import pathlib
@@ -130,6 +131,27 @@ def write_safetensors(
             raise InputError(f"{path}: cannot be written: {error}") from error
         # The library makes files that only their owner can read.
         temporary.chmod(0o644)
+
+
+def sha256_of(path: str | os.PathLike[str]) -> str:
+    """The digest of a file's bytes, in hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def around(page: pathlib.Path, name: str) -> tuple[str, str]:
+    """A page up to the place of what is called so, and from its end on: between two comments.
+
+    Raises:
+        InputError: there is no such page, or it has no place of this name.
+    """
+    check_source(page, "a page with a place for the table")
+    start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+    before, found, rest = page.read_text(encoding="utf-8").partition(start)
+    _, closed, after = rest.partition(end)
+    if not found or not closed:
+        raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
+    return before + start, end + after
 
 
 @contextlib.contextmanager

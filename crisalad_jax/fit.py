@@ -226,13 +226,13 @@ class _Run:
         # What does not fit raises before claim_run writes the first file, in all processes.
         checksums = {
             "configuration": zlib.crc32(json.dumps(to_plain(config)).encode()),
-            "places": _checksum([_text(places.files), places.place_start]),
-            "validation": 0 if validation is None else _checksum_of(validation),
+            "places": checksum_of_places(places),
+            "validation": 0 if validation is None else checksum_of_benchmark(validation),
         }
         for what, number in (checksums | {"--split-state": int(split_state)}).items():
             processes.check_same(what, number)
         self._groups = groups_of(config, places)
-        self.steps_per_epoch = _steps_per_epoch(config, self._groups)
+        self.steps_per_epoch = steps_per_epoch(config, self._groups)
         self.config, self.out = config, out
         self._validation = validation
         self._devices = _devices(config)
@@ -549,8 +549,12 @@ def groups_of(config: TrainConfig, places: Places) -> tuple[Places, ...]:
     )
 
 
-def _steps_per_epoch(config: TrainConfig, groups: Sequence[Places]) -> int:
-    """The same in all epochs: as asked for, or so many as take the largest group's places once."""
+def steps_per_epoch(config: TrainConfig, groups: Sequence[Places]) -> int:
+    """The same in all epochs: as asked for, or so many as take the largest group's places once.
+
+    Raises:
+        InputError: a group has too few places or images for a batch.
+    """
     if config.loss.classifies and config.loss.large_margin_cosine.steps is not None:
         return config.loss.large_margin_cosine.steps
     return max(
@@ -640,7 +644,12 @@ def _text(names: Iterable[Any]) -> np.ndarray:
     return np.frombuffer("\n".join(map(str, names)).encode(), np.uint8)
 
 
-def _checksum_of(benchmark: Benchmark) -> int:
+def checksum_of_places(places: Places) -> int:
+    """Of the names of all images, and of how they make places."""
+    return _checksum([_text(places.files), places.place_start])
+
+
+def checksum_of_benchmark(benchmark: Benchmark) -> int:
     """Of its name, which tells its rule, and of its images' names, wherever they lie."""
     names = (path.name for path in (*benchmark.database, *benchmark.queries))
     return _checksum([_text((benchmark.name, *names))])

@@ -7,7 +7,6 @@ be converted as well as weights, and the way back gives the same bits.
 """
 
 import dataclasses
-import functools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -28,7 +27,7 @@ from crisalad_jax.config import (
     choose,
 )
 from crisalad_jax.errors import InputError
-from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.model import Crisalad, parameter_shapes
 from crisalad_jax.pytree import named_leaves
 from crisalad_jax.serial import differences
 
@@ -386,7 +385,7 @@ def public_shapes(config: ModelConfig, layout: str) -> dict[str, tuple[int, ...]
     Raises:
         InputError: what `table` raises.
     """
-    wanted = _numbered(named_leaves(_template(config)))
+    wanted = _numbered(named_leaves(parameter_shapes(config)))
     shapes: dict[str, tuple[int, ...]] = {}
     for line in table(config, layout):
         if isinstance(line, Extra):
@@ -459,10 +458,6 @@ def to_state(
     return state
 
 
-def _template(config: ModelConfig) -> Crisalad:
-    return jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
-
-
 _BLOCKS = "backbone.blocks."
 
 
@@ -483,7 +478,7 @@ def _numbered(leaves: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
-    template = _template(config)
+    template = parameter_shapes(config)
     leaves = []
     for name, leaf in named_leaves(template).items():
         if name.startswith(_BLOCKS):

@@ -45,6 +45,11 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     )
 
 
+def parameter_shapes(config: ModelConfig) -> Crisalad:
+    """Shapes and types of all parameters (`jax.ShapeDtypeStruct`); nothing is computed."""
+    return jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+
+
 @functools.partial(platform.jit, static_argnames=("config", "micro_batch"))
 def describe(
     params: Crisalad,
@@ -160,7 +165,7 @@ def unit_features(
     Raises:
         InputError: as `describe`.
     """
-    return l2_normalise(widen(_features(params, images, config).patches))
+    return l2_normalise(widen(features_of(params, images, config).patches))
 
 
 @functools.partial(platform.jit, static_argnames="config")

@@ -151,16 +151,16 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
     for result in results:
         spread = result.spread or _NO_SPREAD
         recall_cells = (
-            f"{_percent(value)}{_spread(spread.recalls.get(k))}\n"
-            f"{_percent(result.intervals[k].low)}-{_percent(result.intervals[k].high)}"
+            f"{_or_dash(value)}{_spread(spread.recalls.get(k))}\n"
+            f"{_or_dash(result.intervals[k].low)}-{_or_dash(result.intervals[k].high)}"
             for k, value in result.recalls.items()
         )
         cells = (
             result.grouping + (f"\n+ {result.rerank}" if result.rerank else ""),
-            f"{_percent(result.query_share)} / {_percent(result.database_share)}",
+            f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}",
             *recall_cells,
-            f"{_percent(result.average_precision)}\n{_spread(spread.average_precision)}",
-            f"{_percent(result.recall_at_full_precision)}\n"
+            f"{_or_dash(result.average_precision)}\n{_spread(spread.average_precision)}",
+            f"{_or_dash(result.recall_at_full_precision)}\n"
             f"{_spread(spread.recall_at_full_precision)}",
         )
         table.add_row(*map(Text, cells))
@@ -170,12 +170,17 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
 _NO_SPREAD = Scores({}, None, None)
 
 
-def _percent(fraction: float | None) -> str:
-    return "-" if fraction is None else f"{100 * fraction:.1f}"
+def percent(fraction: float) -> str:
+    """A fraction in percent, with one decimal."""
+    return f"{100 * fraction:.1f}"
+
+
+def _or_dash(fraction: float | None) -> str:
+    return "-" if fraction is None else percent(fraction)
 
 
 def _spread(fraction: float | None) -> str:
-    return "" if fraction is None else f" ±{100 * fraction:.1f}"
+    return "" if fraction is None else f" ±{percent(fraction)}"
 
 
 def to_json(result: GroupingResult) -> dict[str, Any]:

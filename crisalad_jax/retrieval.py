@@ -8,7 +8,6 @@ import itertools
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import cycle
 from typing import Any, NamedTuple
 
 import jax
@@ -123,7 +122,7 @@ def _search(
         # One is read, one is with the devices, one is finished.
         dtype = database.dtype if database.dtype in KEPT else WIDE
         buffers = [aligned((chunk, database.shape[1]), dtype) for _ in range(3)]
-        stream = blocks(database, "database", cycle(buffers))
+        stream = blocks(database, "database", itertools.cycle(buffers))
     with progress_bar(label, count, "rows", quiet=quiet) as bar:
         name = _on_host if on_host else _on_devices
         for block, part, pairs in name(parts, one_ahead(stream), chunk):
@@ -177,8 +176,12 @@ class _Part:
         self.values, self.indices = np.full(shape, -np.inf, np.float32), np.full(shape, -1)
 
     def least(self) -> Float32[np.ndarray, " q"]:
-        """A row of a smaller product is not among the best of a query, whatever the rounding."""
-        return _largest(self.values, self.k) - np.float32(2 * self.error)
+        """`least_of` what is known."""
+        return self.least_of(self.values)
+
+    def least_of(self, values: Float32[np.ndarray, "line m"]) -> Float32[np.ndarray, " line"]:
+        """A row of a smaller product is not among the k best of these, whatever the rounding."""
+        return np.partition(values, -self.k, axis=1)[:, -self.k] - np.float32(2 * self.error)
 
     def take(self, block: Block, pairs: _Pairs, database: Float[np.ndarray, "n d"]) -> None:
         """Put pairs of queries and rows of a block among the candidates."""
@@ -192,7 +195,7 @@ class _Part:
         values, indices = np.full(shape, -np.inf, np.float32), np.full(shape, -1)
         values[:, :width], indices[:, :width] = self.values[touched], self.indices[touched]
         values[line, column], indices[line, column] = value, block.start + row
-        least = _largest(values, self.k) - np.float32(2 * self.error)
+        least = self.least_of(values)
         values[values < least[:, None]] = -np.inf
         crowded = np.flatnonzero(np.isfinite(values).sum(axis=1) > width)
         if crowded.size:
@@ -235,16 +238,11 @@ _Named = Iterator[tuple[Block, _Part, Callable[[], _Pairs]]]
 """Every block for each part of the queries, and what gives their pairs."""
 
 
-def _largest(values: Float32[np.ndarray, "line m"], k: int) -> Float32[np.ndarray, " line"]:
-    """The k-th largest value of each line."""
-    return np.partition(values, -k, axis=1)[:, -k]
-
-
 def _on_host(parts: Sequence[_Part], stream: Iterator[Block], chunk: int) -> _Named:
     """By numpy, which multiplies while what it found before is sorted in."""
     size = len(parts[0].queries)
     # Kept: memory that is new each time takes longer than what is written to it.
-    memory = cycle([np.empty(chunk * size, np.float32) for _ in range(2)])
+    memory = itertools.cycle([np.empty(chunk * size, np.float32) for _ in range(2)])
 
     def multiply() -> Generator[tuple[Block, _Part, Float32[np.ndarray, "rows q"]], None, None]:
         for block in stream:
@@ -260,10 +258,10 @@ def _on_host(parts: Sequence[_Part], stream: Iterator[Block], chunk: int) -> _Na
 
 
 def _of_products(part: _Part, products: Float32[np.ndarray, "rows q"]) -> _Pairs:
-    least, k = part.least(), part.k
+    least = part.least()
     fresh = np.isneginf(least)
-    if fresh.any() and len(products) >= k:
-        least[fresh] = _largest(products.T[fresh], k) - np.float32(2 * part.error)
+    if fresh.any() and len(products) >= part.k:
+        least[fresh] = part.least_of(products.T[fresh])
     row, query = np.nonzero(products >= least)
     order = np.argsort(query, kind="stable")
     row, query = row[order], query[order]
@@ -292,8 +290,7 @@ def _of_candidates(part: _Part, block: Block, *found: Array) -> _Pairs:
     least = part.least()
     all_values = np.concatenate(values, axis=1)
     if all_values.shape[1] >= part.k:
-        largest = _largest(all_values, part.k)
-        least = np.maximum(least, largest - np.float32(2 * part.error))
+        least = np.maximum(least, part.least_of(all_values))
     wanted = (all_values >= least[:, None]) & np.isfinite(all_values)
     # Where the last that a device named is wanted, it may have left out others.
     last = values[:, :, -1]

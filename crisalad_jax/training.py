@@ -17,7 +17,7 @@ from crisalad_jax.classification import Classifiers, init_classifiers, updated
 from crisalad_jax.config import LossConfig, ModelConfig, OptimiserConfig
 from crisalad_jax.errors import InputError
 from crisalad_jax.losses import LossResult, large_margin_cosine_loss, metric_loss
-from crisalad_jax.model import Crisalad, among, relate, tokenise
+from crisalad_jax.model import Crisalad, among, parameter_shapes, relate, tokenise
 from crisalad_jax.nn.layers import split_key
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.nn.vit import Block
@@ -108,6 +108,14 @@ def split_params(params: Crisalad, trains: str) -> tuple[PyTree, PyTree]:
 
     chosen = jax.tree.map(lambda _: learns(next(names)), params)
     return eqx.partition(params, chosen)
+
+
+def trained_parameters(config: ModelConfig, trains: str) -> int:
+    """How many numbers train; raises as `split_params`."""
+    trainable = jax.eval_shape(
+        lambda params: split_params(params, trains)[0], parameter_shapes(config)
+    )
+    return sum(leaf.size for leaf in jax.tree.leaves(trainable))
 
 
 def _stack(params: Crisalad) -> Block:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32
 
-from crisalad_jax.config import PATCH_SIZE, ModelConfig
+from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.loader import OnBadImage, image_batches
 from crisalad_jax.errors import InputError
 from crisalad_jax.model import Crisalad, unit_features
@@ -117,8 +117,7 @@ def _check_counts(
 
 def _taken(config: ModelConfig) -> int:
     """Features of an image."""
-    height, width = config.image_size
-    return min(PATCHES, (height // PATCH_SIZE) * (width // PATCH_SIZE))
+    return min(PATCHES, config.patches)
 
 
 def _read_features(

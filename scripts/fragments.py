@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_source, check_target, write_json
+from crisalad_jax.files import around, atomic_path, check_target, write_json
 
 INK, GREY, PALE = "#222222", "#757575", "#e4e4e4"
 # Okabe and Ito's: told apart by the colour-blind.
@@ -69,17 +69,6 @@ def splice(page: pathlib.Path, name: str, table: Table) -> None:
     before, after = around(page, name)
     with atomic_path(page) as temporary:
         temporary.write_text(before + markdown(table) + after, encoding="utf-8")
-
-
-def around(page: pathlib.Path, name: str) -> tuple[str, str]:
-    """The page up to the place of a study's table, and from there on; as `splice`."""
-    check_source(page, "a page with a place for the table")
-    start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-    before, found, rest = page.read_text(encoding="utf-8").partition(start)
-    _, closed, after = rest.partition(end)
-    if not found or not closed:
-        raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
-    return before + start, end + after
 
 
 def flags(description: str, out: str) -> argparse.ArgumentParser:

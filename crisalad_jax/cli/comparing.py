@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import rich.console
 
 from crisalad_jax.cli.common import console
-from crisalad_jax.files import check_target
+from crisalad_jax.files import around, check_target
 
 if TYPE_CHECKING:
     from crisalad_jax.comparison import AdapterCost, ComparisonConfig
@@ -79,7 +79,7 @@ def compare(config: "ComparisonConfig", arguments: Side) -> None:
     check_target(out / "config.json")
     place = out.resolve().name
     if arguments.page is not None:
-        tables.around(arguments.page, place)
+        around(arguments.page, place)
     prepared = prepare(config)
     claim(out, prepared)
     notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=arguments.quiet)

@@ -3,7 +3,6 @@
 import dataclasses
 import pathlib
 
-import jax
 import rich.table
 
 from crisalad_jax.checkpoint import load_weights
@@ -14,7 +13,6 @@ from crisalad_jax.errors import InputError
 from crisalad_jax.files import check_target, write_json
 from crisalad_jax.groupings import check_grouping
 from crisalad_jax.maps import open_map
-from crisalad_jax.model import init_crisalad
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Info:
 
 def run(arguments: Info) -> None:
     """Print the table."""
-    from crisalad_jax.training import split_params
+    from crisalad_jax.training import trained_parameters
 
     check_grouping((), arguments.batch_size, seed=0)
     if arguments.verify and arguments.map is None:
@@ -65,9 +63,7 @@ def run(arguments: Info) -> None:
     config = resized(config, arguments.image_size)
     costs = part_costs(config, images=arguments.batch_size)
     total, macs = sum(c.parameters for c in costs), sum(c.macs for c in costs)
-    template = jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
-    trainable = jax.eval_shape(lambda params: split_params(params, trains)[0], template)
-    trained = sum(leaf.size for leaf in jax.tree.leaves(trainable))
+    trained = trained_parameters(config, trains)
     summary = {
         "model": title,
         "image_size": list(config.image_size),

@@ -22,6 +22,7 @@ from crisalad_jax.report.style import (
     plain_axes,
     save,
 )
+from crisalad_jax.results import percent
 
 _TITLES = {"compare": "Methods compared", "ablate": "What each part brings"}
 
@@ -59,7 +60,7 @@ def write_page(summary: Summary, out: pathlib.Path) -> pathlib.Path:
         "cost_headers": tables.COSTS,
         "costs": costs,
         "adapter_headers": tables.ADAPTERS,
-        "adapters": list(map(tables.adapter_cells, summary.adapters)),
+        "adapters": [(name, cells) for name, *cells in map(tables.adapter_cells, summary.adapters)],
         "notes": summary.notes,
         "settings": json.dumps(summary.settings, indent=2),
     }
@@ -81,9 +82,9 @@ def _recall_cells(summary: Summary, number: int) -> list[_Cell]:
 
 
 def _cell(recall: Recall, *, best: bool) -> _Cell:
-    spread = "" if recall.spread is None else f"± {tables.percent(recall.spread)}\n"
+    spread = "" if recall.spread is None else f"± {percent(recall.spread)}\n"
     interval = tables.interval_words(recall).replace("-", "\N{EN DASH}")
-    return _Cell(tables.percent(recall.mean), spread + interval, best)
+    return _Cell(percent(recall.mean), spread + interval, best)
 
 
 def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawing:
@@ -114,7 +115,7 @@ def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawi
     path = out / f"recall_{number}.png"
     save(figure, path, NARROW_DPI)
     found = "; ".join(
-        f"{title} {tables.percent(row.recalls[name][1].mean)} %"
+        f"{title} {percent(row.recalls[name][1].mean)} %"
         for title, row in zip(titles, rows, strict=True)
     )
     return drawing(path, f"R@1 on {name}: {found}")

@@ -1,7 +1,6 @@
 """What a comparison is, and its parts made and checked before any work starts."""
 
 import dataclasses
-import functools
 import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -15,14 +14,13 @@ from crisalad_jax.comparison.methods import METHODS
 from crisalad_jax.config import LossConfig, ModelConfig, TrainConfig, choose, from_scratch, recipe
 from crisalad_jax.convert import read_backbone
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.errors import InputError
-from crisalad_jax.fit import groups_of
+from crisalad_jax.fit import groups_of, steps_per_epoch
 from crisalad_jax.groupings import check_grouping, parse_groupings
-from crisalad_jax.model import init_crisalad
 from crisalad_jax.nn.vit import init_vit
 from crisalad_jax.reranking import parse_reranking
-from crisalad_jax.training import split_params
+from crisalad_jax.training import trained_parameters
 
 EPOCHS = 6
 """From nothing: all methods in less than an hour on two cores, three seeds, on two small sets."""
@@ -173,15 +171,7 @@ def _own_training_set(
     if training.min_images_of_place < training.min_images:
         places = read_places(config.train, min_images=training.min_images_of_place)
     try:
-        for group in groups_of(training, places):
-            epoch_batches(
-                group,
-                places_per_batch=training.places_per_batch,
-                images_per_place=training.images_per_place,
-                order=training.batch_order,
-                seed=0,
-                epoch=0,
-            )
+        steps_per_epoch(training, groups_of(training, places))
     except InputError as error:
         raise InputError(f"{draft.name}: {error}") from error
     return places
@@ -311,11 +301,8 @@ def _own_places(loss: LossConfig) -> LossConfig:
 
 def _check(variant: Variant, config: ComparisonConfig, benchmarks: list[Benchmark]) -> None:
     """That a variant's parts fit each other and the sets; nothing is computed."""
-    template = jax.eval_shape(
-        functools.partial(init_crisalad, config=variant.model), jax.random.key(0)
-    )
     if variant.trains:
-        jax.eval_shape(lambda p: split_params(p, variant.training.trains)[0], template)
+        trained_parameters(variant.model, variant.training.trains)  # raises where nothing could
     for benchmark in benchmarks:
         if variant.rerank is not None and config.rerank > len(benchmark.database):
             raise InputError(

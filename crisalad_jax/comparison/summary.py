@@ -1,25 +1,23 @@
 """What a comparison found: a row for each method, its recalls over the seeds, what it costs."""
 
-import functools
 import pathlib
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from crisalad_jax.comparison.ablation import NOTES, AdapterCost
 from crisalad_jax.comparison.plan import Prepared, Variant, labels_of, short_names
 from crisalad_jax.comparison.speed import Race
 from crisalad_jax.comparison.work import folder_of, read_json, read_race, result_path
+from crisalad_jax.costs import part_costs
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.errors import InputError
-from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.results import ANY
 from crisalad_jax.scores import Interval, bootstrap_interval
 from crisalad_jax.serial import to_plain
-from crisalad_jax.training import split_params
+from crisalad_jax.training import trained_parameters
 
 KS = (1, 5, 10)
 """The paper's."""
@@ -147,16 +145,12 @@ def _seconds(records: list[dict[str, Any]]) -> float | None:
 
 def _parameters(variant: Variant) -> tuple[int, int | None]:
     """In all, and trained."""
-    template: Crisalad = jax.eval_shape(
-        functools.partial(init_crisalad, config=variant.model), jax.random.key(0)
-    )
-    total = sum(leaf.size for leaf in jax.tree.leaves(template))
+    total = sum(cost.parameters for cost in part_costs(variant.model))
     if variant.weights is not None:
         return total, None
     if not variant.learns:
         return total, 0
-    trainable = jax.eval_shape(lambda p: split_params(p, variant.training.trains)[0], template)
-    return total, sum(leaf.size for leaf in jax.tree.leaves(trainable))
+    return total, trained_parameters(variant.model, variant.training.trains)
 
 
 def _recalls(

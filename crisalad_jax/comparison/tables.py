@@ -11,8 +11,8 @@ from rich.text import Text
 
 from crisalad_jax.comparison.ablation import AdapterCost
 from crisalad_jax.comparison.summary import KS, Recall, Row, Summary
-from crisalad_jax.errors import InputError
-from crisalad_jax.files import atomic_path, check_source, write_json
+from crisalad_jax.files import around, atomic_path, write_json
+from crisalad_jax.results import percent
 
 NOTHING = "-"
 
@@ -21,11 +21,6 @@ def title_of(row: Row, rows: Sequence[Row]) -> str:
     """A row's first label, with its grouping where that has several."""
     several = sum(other.name == row.name for other in rows) > 1
     return f"{row.labels[0]}, {row.grouping}" if several else row.labels[0]
-
-
-def percent(value: float) -> str:
-    """A fraction in percent, with one decimal."""
-    return f"{100 * value:.1f}"
 
 
 def mean_words(recall: Recall) -> str:
@@ -211,23 +206,8 @@ def write_tables(summary: Summary, out: pathlib.Path) -> None:
     write_json(out / "results.json", as_json(summary))
 
 
-def around(page: pathlib.Path, name: str) -> tuple[str, str]:
-    """A page up to the place of a table, and from its end on: between two comments.
-
-    Raises:
-        InputError: there is no such page, or it has no place of this name.
-    """
-    check_source(page, "a page with a place for the table")
-    start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-    before, found, rest = page.read_text(encoding="utf-8").partition(start)
-    _, closed, after = rest.partition(end)
-    if not found or not closed:
-        raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
-    return before + start, end + after
-
-
 def put_in_page(page: pathlib.Path, name: str, text: str) -> None:
-    """Put a text in its place in a page; raises as `around`."""
+    """Put a text in its place in a page; raises as `files.around`."""
     before, after = around(page, name)
     with atomic_path(page) as temporary:
         temporary.write_text(f"{before}\n{text}\n{after}", encoding="utf-8")

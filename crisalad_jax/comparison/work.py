@@ -10,12 +10,11 @@ OUT/speed.json                        the race of all models
 
 import dataclasses
 import functools
-import hashlib
 import json
 import pathlib
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -29,8 +28,8 @@ from crisalad_jax.convert import read_backbone
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate
-from crisalad_jax.files import check_target, write_json
-from crisalad_jax.fit import fit
+from crisalad_jax.files import check_target, sha256_of, write_json
+from crisalad_jax.fit import checksum_of_benchmark, checksum_of_places, fit
 from crisalad_jax.metrics import read_metrics
 from crisalad_jax.model import Crisalad, init_crisalad
 from crisalad_jax.reranking import parse_reranking
@@ -84,20 +83,12 @@ def _behind(prepared: Prepared) -> dict[str, str]:
     files = {str(v.weights) for v in prepared.variants if v.weights is not None}
     if prepared.config.backbone is not None:
         files.add(prepared.config.backbone)
-    found = {}
-    for name in sorted(files):
-        with pathlib.Path(name).open("rb") as file:
-            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    found = {name: sha256_of(name) for name in sorted(files)}
     if prepared.places is not None:
-        found[str(prepared.config.train)] = _digest(prepared.places.files)
+        found[str(prepared.config.train)] = str(checksum_of_places(prepared.places))
     for name, benchmark in zip(prepared.config.test, prepared.benchmarks, strict=True):
-        images = (*benchmark.database, *benchmark.queries)
-        found[name] = _digest([path.name for path in images])
+        found[name] = str(checksum_of_benchmark(benchmark))
     return found
-
-
-def _digest(names: Sequence[str]) -> str:
-    return hashlib.sha256("\n".join(names).encode(errors="surrogateescape")).hexdigest()
 
 
 def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = False) -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Literal
+from typing import Literal, get_args
 
 from crisalad_jax.config.aggregators import (
     PYRAMID_LEVELS,
@@ -25,19 +25,20 @@ from crisalad_jax.config.backbone import PATCH_SIZE, ViTConfig
 from crisalad_jax.config.checks import choose, require, require_choice
 from crisalad_jax.errors import InputError
 
-AGGREGATORS: Mapping[str, str] = {
-    "salad": "salad",
-    "gem-pyramid": "gem_pyramid",
-    "class-token": "class_token",
-    "gem": "gem",
-    "netvlad": "netvlad",
-    "conv-ap": "conv_ap",
-    "cosplace": "cosplace",
-    "mixvpr": "mixvpr",
-    "anyloc": "anyloc",
-    "boq": "boq",
-    "transvpr": "transvpr",
-}
+AggregatorName = Literal[
+    "salad",
+    "gem-pyramid",
+    "class-token",
+    "gem",
+    "netvlad",
+    "conv-ap",
+    "cosplace",
+    "mixvpr",
+    "anyloc",
+    "boq",
+    "transvpr",
+]
+AGGREGATORS: Mapping[str, str] = {name: name.replace("-", "_") for name in get_args(AggregatorName)}
 """The field of `ModelConfig` that describes each."""
 
 _WIDTHS = {
@@ -79,19 +80,7 @@ class ModelConfig:
     normalisation: Literal["imagenet", "local-contrast"] = "imagenet"
     """What 8-bit pixels are normalised by: ImageNet or local mean and deviation."""
     backbone: ViTConfig = ViTConfig()
-    aggregator: Literal[
-        "salad",
-        "gem-pyramid",
-        "class-token",
-        "gem",
-        "netvlad",
-        "conv-ap",
-        "cosplace",
-        "mixvpr",
-        "anyloc",
-        "boq",
-        "transvpr",
-    ] = "salad"
+    aggregator: AggregatorName = "salad"
     """What makes descriptors of the backbone's features; docs/methods.md tells of each."""
     salad: SaladConfig = SaladConfig()
     gem_pyramid: GemPyramidConfig = GemPyramidConfig()
@@ -182,9 +171,15 @@ class ModelConfig:
         return shape.global_dim + shape.tokens * shape.token_dim
 
     @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of patches in an image of `image_size`."""
+        height, width = self.image_size
+        return height // PATCH_SIZE, width // PATCH_SIZE
+
+    @property
     def patches(self) -> int:
         """How many there are in an image of `image_size`."""
-        return math.prod(self.image_size) // PATCH_SIZE**2
+        return math.prod(self.grid)
 
     @property
     def aggregator_layers(self) -> int:

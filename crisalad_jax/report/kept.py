@@ -7,7 +7,7 @@ import matplotlib
 import matplotlib.colors
 import numpy as np
 
-from crisalad_jax.config import PATCH_SIZE, ModelConfig
+from crisalad_jax.config import ModelConfig
 from crisalad_jax.data.images import read_image, resize_image
 from crisalad_jax.model import Crisalad, transport_masses
 from crisalad_jax.nn.salad import Salad
@@ -102,9 +102,8 @@ def transport_of(
     images = [read_image(path) for path in paths]
     batch = np.stack([resize_image(image, config.image_size) for image in images])
     masses = np.asarray(transport_masses(params, batch, config), np.float32)
-    grid = tuple(side // PATCH_SIZE for side in config.image_size)
     return [
-        Transported(image, mass.reshape(*grid, -1), config.salad.clusters)
+        Transported(image, mass.reshape(*config.grid, -1), config.salad.clusters)
         for image, mass in zip(images, masses, strict=True)
     ]
 

@@ -20,7 +20,7 @@ from crisalad_jax.report.choice import Verdicts, choose_shown, judge
 from crisalad_jax.report.kept import transport_section
 from crisalad_jax.report.sections import Subject
 from crisalad_jax.report.tables import check_fractions
-from crisalad_jax.results import ANY, GroupingResult
+from crisalad_jax.results import ANY, GroupingResult, percent
 
 PAGE = "index.html"
 
@@ -98,11 +98,6 @@ def render(context: Mapping[str, Any], template: str = "page.html") -> str:
     )
     environment.filters["percent"] = percent
     return environment.get_template(template).render(context)
-
-
-def percent(value: float) -> str:
-    """A fraction in percent, with one decimal."""
-    return f"{100 * value:.1f}"
 
 
 class _Cell(NamedTuple):

@@ -29,7 +29,7 @@ def windows_of(config: ModelConfig) -> list[tuple[int, float, Grid]]:
     Raises:
         InputError: none is left.
     """
-    rows, columns = (side // PATCH_SIZE for side in config.image_size)
+    rows, columns = config.grid
     fitting = [
         (side, weight, (rows - side + 1, columns - side + 1))
         for side, weight in WINDOWS
@@ -86,13 +86,12 @@ def describe(
     """Unit descriptors of the windows of all sizes, the smallest first, in float16."""
     aggregator = params.aggregator
     assert isinstance(aggregator, NetVlad)
-    grid = config.image_size[0] // PATCH_SIZE, config.image_size[1] // PATCH_SIZE
     features = unit_features(params, images, config)
     assignment = shares(aggregator, features)
 
     def of_one(image: tuple[Array, Array]) -> Array:
         parts = [
-            window_vlads(*image, widen(aggregator.centroids), grid, side)
+            window_vlads(*image, widen(aggregator.centroids), config.grid, side)
             for side, _, _ in windows_of(config)
         ]
         return jnp.concatenate(parts).astype(jnp.float16)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from crisalad_jax import platform
-from crisalad_jax.config import PATCH_SIZE, ModelConfig
+from crisalad_jax.config import ModelConfig
 from crisalad_jax.model import Crisalad, Images, features_of
 from crisalad_jax.nn.aggregators.transvpr import TransVpr, key_features
 from crisalad_jax.reranking.matching import inliers, mutual_matches
@@ -16,12 +16,7 @@ from crisalad_jax.reranking.matching import inliers, mutual_matches
 
 def shape(config: ModelConfig) -> tuple[int, int]:
     """How many patches an image has, and numbers in each one's feature."""
-    rows, columns = _grid(config)
-    return rows * columns, config.backbone.dim
-
-
-def _grid(config: ModelConfig) -> tuple[int, int]:
-    return config.image_size[0] // PATCH_SIZE, config.image_size[1] // PATCH_SIZE
+    return config.patches, config.backbone.dim
 
 
 @functools.partial(platform.jit, static_argnames="config")
@@ -41,7 +36,7 @@ def score(
 ) -> Float[np.ndarray, " candidate"]:
     """How many mutual matches of key patches are RANSAC's inliers (paper section 3.3)."""
     matches = np.asarray(_matches(query, candidates))
-    return np.array([inliers(each, _grid(config)) for each in matches], np.float32)
+    return np.array([inliers(each, config.grid) for each in matches], np.float32)
 
 
 @platform.jit
