@@ -49,8 +49,9 @@ from crisalad_jax import evaluation, platform
 from crisalad_jax.config import PRESETS, ModelConfig
 from crisalad_jax.cores import usable_cores
 from crisalad_jax.data import synthetic
-from crisalad_jax.data.images import list_images, read_image, resize_image
+from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.loader import image_batches
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.descriptors import writer_for
 from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN, LOCAL_NOISE, LOCAL_WINDOW
 

@@ -30,7 +30,8 @@ from crisalad_jax.config import (
 )
 from crisalad_jax.convert import read_checkpoint
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.images import list_images, read_image, resize_image
+from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.files import write_json
 from crisalad_jax.layouts import public_shapes

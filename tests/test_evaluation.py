@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import FolderTokens, evaluate, group, read_tokens, same_place_rule
 from crisalad_jax.groupings import GROUPINGS, batches_of

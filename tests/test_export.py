@@ -30,7 +30,8 @@ from crisalad_jax.config import (
     ModelConfig,
     SinkhornConfig,
 )
-from crisalad_jax.data.images import list_images, read_image, resize_image
+from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.export import (
     ExportConfig,

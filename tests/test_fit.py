@@ -15,8 +15,9 @@ import crisalad_jax.fit
 from crisalad_jax.checkpoint import load_weights
 from crisalad_jax.config import TrainConfig
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import GroupingResult, evaluate
 from crisalad_jax.fit import FitResult, claim_run, fit

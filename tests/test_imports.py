@@ -138,7 +138,10 @@ def loaded_after(statement: str, candidates: set[str]) -> set[str]:
     return set(done.stdout.split())
 
 
-HEAVY = {"cv2", "orbax", "grain", "h5py", "tyro", "optax", "safetensors", "matplotlib", "rich"}
+HEAVY = {
+    *("cv2", "grain", "h5py", "matplotlib", "numba", "optax", "orbax", "rich", "safetensors"),
+    "tyro",
+}
 
 
 def test_a_model_needs_no_file_formats():

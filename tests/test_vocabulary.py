@@ -13,8 +13,9 @@ import safetensors.numpy
 import crisalad_jax.fit
 from crisalad_jax.checkpoint import load_weights, save_weights
 from crisalad_jax.config import AnyLocConfig, CrossImageConfig, NetVladConfig, recipe
-from crisalad_jax.data.images import list_images, read_image, resize_image
+from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.files import write_json
 from crisalad_jax.fit import fit

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from crisalad_jax.data.images import resize_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 
 _SIDE = 128

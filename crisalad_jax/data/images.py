@@ -1,18 +1,16 @@
-"""Pictures from files: decode to 8-bit RGB, resize as Pillow does, list a folder.
+"""Pictures from files: decode to 8-bit RGB, list a folder.
 
 JPEG markers are from ITU-T T.81 annex B, PNG chunks from the W3C PNG specification, section 5.
 """
 
-import functools
 import os
 import pathlib
 import re
-import threading
 from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.errors import InputError
@@ -31,12 +29,6 @@ _REDUCED = (
     (4, cv2.IMREAD_REDUCED_GRAYSCALE_4),
     (2, cv2.IMREAD_REDUCED_GRAYSCALE_2),
 )
-# OpenBLAS takes several threads for a product of more than so many multiplications: more than all
-# cores have to do, where each decodes an image of its own.
-_SERIAL = 2**18
-_KEPT = 3 * 2**22
-_Band = tuple[slice, slice, np.ndarray]
-"""Which outputs are made of which inputs, by which weights."""
 
 
 def read_image(
@@ -129,97 +121,6 @@ def _png_is_whole(data: bytes) -> bool:
         if kind == b"IEND":
             return True
     return False
-
-
-def resize_image(
-    image: UInt8[np.ndarray, "h w 3"], image_size: tuple[int, int]
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Resize to `image_size`, (height, width), without keeping the aspect ratio.
-
-    Bilinear, and antialiased where it shrinks: a triangle filter two output pixels wide, which is
-    Pillow's BILINEAR and so torchvision's Resize, with which the public models were trained and
-    evaluated. Equal to Pillow within one grey level. (OpenCV's INTER_AREA is a box, on photographs
-    several times further away; its INTER_LINEAR aliases.)
-    """
-    height, width = image.shape[:2]
-    new_height, new_width = image_size
-    if height * new_width < new_height * width:
-        # Columns first gives the smaller intermediate, much smaller for extreme aspect ratios.
-        turned = resize_image(cv2.transpose(image), (new_width, new_height))
-        return cv2.transpose(turned)
-    pixels = image.reshape(height, 3 * width)
-    rows = _scratch("rows", new_height, 3 * width)
-    for outputs, inputs, weights in _row_bands(height, new_height, 3 * width):
-        band = _scratch("band", inputs.stop - inputs.start, 3 * width)
-        band[:] = pixels[inputs]
-        np.matmul(weights, band, out=rows[outputs])
-    resized = _scratch("resized", new_height, 3 * new_width)
-    for outputs, inputs, weights in _column_bands(width, new_width, new_height):
-        np.matmul(rows[:, inputs], weights, out=resized[:, outputs])
-    return cv2.convertScaleAbs(resized).reshape(new_height, new_width, 3)
-
-
-_kept = threading.local()
-
-
-def _scratch(name: str, rows: int, columns: int) -> Float32[np.ndarray, "rows columns"]:
-    """Memory of this thread, with anything in it; the same the next time.
-
-    Memory that is new each time the system hands out page by page, which takes longer than the
-    products that go into it. What is larger than a photograph of 4 megapixels is not kept.
-    """
-    size = rows * columns
-    if size > _KEPT:
-        return np.empty((rows, columns), np.float32)
-    memory = getattr(_kept, name, None)
-    if memory is None or memory.size < size:
-        memory = np.empty(size, np.float32)
-        setattr(_kept, name, memory)
-    return memory[:size].reshape(rows, columns)
-
-
-@functools.lru_cache(maxsize=64)
-def _row_bands(old: int, new: int, columns: int) -> list[_Band]:
-    """To multiply rows of `columns` numbers from the left."""
-    return _bands(old, new, columns)
-
-
-@functools.lru_cache(maxsize=64)
-def _column_bands(old: int, new: int, rows: int) -> list[_Band]:
-    """To multiply `rows` rows from the right, which hold three numbers for each pixel."""
-
-    def wide(pixels: slice) -> slice:
-        return slice(3 * pixels.start, 3 * pixels.stop)
-
-    # Each number is that of its own channel alone: two thirds of the products are with zeros, which
-    # takes less time than to turn the picture twice.
-    eye = np.eye(3, dtype=np.float32)
-    return [
-        (wide(outputs), wide(inputs), np.kron(weights.T, eye))
-        for outputs, inputs, weights in _bands(old, new, 9 * rows)
-    ]
-
-
-def _bands(old: int, new: int, others: int) -> list[_Band]:
-    """The banded matrix that resamples `old` values to `new`, cut into small dense blocks.
-
-    By so many `others` a block is multiplied, in less work than is shared among threads.
-    """
-    scale = old / new
-    radius = max(scale, 1.0)
-    centres = (np.arange(new) + 0.5) * scale
-    size = next(n for n in (8, 4, 2, 1) if n * (n + 2) * radius * others <= _SERIAL or n == 1)
-    bands = []
-    for start in range(0, new, size):
-        stop = min(start + size, new)
-        block = centres[start:stop, None]
-        low = max(0, int(block[0, 0] - radius))
-        high = min(old, int(np.ceil(block[-1, 0] + radius)))
-        distances = np.abs(np.arange(low, high) + 0.5 - block) / radius
-        weights = np.maximum(0, 1 - distances)
-        weights /= weights.sum(axis=1, keepdims=True)
-        bands.append((slice(start, stop), slice(low, high), weights.astype(np.float32)))
-    return bands
 
 
 def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:

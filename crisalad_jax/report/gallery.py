@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.report.style import DPI, GREY, INK, RIGHT, WRONG, fit_width, save
 

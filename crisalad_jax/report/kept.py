@@ -8,7 +8,8 @@ import matplotlib.colors
 import numpy as np
 
 from crisalad_jax.config import ModelConfig
-from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.model import Crisalad, transport_masses
 from crisalad_jax.nn.salad import Salad
 from crisalad_jax.report.choice import Shown

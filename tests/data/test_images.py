@@ -1,17 +1,17 @@
-"""Reading, resizing and listing images, against Pillow."""
+"""Reading and listing images, against Pillow."""
 
 import io
 import pathlib
 import struct
 import zlib
-from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image, resize_image
+from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 
 PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
@@ -238,50 +238,6 @@ def test_the_log_level_is_restored(tmp_path):
         except InputError:
             assert data == b"text"
         assert cv2.utils.logging.getLogLevel() == before
-
-
-SIZES = [(224, 224), (322, 322), (70, 126), (448, 420)]
-
-
-@pytest.mark.parametrize("image_size", SIZES)
-@pytest.mark.parametrize("shape", [(480, 640), (72, 97), (224, 224), (1, 1), (3, 20_000), (701, 1)])
-def test_resize_is_pillows(shape, image_size):
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
-    height, width = image_size
-    expected = np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))
-    resized = resize_image(image, image_size)
-    assert resized.dtype == np.uint8
-    # Pillow rounds after each direction, we once: at most a level, a quarter of one on average.
-    assert largest_difference(resized, expected) <= 1
-    assert np.abs(resized.astype(int) - expected).mean() < 0.25
-
-
-def test_resize_to_the_same_size_changes_nothing():
-    image = smooth_picture()
-    np.testing.assert_array_equal(resize_image(image, (60, 80)), image)
-
-
-def test_resize_of_a_mirrored_view():
-    image = smooth_picture()
-    mirrored = np.flip(image, axis=1)
-    np.testing.assert_array_equal(
-        resize_image(mirrored, (28, 42)), resize_image(np.ascontiguousarray(mirrored), (28, 42))
-    )
-
-
-def test_pictures_resized_between_and_beside_change_nothing():
-    """What the resize keeps in memory is of its thread, and never part of what it returns."""
-    rng = np.random.default_rng(1)
-    shapes = ((60, 80), (200, 90), (1, 1), (150, 170), (30, 400)) * 8
-    images = [rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in shapes]
-    alone = []
-    for image in images:
-        with ThreadPoolExecutor(1) as fresh:
-            alone.append(fresh.submit(resize_image, image, (70, 84)).result())
-    with ThreadPoolExecutor(4) as together:
-        found = list(together.map(lambda image: resize_image(image, (70, 84)), images))
-    np.testing.assert_array_equal(found, alone)
 
 
 def test_photographs_read_and_resize_as_by_pillow():

@@ -15,9 +15,10 @@ import pytest
 from crisalad_jax.config import LightAugmentConfig, RandAugmentConfig
 from crisalad_jax.data import loader
 from crisalad_jax.data.augment import augment
-from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageBatch, ImageCache, image_batches, training_batches
 from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 
 SIZE = (28, 42)

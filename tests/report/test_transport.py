@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.report.kept import transport_of
 from crisalad_jax.report.transport import (

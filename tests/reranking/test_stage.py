@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from crisalad_jax.config import ModelConfig, NetVladConfig, TransVprConfig
-from crisalad_jax.data.images import read_image, resize_image
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.errors import InputError
 from crisalad_jax.evaluation import evaluate
 from crisalad_jax.reranking import (
