@@ -315,7 +315,7 @@ def train_step(
     transport = jax.tree.map(lambda each: jnp.where(valid, each, 0).sum() / valid.sum(), transport)
     norm = optax.tree.norm((gradient, classifier_gradient))
     optimiser = config.make_optimiser()
-    updates, new_optimiser = optimiser.update(placed(gradient), state.optimiser, state.trainable)
+    updates, new_optimiser = optimiser.update(gradient, state.optimiser, state.trainable)
     classifiers = state.classifiers
     if classifiers is not None:
         rate = config.loss.large_margin_cosine.learning_rate
