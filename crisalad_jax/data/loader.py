@@ -1,6 +1,7 @@
 """Batches of decoded images, read ahead by threads or processes (grain) in a fixed order."""
 
 import contextlib
+import itertools
 import multiprocessing
 import os
 import signal
@@ -249,15 +250,24 @@ def _batches(
         except InputError as error:
             return None, str(error)
 
-    starts = range(0, len(positions), batch_size)
-    ends = [min(start + batch_size, len(positions)) for start in starts]
+    spans = [
+        range(start, min(start + batch_size, len(positions)))
+        for start in range(0, len(positions), batch_size)
+    ]
     # Smaller than a batch, so that the threads share the batch in hand.
     size = max(1, min(_TOGETHER, batch_size // max(threads, workers, 1)))
-    runs = [
-        range(first, min(first + size, end))
-        for start, end in zip(starts, ends, strict=True)
-        for first in range(start, end, size)
-    ]
+    runs = [span[first : first + size] for span in spans for first in range(0, len(span), size)]
+
+    def one_by_one(
+        stream: Iterator[list[tuple[_Image | None, str]]],
+    ) -> Iterator[tuple[_Image | None, str]]:
+        try:
+            yield from itertools.chain.from_iterable(stream)
+        except RuntimeError as error:
+            if not workers:
+                raise
+            words = f"workers: one of {workers} that read images has ended: {error}"
+            raise InputError(words) from error
 
     def batches() -> Iterator[ImageBatch]:
         dataset = grain.MapDataset.source(runs).map(lambda run: list(map(load_or_tell, run)))
@@ -265,26 +275,18 @@ def _batches(
         stream = iter(_ahead(dataset, ahead, threads, workers))
         # Closing cancels what is queued, so that an abandoned epoch does not go on decoding.
         with ONE_THREAD, contextlib.closing(stream):
-            for start, end in zip(starts, ends, strict=True):
+            found = one_by_one(stream)
+            for span in spans:
+                part = positions[span.start : span.stop]
                 batch = _empty_batch(batch_size, image_size)
-                batch.labels[: end - start] = labels[positions[start:end]]
-                batch.indices[: end - start] = indices[positions[start:end]]
-                slot = 0
-                while slot < end - start:
-                    try:
-                        found = next(stream)
-                    except RuntimeError as error:
-                        if not workers:
-                            raise
-                        words = f"workers: one of {workers} that read images has ended: {error}"
-                        raise InputError(words) from error
-                    for image, problem in found:
-                        if image is not None:
-                            batch.images[slot] = image
-                            batch.valid[slot] = True
-                        elif on_bad_image == "stop":
-                            raise InputError(problem)
-                        slot += 1
+                batch.labels[: len(part)] = labels[part]
+                batch.indices[: len(part)] = indices[part]
+                for slot, (image, problem) in enumerate(itertools.islice(found, len(part))):
+                    if image is not None:
+                        batch.images[slot] = image
+                        batch.valid[slot] = True
+                    elif on_bad_image == "stop":
+                        raise InputError(problem)
                 yield batch
 
     return batches()
