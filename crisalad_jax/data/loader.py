@@ -1,6 +1,7 @@
 """Batches of decoded images, read ahead by threads or processes (grain) in a fixed order."""
 
 import contextlib
+import gc
 import itertools
 import multiprocessing
 import os
@@ -267,9 +268,11 @@ def _batches(
             if not workers:
                 raise
             words = f"workers: one of {workers} that read images has ended: {error}"
+            if "exit code -7" in str(error):  # SIGBUS
+                words += " (likely for want of shared memory: give /dev/shm more, or less workers)"
             raise InputError(words) from error
 
-    def batches() -> Iterator[ImageBatch]:
+    def batches() -> Generator[ImageBatch, None, None]:
         dataset = grain.MapDataset.source(runs).map(lambda run: list(map(load_or_tell, run)))
         ahead = -(-BATCHES_AHEAD * batch_size // size)
         stream = iter(_ahead(dataset, ahead, threads, workers))
@@ -289,14 +292,16 @@ def _batches(
                         raise InputError(problem)
                 yield batch
 
-    return batches()
+    return _released(batches()) if workers else batches()
 
 
 def _ahead(dataset: grain.MapDataset, many: int, threads: int, workers: int) -> grain.IterDataset:
     """Elements made so many ahead, in order."""
     if not workers:
         return dataset.to_iter_dataset(
-            grain.ReadOptions(num_threads=threads, prefetch_buffer_size=many if threads else 0)
+            grain.ReadOptions(
+                num_threads=min(threads, many), prefetch_buffer_size=many if threads else 0
+            )
         )
     if not flags.FLAGS.is_parsed():
         flags.FLAGS.mark_as_parsed()  # grain's own, which it hands to its processes
@@ -305,6 +310,15 @@ def _ahead(dataset: grain.MapDataset, many: int, threads: int, workers: int) -> 
         grain.MultiprocessingOptions(workers, per_worker_buffer_size=-(-many // workers)),
         worker_init_fn=_begin_work,
     )
+
+
+def _released(batches: Generator[ImageBatch, None, None]) -> Iterator[ImageBatch]:
+    """The same; the memory shared with processes, held by objects in cycles, is given back."""
+    try:
+        with contextlib.closing(batches):
+            yield from batches
+    finally:
+        gc.collect()
 
 
 def _begin_work(_index: int, _count: int) -> None:

@@ -138,6 +138,63 @@ def test_processes_read_the_same_and_name_what_they_cannot(places):
         train(places, workers=1, **options)
 
 
+READER = """
+import sys, time
+from crisalad_jax.data.loader import training_batches
+from crisalad_jax.data.places import read_places
+
+if __name__ == "__main__":
+    for epoch in range(2):
+        for batch in training_batches(
+            read_places(sys.argv[1], min_images=3), image_size=(224, 224), places_per_batch=2,
+            images_per_place=3, order="within-city", augment=None, seed=1, epoch=epoch, workers=2
+        ):
+            assert batch.valid.all()
+    time.sleep(1)  # a thread of grain's gives the memory back
+"""
+
+
+@pytest.mark.slow
+def test_processes_that_read_leave_no_shared_memory(places, tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(READER)
+    done = subprocess.run(
+        [sys.executable, str(program), str(places.root)], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_parts_of_a_batch_are_the_whole(places):
+    """For processes, each of which reads one: also on from the middle of an epoch."""
+    options = {"augment": RandAugmentConfig(), "start_step": 1}
+    whole = train(places, **options)
+    parts = [train(places, part=(number, 3), **options) for number in range(3)]
+    assert_same(
+        [
+            ImageBatch(*map(np.concatenate, zip(*step, strict=True)))
+            for step in zip(*parts, strict=True)
+        ],
+        whole,
+    )
+    with pytest.raises(InputError, match=r"part: found \(0, 4\), expected .* which divides 6"):
+        train(places, part=(0, 4))
+    with pytest.raises(InputError, match=r"part: found \(3, 3\)"):
+        train(places, part=(3, 3))
+
+
+@pytest.mark.parametrize("threads", [0, 1, 2, 5])
+@pytest.mark.parametrize("batch_size", [1, 5, 20, 50])
+def test_batches_of_any_size_are_the_images_one_by_one(places, batch_size, threads):
+    """Threads take up to eight images at a time, which divide few batches."""
+    paths = [places.path(number % 21) for number in range(47)]
+    batches = list(image_batches(paths, image_size=SIZE, batch_size=batch_size, threads=threads))
+    images = np.concatenate([batch.images[batch.valid] for batch in batches])
+    np.testing.assert_array_equal(images, np.stack([plain(path) for path in paths]))
+    indices = np.concatenate([batch.indices for batch in batches])
+    padding = -47 % batch_size
+    np.testing.assert_array_equal(indices, [*range(47), *[-1] * padding])
+
+
 SLOW_READER = """
 import sys, time
 import numpy as np

@@ -1,12 +1,17 @@
 """The resize, against Pillow's."""
 
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 import pytest
 from PIL import Image
 
+from crisalad_jax.data import resize
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.errors import InputError
 
 SIZES = [(224, 224), (322, 322), (70, 126), (448, 420)]
 
@@ -58,3 +63,62 @@ def test_threads_beside_each_other_change_nothing():
     with ThreadPoolExecutor(4) as together:
         found = list(together.map(lambda image: resize_image(image, (70, 84)), images))
     np.testing.assert_array_equal(found, alone)
+
+
+def test_threads_that_meet_at_the_first_picture_compile_once():
+    """And what is compiled lets go of Python's lock."""
+    program = """
+import threading
+from concurrent.futures import ThreadPoolExecutor
+import numba, numpy
+from crisalad_jax.data.resize import resize_image
+
+barrier, compiled, njit = threading.Barrier(8), [], numba.njit
+
+def counted(*arguments, **options):
+    if "nogil" in options:  # numba compiles parts of its own, too
+        compiled.append(options["nogil"])
+    return njit(*arguments, **options)
+
+numba.njit = counted
+
+def first(_):
+    barrier.wait()
+    return resize_image(numpy.zeros((30, 40, 3), numpy.uint8), (28, 28))
+
+with ThreadPoolExecutor(8) as threads:
+    list(threads.map(first, range(8)))
+print(compiled)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "[True]\n", done.stderr
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no locator"), OSError(28, "No space left")])
+def test_where_nothing_can_be_kept_it_compiles_all_the_same(monkeypatch, error):
+    njit = numba.njit
+
+    def keeps_nothing(*arguments, cache=False, **options):
+        if cache:
+            raise error
+        return njit(*arguments, **options)
+
+    expected = resize_image(picture(60, 80), (28, 42))
+    monkeypatch.setattr(numba, "njit", keeps_nothing)
+    monkeypatch.setattr(resize, "_compiled", resize._compiled.__wrapped__)
+    np.testing.assert_array_equal(resize_image(picture(60, 80), (28, 42)), expected)
+
+
+@pytest.mark.parametrize(
+    ("image", "image_size", "message"),
+    [
+        (np.zeros((4, 5, 3), np.float32), (2, 2), r"image: found float32 of shape \(4, 5, 3\)"),
+        (np.zeros((4, 5), np.uint8), (2, 2), r"image: found uint8 of shape \(4, 5\), expected"),
+        (np.zeros((4, 5, 4), np.uint8), (2, 2), r"image: found uint8 of shape \(4, 5, 4\)"),
+        (np.zeros((0, 5, 3), np.uint8), (2, 2), r"image: found uint8 of shape \(0, 5, 3\)"),
+        (np.zeros((4, 5, 3), np.uint8), (0, 2), r"image_size: found \(0, 2\), expected sides"),
+    ],
+)
+def test_what_is_no_picture(image, image_size, message):
+    with pytest.raises(InputError, match=message):
+        resize_image(image, image_size)
