@@ -1,6 +1,7 @@
 """The states that a run resumes from (orbax)."""
 
 import contextlib
+import json
 import os
 import pathlib
 import shutil
@@ -14,9 +15,11 @@ import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
 from crisalad_jax.errors import InputError
+from crisalad_jax.files import sha256_of, write_json
 from crisalad_jax.pytree import named_leaves
 
 _DROPPED = "dropped"
+_SEAL = "sha256.json"
 
 
 class Saved(NamedTuple):
@@ -47,6 +50,7 @@ class StateStore:
             create=False,
             todelete_subdir=_DROPPED,
             enable_async_checkpointing=True,
+            async_options=ocp.AsyncOptions(post_finalization_callback=self._seal),
             cleanup_tmp_directories=True,
             multiprocessing_options=alone,
         )
@@ -95,8 +99,9 @@ class StateStore:
             return None
         wanted = jax.tree.map(ocp.utils.to_shape_dtype_struct, _stored(template))
         try:
-            # Before any array is read: orbax reads all at once, and every misfit is an exception
-            # in a thread of its own.
+            # Before any array is read: orbax reads all at once, and whatever does not fit is an
+            # exception in a thread of its own.
+            self._check_seal(step)
             found = self._manager.item_metadata(step)["state"].tree
             misfits = _misfits(wanted, found)
             if misfits:
@@ -108,7 +113,7 @@ class StateStore:
                 ),
             )
         except Exception as error:  # whatever a damaged file makes orbax and its threads raise
-            reason = " ".join(str(error).split())[:200]
+            reason = " ".join(str(error).partition("See full TensorStore")[0].split())[:200]
             older = [other for other in self._manager.all_steps() if other != step]
             advice = f"; delete it to go on from step {max(older)}" if older else ""
             raise InputError(
@@ -120,9 +125,21 @@ class StateStore:
             jnp.asarray(np.asarray(saved["state"].get(name, leaf)))
             for name, leaf in named_leaves(template).items()
         ]
-        return Saved(
-            step, jax.tree.unflatten(jax.tree.structure(template), leaves), saved["record"]
-        )
+        state = jax.tree.unflatten(jax.tree.structure(template), leaves)
+        return Saved(step, state, saved["record"])
+
+    def _seal(self) -> None:
+        """List the files of the state that is being written, before orbax gives it its name."""
+        for folder in self._folder.glob("*.orbax-checkpoint-tmp*"):  # one
+            write_json(folder / _SEAL, _hashes(folder))
+
+    def _check_seal(self, step: int) -> None:
+        folder = self._folder / str(step)
+        sealed, found = json.loads((folder / _SEAL).read_text()), _hashes(folder)
+        for name, sha256 in sealed.items():
+            if found.get(name) != sha256:
+                what = "other bytes than were saved" if name in found else "no file"
+                raise ValueError(f"{name}: found {what}")
 
     def wait(self) -> None:
         """Return when all that was saved is on the disk; raises as `save`."""
@@ -146,6 +163,12 @@ class StateStore:
     def _clear(self) -> None:
         # What is dropped is renamed first: a kill while it is removed leaves no half of a state.
         shutil.rmtree(self._dropped, ignore_errors=True)
+
+
+def _hashes(folder: pathlib.Path) -> dict[str, str]:
+    """SHA-256 of all files of a state's arrays and record."""
+    files = (path for path in folder.glob("*/**/*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
 
 
 def _stored(state: PyTree) -> dict[str, Any]:

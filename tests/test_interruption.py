@@ -20,7 +20,7 @@ from tests.conftest import RECIPE
 from tests.test_fit import metrics_of
 
 ROOT = pathlib.Path(__file__).parents[1]
-EPOCHS = 6
+EPOCHS = 4
 CONFIG = dataclasses.replace(RECIPE, epochs=EPOCHS, patience=None, keep_best=2)
 PROGRAM = """
 import pathlib, sys

@@ -53,17 +53,37 @@ def test_a_state_of_another_model_is_refused(tmp_path, state):
     store.close()
 
 
-def test_a_damaged_state_is_refused_and_the_older_one_named(tmp_path, state):
+def cut_short(data: bytes) -> bytes:
+    return data[:100]
+
+
+def with_one_bit_turned(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+
+
+@pytest.mark.parametrize("damage", [cut_short, with_one_bit_turned])
+@pytest.mark.parametrize("part", ["state", "record"])
+def test_a_damaged_state_is_refused_and_the_older_one_named(tmp_path, state, capfd, part, damage):
+    """In one line: what reads the arrays, all at once, must not come to the damaged one."""
     store = StateStore(tmp_path / "state")
-    store.save(1, state, {})
-    store.save(2, state, {})
+    store.save(1, state, {"best": list(range(100))})
+    store.save(2, state, {"best": list(range(100))})
     store.wait()
-    files = [file for file in (tmp_path / "state" / "2" / "state").rglob("*") if file.is_file()]
+    files = [file for file in (tmp_path / "state" / "2" / part).rglob("*") if file.is_file()]
     largest = max(files, key=lambda file: file.stat().st_size)
-    largest.write_bytes(largest.read_bytes()[:100])
+    largest.write_bytes(damage(largest.read_bytes()))
+    words = f"{largest.relative_to(tmp_path / 'state' / '2')}: found other bytes than were saved"
     with pytest.raises(
         InputError,
-        match=f"^{tmp_path}/state/2: this state is damaged .*; delete it to go on from step 1",
+        match=f"^{tmp_path}/state/2: this state is damaged .*; delete it to go on from step 1 .*"
+        f"{re.escape(words)}",
+    ):
+        store.load(state)
+    largest.unlink()
+    with pytest.raises(
+        InputError, match=f"{re.escape(words.replace('other bytes than were saved', 'no file'))}"
     ):
         store.load(state)
     store.close()
+    assert capfd.readouterr().err == ""
