@@ -1,59 +1,66 @@
 """CriSALAD visual place recognition in pure JAX.
 
-Names are imported on first use, so that reading pictures takes no jax and a model no file formats.
+The public names are listed once, in `__init__.pyi`, and imported when they are first used, so that
+reading pictures takes no jax and a model no file formats.
 """
 
+import ast
 import importlib
-from typing import TYPE_CHECKING, Any
+import operator
+import pathlib
+import sys
+import warnings
+from typing import Any
 
-if TYPE_CHECKING:
-    from crisalad_jax.checkpoint import load_weights as load
-    from crisalad_jax.checkpoint import save_weights as save
-    from crisalad_jax.config import PRESETS, ModelConfig, TrainConfig, recipe
-    from crisalad_jax.errors import InputError
-    from crisalad_jax.losses import metric_loss
-    from crisalad_jax.model import Crisalad, alone, among, describe, init_crisalad
-    from crisalad_jax.sinkhorn import sinkhorn as solve_transport
+from crisalad_jax.utils.extras import missing_extra
+from crisalad_jax.utils.version import VERSION
 
-__all__ = [
-    "PRESETS",
-    "Crisalad",
-    "InputError",
-    "ModelConfig",
-    "TrainConfig",
-    "alone",
-    "among",
-    "describe",
-    "init_crisalad",
-    "load",
-    "metric_loss",
-    "recipe",
-    "save",
-    "solve_transport",
-]
+__version__ = VERSION
 
-_HOMES = {
-    "PRESETS": "config.PRESETS",
-    "Crisalad": "model.Crisalad",
-    "InputError": "errors.InputError",
-    "ModelConfig": "config.ModelConfig",
-    "TrainConfig": "config.TrainConfig",
-    "alone": "model.alone",
-    "among": "model.among",
-    "describe": "model.describe",
-    "init_crisalad": "model.init_crisalad",
-    "load": "checkpoint.load_weights",
-    "metric_loss": "losses.metric_loss",
-    "recipe": "config.recipe",
-    "save": "checkpoint.save_weights",
-    # `crisalad_jax.sinkhorn` is the module.
-    "solve_transport": "sinkhorn.sinkhorn",
+
+def _homes() -> dict[str, tuple[str, str | None]]:
+    """Read the public names from the stub: the module of each, and its name there."""
+    stub = ast.parse(pathlib.Path(__file__).with_suffix(".pyi").read_bytes())
+    homes: dict[str, tuple[str, str | None]] = {}
+    for node in stub.body:
+        if isinstance(node, ast.ImportFrom) and node.module and node.module != "typing":
+            for alias in node.names:
+                module = f"{node.module}.{alias.name}"
+                is_module = node.module == __name__
+                home = (module, None) if is_module else (node.module, alias.name)
+                homes[alias.asname or alias.name] = home
+    return homes
+
+
+_HOMES = _homes()
+__all__ = sorted([*_HOMES, "__version__"])
+
+
+_RENAMED = {
+    "alone": "self_mask",
+    "among": "valid_mask",
+    "save": "save_weights",
+    "solve_transport": "sinkhorn.solve",
 }
+"""Public names of version 0.1."""
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, from the module it lives in."""
+    """Import a public name from the module it lives in."""
+    if name in _RENAMED:
+        warnings.warn(f"crisalad_jax.{name} is {_RENAMED[name]} now", FutureWarning, stacklevel=2)
+        return operator.attrgetter(_RENAMED[name])(sys.modules[__name__])
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, attribute = _HOMES[name].partition(".")
-    return getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
+    module, attribute = _HOMES[name]
+    try:
+        home = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        message = missing_extra(error, f"{__name__}.{name}")
+        raise ModuleNotFoundError(message, name=error.name) from error
+    return home if attribute is None else getattr(home, attribute)
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return __all__

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 import rich.console
 import tyro
 
-from crisalad_jax.config import choose
-from crisalad_jax.errors import InputError
-from crisalad_jax.files import check_target
-from crisalad_jax.progress import progress_bar
+from crisalad_jax.config.checks import choose
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_target
+from crisalad_jax.utils.progress import progress_bar
 from parity.cases import checks
 from parity.compare import PRECISIONS, Row
 from parity.full_size import full_size_checks

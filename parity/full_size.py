@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from crisalad_jax.config import PRESETS
-from crisalad_jax.model import Crisalad, describe
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.nn.model import Crisalad, describe
 from parity.cases.case import build, convert, random
 from parity.compare import TOLERANCES, Row, Tolerance, as_double, compare
 from parity.reference.model import Crisalad as TorchCrisalad

@@ -11,7 +11,7 @@ from typing import Any
 import rich.box
 import rich.table
 
-from crisalad_jax.files import atomic_path, write_json
+from crisalad_jax.utils.files import atomic_path, write_json
 from parity.compare import Row
 
 PACKAGES = ("jax", "optax", "torch", "numpy")

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.convert import read_checkpoint
-from crisalad_jax.layouts import to_state
-from crisalad_jax.model import Crisalad
-from crisalad_jax.nn.vit import Features, facet
+from crisalad_jax.checkpoints.layouts import to_state
+from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.nn.backbones import FeatureRequest, Features
+from crisalad_jax.nn.backbones.vit import vit
+from crisalad_jax.nn.model import Crisalad
 from parity.reference.model import Crisalad as TorchCrisalad
 from parity.test_goldens import OUTPUT_BOUND
 from parity.test_independent import (
@@ -68,8 +69,11 @@ def test_facets_are_transformers(kind: Kind, number: int, tmp_path: pathlib.Path
 
     @jax.jit
     def all_of(images: jax.Array) -> dict[str, Features]:
-        found = (facet(params.backbone, images, config.backbone, number, name) for name in theirs)
-        return dict(zip(theirs, found, strict=True))
+        def one(name: Any) -> Features:
+            request = FeatureRequest((number + 1,), name, norm=False)
+            return vit(params.backbone, images, config.backbone, request)
+
+        return {name: one(name) for name in theirs}
 
     ours = all_of(jnp.asarray(images))
     channels_first = torch.from_numpy(images).permute(0, 3, 1, 2)

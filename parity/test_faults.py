@@ -12,14 +12,14 @@ import optax
 import pytest
 
 import crisalad_jax.nn.adapter
+import crisalad_jax.nn.backbones.vit
 import crisalad_jax.nn.cross_image
 import crisalad_jax.nn.pixels
-import crisalad_jax.nn.vit
 import parity.cases.case
 import parity.cases.parts
 import parity.cases.run
-from crisalad_jax.nn import vit
-from crisalad_jax.nn.layers import Linear, widen
+from crisalad_jax.nn.backbones import vit
+from crisalad_jax.nn.layers import Linear, at_least_float32
 from parity.cases import checks
 from parity.compare import OWN_STEP, STEP
 
@@ -93,9 +93,9 @@ def _special_tokens_once(adapter: Any) -> Any:
 
 
 def _an_iteration_short(assign: Any) -> Any:
-    def wrong(scores: Any, dustbin: Any, config: Any) -> Any:
+    def wrong(*args: Any, config: Any, **more: Any) -> Any:
         short = dataclasses.replace(config, iterations=config.iterations - 1)
-        return assign(scores, dustbin, short)
+        return assign(*args, config=short, **more)
 
     return wrong
 
@@ -113,8 +113,8 @@ def _constant_input(feed_forward: Any) -> Any:
 
 
 def _all_positives(mine: Any) -> Any:
-    def wrong(similarities: Any, pairs: Any, *, epsilon: float) -> Any:
-        return mine(similarities, pairs, epsilon=epsilon)._replace(positives=pairs.positives)
+    def wrong(similarities: Any, pairs: Any, *, margin: float) -> Any:
+        return mine(similarities, pairs, margin=margin)._replace(positives=pairs.positives)
 
     return wrong
 
@@ -126,7 +126,7 @@ def _transposed_mask(encoder: Any) -> Any:
     return wrong
 
 
-PARTS, VIT = parity.cases.parts, crisalad_jax.nn.vit
+PARTS, VIT = parity.cases.parts, crisalad_jax.nn.backbones.vit
 FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "blocks swapped": (
         "attention",
@@ -185,7 +185,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "an iteration of Sinkhorn short": (
         "Sinkhorn: 3 iterations, epsilon 1.0",
         FORWARD,
-        replace(PARTS, "assign", _an_iteration_short),
+        replace(PARTS, "assign_with_dustbin", _an_iteration_short),
     ),
     "mask transposed": (
         "cross-image encoder, masked",
@@ -195,7 +195,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "margin of the miner": (
         "miner",
         {"choices"},
-        replace(PARTS, "mine", lambda mine: lambda *x, epsilon: mine(*x, epsilon=2 * epsilon)),
+        replace(PARTS, "mine", lambda mine: lambda *x, margin: mine(*x, margin=2 * margin)),
     ),
     "positives all mined": ("miner", {"choices"}, replace(PARTS, "mine", _all_positives)),
     "mean of ImageNet": (
@@ -237,14 +237,14 @@ def test_a_fault_misses(fault: str, monkeypatch: Patch) -> None:
 
 @jax.custom_vjp
 def _add_bias(y: Any, bias: Any) -> Any:
-    return (widen(y) + bias).astype(y.dtype)
+    return (at_least_float32(y) + bias).astype(y.dtype)
 
 
 def _sum_in_8_bits(_: None, slope: Any) -> Any:
     def add(total: Any, x: Any) -> Any:
         return jax.lax.reduce_precision(total + x, exponent_bits=8, mantissa_bits=7), None
 
-    rows = widen(slope).reshape(-1, slope.shape[-1])
+    rows = at_least_float32(slope).reshape(-1, slope.shape[-1])
     return slope, jax.lax.scan(add, jnp.zeros(slope.shape[-1]), rows)[0]
 
 
@@ -284,10 +284,10 @@ RUN = parity.cases.run
 @pytest.mark.slow
 def test_a_frozen_parameter_that_moves_misses(monkeypatch: Patch) -> None:
     def fault(merge_params: Any) -> Any:
-        def wrong(trainable: Any, frozen: Any) -> Any:
+        def wrong(trainable: Any, frozen: Any, *rest: Any) -> Any:
             positions = frozen.backbone.pos_embed * (1 + 2e-7)
             backbone = dataclasses.replace(frozen.backbone, pos_embed=positions)
-            return merge_params(trainable, dataclasses.replace(frozen, backbone=backbone))
+            return merge_params(trainable, dataclasses.replace(frozen, backbone=backbone), *rest)
 
         return wrong
 

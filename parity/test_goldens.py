@@ -16,32 +16,29 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.config import (
-    AdapterConfig,
-    CrossImageConfig,
-    ModelConfig,
-    SaladConfig,
-    SinkhornConfig,
+from crisalad_jax.checkpoints.layouts import to_params, to_state
+from crisalad_jax.checkpoints.layouts.base import head_lines
+from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines
+from crisalad_jax.checkpoints.layouts.dinov2 import adapter_lines
+from crisalad_jax.checkpoints.layouts.forms import Entry, Extra
+from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones import Features
+from crisalad_jax.nn.backbones.vit import (
+    NORM_EPSILON,
     ViTConfig,
+    embed,
+    grid_of,
+    run_blocks,
 )
-from crisalad_jax.layouts import (
-    Entry,
-    Extra,
-    adapter_lines,
-    aggregator_lines,
-    encoder_lines,
-    to_params,
-    to_state,
-)
-from crisalad_jax.model import Crisalad
-from crisalad_jax.nn.adapter import adapter, init_adapter
-from crisalad_jax.nn.aggregators import join
-from crisalad_jax.nn.cross_image import cross_image_encoder, init_cross_image
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.layers import layer_norm
-from crisalad_jax.nn.salad import init_salad, salad, transport
-from crisalad_jax.nn.vit import NORM_EPSILON, Features, embed, grid_of, run_blocks
-from crisalad_jax.pytree import named_leaves
-from crisalad_jax.sinkhorn import assign
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.sinkhorn import SinkhornConfig, assign_with_dustbin
+from crisalad_jax.utils.pytree import named_leaves
 
 GOLDENS = pathlib.Path(__file__).parent / "goldens"
 OUTPUT_BOUND, GRADIENT_BOUND = 1e-5, 1e-4
@@ -58,11 +55,15 @@ class Names(NamedTuple):
     theirs: Callable[[Any], dict[str, np.ndarray]]
 
 
-def part_names(prefix: str, lines: Iterable[Entry | Extra], template: Any) -> Names:
+def part_names(
+    prefix: str, lines: Iterable[Entry | Extra], template: Any, public: str | None = None
+) -> Names:
     """For one part of a model, whose names lack the `prefix` that the table's have.
 
-    Of `template` only the structure counts.
+    Of `template` only the structure counts. `public` is the prefix of the public names, where that
+    is another.
     """
+    public = prefix if public is None else public
     entries = [line for line in lines if isinstance(line, Entry)]
     structure = jax.tree.structure(template)
     order = [f"{prefix}.{name}" for name in named_leaves(template)]
@@ -70,7 +71,7 @@ def part_names(prefix: str, lines: Iterable[Entry | Extra], template: Any) -> Na
     def ours(state: State) -> Any:
         found: dict[str, np.ndarray] = {}
         for entry in entries:
-            arrays = (state[name.removeprefix(f"{prefix}.")] for name in entry.theirs)
+            arrays = (state[name.removeprefix(f"{public}.")] for name in entry.theirs)
             found |= zip(entry.ours, entry.form.ours(*arrays), strict=True)
         return jax.tree.unflatten(structure, [jnp.asarray(found[name]) for name in order])
 
@@ -79,7 +80,7 @@ def part_names(prefix: str, lines: Iterable[Entry | Extra], template: Any) -> Na
         found: dict[str, np.ndarray] = {}
         for entry in entries:
             arrays = entry.form.theirs(*(leaves[name] for name in entry.ours))
-            names = (name.removeprefix(f"{prefix}.") for name in entry.theirs)
+            names = (name.removeprefix(f"{public}.") for name in entry.theirs)
             found |= zip(names, arrays, strict=True)
         return found
 
@@ -147,7 +148,7 @@ def test_vit(name: str, registers: int) -> None:
         adapter=AdapterConfig(kind="none"),
     )
     model = ModelConfig(
-        backbone=config, aggregator="class-token", encoder=CrossImageConfig(layers=0)
+        backbone=config, aggregator=ClassTokenConfig(), cross_image=CrossImageConfig(layers=0)
     )
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
@@ -176,7 +177,9 @@ def test_multi_resolution_adapter() -> None:
     # The stored one narrows 24 channels to 4, not to a sixteenth: our configuration has the names
     # and the structure, not the widths.
     config = ViTConfig(dim=48, heads=3, adapter=AdapterConfig("multi-resolution", bottleneck=1.0))
-    template = jax.eval_shape(functools.partial(init_adapter, config=config), jax.random.key(0))
+    template = jax.eval_shape(
+        lambda key: init_adapter(key, config.dim, config.adapter), jax.random.key(0)
+    )
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         return {"tokens": adapter(params, inputs["tokens"], (5, 5))}
@@ -188,19 +191,20 @@ def test_multi_resolution_adapter() -> None:
 def test_salad() -> None:
     golden = load("salad")
     config = SaladConfig(clusters=6, cluster_dim=8, token_dim=16, hidden=512)
-    model = ModelConfig(salad=config, encoder=CrossImageConfig(layers=0))
+    model = ModelConfig(aggregator=config, cross_image=CrossImageConfig(layers=0))
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         batch, channels = inputs["features"].shape[:2]
         patches = inputs["features"].reshape(batch, channels, -1).transpose(0, 2, 1)
 
-        def one(token: jax.Array, local: jax.Array) -> jax.Array:
-            return join(salad(params, Features(token, local), config, key=None), model)
+        tokens = config.apply(params, Features(inputs["token"], patches), (4, 6), key=None)
+        descriptors = jax.vmap(functools.partial(to_descriptor, aggregator=config))(tokens)
+        return {"descriptor": descriptors}
 
-        return {"descriptor": jax.vmap(one)(inputs["token"], patches)}
-
-    template = jax.eval_shape(lambda key: init_salad(key, 48, config), jax.random.key(0))
-    names = part_names("aggregator", aggregator_lines(model), template)
+    template = jax.eval_shape(
+        lambda key: config.init(key, model.backbone, (4, 6)), jax.random.key(0)
+    )
+    names = part_names("aggregator", head_lines(model), template)
     inputs = {name: jnp.asarray(golden[f"in.{name}"]) for name in ("features", "token")}
     # A constant added to a column of scores is absorbed by the column's potential: the dustbin's
     # score and the score network's last bias have no effect, their gradients are rounding noise.
@@ -214,7 +218,7 @@ def test_salad() -> None:
         assert np.abs(golden[f"grad.{name}"]).max() < 1e-6
 
     patches = inputs["features"].reshape(3, 48, -1).transpose(0, 2, 1)
-    plan = jax.vmap(lambda p: jnp.exp(transport(params, p, config, key=None).log_plan))(patches)
+    plan = jnp.exp(config.transport(params, patches, key=None).log_plan)
     stored = golden["aux.assignment_with_dustbin"].transpose(0, 2, 1)
     assert relative_error(plan, stored) < OUTPUT_BOUND
 
@@ -222,10 +226,12 @@ def test_salad() -> None:
 @pytest.mark.parametrize("case", range(5))
 def test_sinkhorn(case: int) -> None:
     golden = under(load("sinkhorn"), f"{case}.")
-    config = SinkhornConfig(iterations=int(golden["num_iters"]), epsilon=float(golden["reg"]))
+    config, epsilon = SinkhornConfig(iterations=int(golden["num_iters"])), float(golden["reg"])
 
     def log_plan(scores: jax.Array, dustbin: jax.Array) -> jax.Array:
-        return assign(scores.transpose(0, 2, 1), dustbin, config).log_plan.transpose(0, 2, 1)
+        by_patch = scores.transpose(0, 2, 1)
+        result = assign_with_dustbin(by_patch, dustbin, epsilon=epsilon, config=config)
+        return result.log_plan.transpose(0, 2, 1)
 
     def loss(scores: jax.Array, dustbin: jax.Array) -> jax.Array:
         return golden_loss(jnp.exp(log_plan(scores, dustbin)))
@@ -248,5 +254,5 @@ def test_cross_image_encoder() -> None:
         return {"tokens": cross_image_encoder(params, inputs["tokens"], config, key=None)}
 
     template = jax.eval_shape(lambda key: init_cross_image(key, 16, config), jax.random.key(0))
-    names = part_names("encoder", encoder_lines(config), template)
+    names = part_names("cross_image", encoder_lines(config), template, "encoder")
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})

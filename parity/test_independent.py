@@ -31,21 +31,20 @@ from transformers import (
     Dinov2WithRegistersModel,
 )
 
-from crisalad_jax.config import (
-    AdapterConfig,
-    CrossImageConfig,
-    LossConfig,
-    ModelConfig,
-    MultiSimilarityConfig,
-    OptimiserConfig,
-    ViTConfig,
-)
-from crisalad_jax.convert import read_checkpoint, write_checkpoint
-from crisalad_jax.layouts import encoder_lines, to_state
-from crisalad_jax.model import Crisalad
-from crisalad_jax.nn.cross_image import cross_image_encoder, init_cross_image
-from crisalad_jax.nn.vit import vit
-from crisalad_jax.training import StepConfig, init_state, merge_params, train_step
+from crisalad_jax.checkpoints.layouts import to_state
+from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines
+from crisalad_jax.checkpoints.torch_io import read_checkpoint, write_checkpoint
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig, vit
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder, init_cross_image
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.training.config import OptimiserConfig
+from crisalad_jax.training.step import StepConfig, init_train_state, train_step
+from crisalad_jax.training.trainable import merge_params
 from parity.test_goldens import (
     GRADIENT_BOUND,
     NO_GRADIENT,
@@ -123,8 +122,8 @@ def expected_config(kind: Kind) -> ModelConfig:
     )
     return ModelConfig(
         backbone=backbone,
-        aggregator="class-token",
-        encoder=CrossImageConfig(layers=0),
+        aggregator=ClassTokenConfig(),
+        cross_image=CrossImageConfig(layers=0),
     )
 
 
@@ -315,18 +314,18 @@ def test_training_is_that_of_the_libraries(tmp_path: pathlib.Path) -> None:
     with jax.enable_x64(True):
         config = StepConfig(
             dataclasses.replace(found.config, compute_dtype="float64"),
-            LossConfig(library_quirk=True, multi_similarity=MultiSimilarityConfig(base=0.5)),
+            LossConfig(match_pml_zero=True, kind=MultiSimilarityConfig(base=0.5)),
             OptimiserConfig(learning_rate=rate, weight_decay=weight_decay),
             planned,
         )
         params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), found.params)
-        state, frozen = init_state(params, "all", config)
+        state, frozen = init_train_state(params, "all", config)
         our_losses = []
         for images in batches:
             arrays = (jnp.asarray(x) for x in (images, labels, np.ones(len(labels), bool)))
             state, metrics = train_step(state, frozen, *arrays, jax.random.key(0), config)
             our_losses.append(float(metrics.loss))
-        final = jax.tree.map(np.asarray, merge_params(state.trainable, frozen))
+        final = jax.tree.map(np.asarray, merge_params(state.trainable, frozen, config.model))
     ours = to_state(final, config.model, "huggingface", found.extras)
     # Measured 1e-14; float32 anywhere would show at 1e-8.
     np.testing.assert_allclose(our_losses, their_losses, rtol=1e-12)
@@ -352,7 +351,7 @@ def test_masked_encoder_is_torchs() -> None:
     encoder = nn.TransformerEncoder(layer, 2, enable_nested_tensor=False).eval()
     shake(encoder)
     template = jax.eval_shape(lambda key: init_cross_image(key, 16, config), jax.random.key(0))
-    names = part_names("encoder", encoder_lines(config), template)
+    names = part_names("cross_image", encoder_lines(config), template, "encoder")
     params = names.ours({name: x.numpy() for name, x in encoder.state_dict().items()})
     mask = np.tri(5, dtype=bool)
     mask[1, 3] = True

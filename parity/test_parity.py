@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import parity.cases.case
-from parity.cases import CASES, RUNS, checks
+from parity.cases import ANYLOC, CASES, RUNS, checks
 from parity.cases.case import build, cancelling, random, split
 from parity.compare import Arrays, Row, compare
 from parity.full_size import SIZES, full_size_checks
@@ -72,7 +72,7 @@ def test_parity(precision: str, name: str, monkeypatch: pytest.MonkeyPatch) -> N
             reals = {n for n, x in drawn.items() if np.issubdtype(x.dtype, np.floating)}
             assert reals <= covered["gradients"]
             # The whole model: all of it has a gradient, but for what lies behind AnyLoc's facet.
-            if case.forward == "descriptor" and case.model.aggregator != "anyloc":
+            if case.forward == "descriptor" and case.model is not ANYLOC:
                 names = dict(build(case.model, precision, random(name, SEED)).named_parameters())
                 del names["backbone.mask_token"]
                 parts = split({n: p.detach().float().numpy() for n, p in names.items()})

@@ -22,19 +22,19 @@ from pytorch_metric_learning.miners import MultiSimilarityMiner
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.config import (
-    AdapterConfig,
-    CrossImageConfig,
-    LossConfig,
-    ModelConfig,
-    MultiSimilarityConfig,
-    OptimiserConfig,
-    SaladConfig,
-    SinkhornConfig,
-    TrainConfig,
-    ViTConfig,
-)
-from crisalad_jax.errors import InputError
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators import Aggregator, TokenShape
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.utils.errors import InputError
 from parity.reference.adapter import ConvNorm, MultiResolutionAdapter
 from parity.reference.cross_image import CrossImageEncoder
 from parity.reference.gem import UnitPatches
@@ -42,7 +42,7 @@ from parity.reference.losses import mine, multi_similarity_loss
 from parity.reference.model import Crisalad
 from parity.reference.pyramid import GemPyramid
 from parity.reference.salad import Salad
-from parity.reference.sinkhorn import assign
+from parity.reference.sinkhorn import assign_with_dustbin
 from parity.reference.tokens import Tokens
 from parity.reference.training import clip_gradients, freeze, learning_rate_factor, train
 from parity.reference.vit import Features, ViT, grid_of
@@ -54,8 +54,8 @@ NO_ADAPTER = AdapterConfig(kind="none")
 MODEL = ModelConfig(
     image_size=(42, 56),
     backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),
-    salad=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, dropout=0.0),
-    encoder=CrossImageConfig(heads=2, feedforward=16, dropout=0.0),
+    aggregator=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, dropout=0.0),
+    cross_image=CrossImageConfig(heads=2, feedforward=16, dropout=0.0),
 )
 
 
@@ -163,21 +163,21 @@ def test_salad() -> None:
         ModelConfig(
             image_size=(56, 84),
             backbone=ViTConfig(dim=48, depth=1, heads=3, position_grid=5, adapter=NO_ADAPTER),
-            salad=config,
-            encoder=CrossImageConfig(layers=0),
+            aggregator=config,
+            cross_image=CrossImageConfig(layers=0),
         )
     )
     # A constant added to a cluster's scores is absorbed by the cluster's potential: the dustbin's
     # score and the score network's last bias have no effect, their gradients are rounding noise.
     dead = ("dust_bin", "score.3.bias")
-    check(salad, golden, inputs, {"descriptor": model.relate(tokens)}, exempt=dead)
+    check(salad, golden, inputs, {"descriptor": model.attend_across_images(tokens)}, exempt=dead)
     plan = salad.transport(inputs["features"]).exp()
     assert relative_error(plan, golden["aux.assignment_with_dustbin"]) < OUTPUT_BOUND
     # float64 tells noise, which falls from 5e-7 to 1e-15, from a small effect, which would stay.
     salad.double()
     salad.zero_grad()
     tokens = salad(Features(inputs["token"].double(), inputs["features"].double()))
-    golden_loss({"descriptor": model.relate(tokens)}).backward()
+    golden_loss({"descriptor": model.attend_across_images(tokens)}).backward()
     for name in dead:
         gradient = salad.get_parameter(name).grad
         assert gradient is not None
@@ -187,11 +187,11 @@ def test_salad() -> None:
 @pytest.mark.parametrize("case", range(5))
 def test_sinkhorn(case: int) -> None:
     golden = under(golden_of("sinkhorn"), f"{case}.")
-    config = SinkhornConfig(iterations=int(golden["num_iters"]), epsilon=float(golden["reg"]))
+    config, epsilon = SinkhornConfig(iterations=int(golden["num_iters"])), float(golden["reg"])
     scores, dust_bin = golden["scores"].requires_grad_(), torch.ones((), requires_grad=True)
-    log_plan = assign(scores, dust_bin, config)
+    log_plan = assign_with_dustbin(scores, dust_bin, epsilon=epsilon, config=config)
     # Scores over a regularisation of 0.1 are ten times as large, and so are their roundings.
-    assert relative_error(log_plan, golden["log_p"]) < OUTPUT_BOUND / min(config.epsilon, 1)
+    assert relative_error(log_plan, golden["log_p"]) < OUTPUT_BOUND / min(epsilon, 1)
     golden_loss({"plan": log_plan.exp()}).backward()
     assert scores.grad is not None
     assert dust_bin.grad is not None
@@ -270,20 +270,22 @@ def dinov2(size: str, registers: int = 0, adapter: AdapterConfig = NO_ADAPTER) -
 # The published model of each layout, and what the reference's names are there.
 PUBLIC: dict[str, tuple[ModelConfig, dict[str, str]]] = {
     f"dinov2_vit{size}14{suffix}": (
-        ModelConfig(backbone=dinov2(size, registers), aggregator="class-token", encoder=NO_ENCODER),
+        ModelConfig(
+            backbone=dinov2(size, registers), aggregator=ClassTokenConfig(), cross_image=NO_ENCODER
+        ),
         {"backbone.": ""},
     )
     for size in SIZES
     for suffix, registers in (("", 0), ("_reg4", 4))
 }
 PUBLIC["dino_salad"] = (
-    ModelConfig(backbone=dinov2("b"), encoder=NO_ENCODER),
+    ModelConfig(backbone=dinov2("b"), cross_image=NO_ENCODER),
     {"backbone.": "backbone.model."},
 )
 PUBLIC["CricaVPR"] = (
     ModelConfig(
         backbone=dinov2("b", adapter=AdapterConfig(kind="multi-resolution")),
-        aggregator="gem-pyramid",
+        aggregator=GemPyramidConfig(),
     ),
     {"": "model_state_dict/module."},
 )
@@ -315,24 +317,24 @@ def random_batch(seed: int) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("base", [0.0, 0.5])
 def test_miner_and_loss_are_the_librarys(base: float) -> None:
-    config = LossConfig(library_quirk=True, multi_similarity=MultiSimilarityConfig(base=base))
+    config = LossConfig(match_pml_zero=True, kind=MultiSimilarityConfig(base=base))
     distance = DotProductSimilarity(normalize_embeddings=False)
-    miner = MultiSimilarityMiner(config.epsilon, distance=distance)
+    miner = MultiSimilarityMiner(config.miner_margin, distance=distance)
     # Any: a type checker takes them for int, after the library's defaults.
-    constants: Any = dataclasses.astuple(config.multi_similarity)
+    constants: Any = dataclasses.astuple(config.kind)
     loss_of = MultiSimilarityLoss(*constants, distance=distance)
     nonzero = 0
     for seed in range(30):
         x, labels = random_batch(seed)
         a1, p, a2, n = pairs = miner(x, labels)
-        positives, negatives = mine(x @ x.T, labels, epsilon=config.epsilon)
+        positives, negatives = mine(x @ x.T, labels, margin=config.miner_margin)
         assert set(zip(a1.tolist(), p.tolist(), strict=True)) == entries(positives)
         assert set(zip(a2.tolist(), n.tolist(), strict=True)) == entries(negatives)
         theirs = loss_of(x, labels, pairs)
-        ours, b_acc = multi_similarity_loss(x, labels, config)
+        ours, easy_anchor_fraction = multi_similarity_loss(x, labels, config)
         # An exponent of 50 times a similarity carries 50 roundings.
         torch.testing.assert_close(ours, theirs.reshape(()), rtol=1e-5, atol=1e-7)
-        assert b_acc.item() == pytest.approx(1 - len(set(a1.tolist())) / len(x))
+        assert easy_anchor_fraction.item() == pytest.approx(1 - len(set(a1.tolist())) / len(x))
         (expected,) = torch.autograd.grad(theirs, x)
         (actual,) = torch.autograd.grad(ours, x)
         torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-6)
@@ -353,7 +355,7 @@ Kind = Literal["depthwise", "multi-resolution"]
 
 
 @pytest.mark.parametrize(
-    ("trains", "moving"),
+    ("trainable", "moving"),
     [
         ("all", ("backbone.", "aggregator.", "encoder.")),
         (
@@ -366,7 +368,7 @@ Kind = Literal["depthwise", "multi-resolution"]
     ],
 )
 @pytest.mark.parametrize("kind", ["depthwise", "multi-resolution"])
-def test_only_what_trains_moves(trains: str, moving: tuple[str, ...], kind: Kind) -> None:
+def test_only_what_trains_moves(trainable: str, moving: tuple[str, ...], kind: Kind) -> None:
     torch.manual_seed(0)
     backbone = ViTConfig(dim=32, depth=2, heads=2, position_grid=3, adapter=AdapterConfig(kind))
     model = Crisalad(dataclasses.replace(MODEL, backbone=backbone))
@@ -374,7 +376,7 @@ def test_only_what_trains_moves(trains: str, moving: tuple[str, ...], kind: Kind
     for parameter in model.parameters():
         nn.init.uniform_(parameter, 0, 0.1)
     before = {name: x.clone() for name, x in model.state_dict().items()}
-    config = TrainConfig(trains=trains, optimiser=OptimiserConfig(learning_rate=1e-3))
+    config = TrainConfig(trainable=trainable, optimiser=OptimiserConfig(learning_rate=1e-3))
     train(model, [batch()] * 2, config, steps=4)
     moved = {name for name, x in model.state_dict().items() if not torch.equal(x, before[name])}
     # The mask token is in no output: it has no gradient, and does not decay either.
@@ -389,7 +391,7 @@ def test_only_what_trains_moves(trains: str, moving: tuple[str, ...], kind: Kind
 def test_loss_falls() -> None:
     torch.manual_seed(0)
     model = Crisalad(MODEL)
-    config = TrainConfig(trains="all", optimiser=OptimiserConfig(learning_rate=1e-3))
+    config = TrainConfig(trainable="all", optimiser=OptimiserConfig(learning_rate=1e-3))
     losses = train(model, [batch()] * 20, config, steps=20)
     assert len(losses) == 20
     assert losses[-1] < 0.5 * losses[0]
@@ -406,7 +408,7 @@ def test_clipping_makes_the_norm_what_is_asked() -> None:
 
 
 def test_schedule() -> None:
-    plain = OptimiserConfig(final_fraction=0.2)
+    plain = OptimiserConfig(end_lr_fraction=0.2)
     assert [learning_rate_factor(plain, step, 4) for step in (0, 2, 4, 9)] == pytest.approx(
         [1, 0.6, 0.2, 0.2]
     )
@@ -415,7 +417,25 @@ def test_schedule() -> None:
     assert factors == [0.5, 1, 1, 0.75, 0.5, 0.25, 0]
 
 
-@pytest.mark.parametrize("trains", ["last-3-blocks+head", "tail"])
-def test_what_cannot_train(trains: str) -> None:
+@pytest.mark.parametrize("trainable", ["last-3-blocks+head", "tail"])
+def test_what_cannot_train(trainable: str) -> None:
     with pytest.raises(InputError, match=r"found '.*', expected head, adapters\+head, last-N"):
-        freeze(Crisalad(MODEL), trains)
+        freeze(Crisalad(MODEL), trainable)
+
+
+class Other(Aggregator):
+    """One that a plug-in would bring."""
+
+    part_name = "other"
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """A global token."""
+        return TokenShape(dim, 0, dim)
+
+    def apply(self, *args: Any, **more: Any) -> Any:
+        """Nothing: the reference refuses it first."""
+
+
+def test_an_aggregator_of_a_plug_in_is_not_held() -> None:
+    with pytest.raises(InputError, match="aggregator: found other, expected one that comes with"):
+        Crisalad(dataclasses.replace(MODEL, aggregator=Other()))

@@ -184,9 +184,7 @@ def test_the_command_passes_and_misses(
     assert main(command) == 0
     assert "1 rows, none missed" in capsys.readouterr().out
     real = parity.cases.parts.mine
-    monkeypatch.setattr(
-        parity.cases.parts, "mine", lambda *x, epsilon: real(*x, epsilon=10 * epsilon)
-    )
+    monkeypatch.setattr(parity.cases.parts, "mine", lambda *x, margin: real(*x, margin=10 * margin))
     assert main(command) == 1
     assert not json.loads((tmp_path / "parity.json").read_text())["passed"]
 

@@ -2,5 +2,5 @@
 # Sets up what is missing and runs the demo: no data and no accelerator needed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-source scripts/environment.sh ""
+source scripts/environment.sh "[all]"
 exec crisalad demo --out demo "$@"

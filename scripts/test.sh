@@ -1,11 +1,13 @@
 #!/usr/bin/env bash
-# Sets up what is missing, then runs the linter, the type checker and the tests.
+# Sets up what is missing, then runs the linters, the type checker and the tests.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source scripts/environment.sh "[dev]"
 ruff check .
 ruff format --check .
 pyright
+# One import direction between the rooms of the package (pyproject.toml).
+lint-imports
 # Most of the time is XLA's, which need not optimise programs that run for milliseconds.
 export XLA_FLAGS="--xla_backend_optimization_level=0 ${XLA_FLAGS:-}"
 # Two workers: much of the time is compiling, which one core does. In the order of conftest.py.

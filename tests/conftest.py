@@ -5,7 +5,6 @@ All tests use the same shapes, so that each program is compiled once for the who
 
 import csv
 import dataclasses
-import functools
 import importlib
 import os
 import pathlib
@@ -18,47 +17,43 @@ from typing import Any
 import cv2
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
-from crisalad_jax import platform
-from crisalad_jax.checkpoint import save_weights
-from crisalad_jax.config import (
-    AnyLocConfig,
-    CrossImageConfig,
-    LossConfig,
-    ModelConfig,
-    MultiSimilarityConfig,
-    OptimiserConfig,
-    SaladConfig,
-    TrainConfig,
-    TransVprConfig,
-    ViTConfig,
-)
+from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.config import plugins
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import COLUMNS, read_places
-from crisalad_jax.files import write_json
-from crisalad_jax.fit import fit
-from crisalad_jax.model import Crisalad, init_crisalad
-from crisalad_jax.pytree import named_leaves
-from crisalad_jax.serial import to_plain
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.loop import fit
+from crisalad_jax.utils import compiler
+from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.pytree import named_leaves
 
 MODEL = ModelConfig(
     image_size=(42, 56),
     backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),
-    salad=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
-    anyloc=AnyLocConfig(layer=-1),
-    transvpr=TransVprConfig(levels=2),
-    encoder=CrossImageConfig(heads=2, feedforward=16),
+    aggregator=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
+    cross_image=CrossImageConfig(heads=2, feedforward=16),
 )
 # Eight places make two batches of three an epoch: six steps in all. The dropouts of MODEL and the
 # light augmentation draw random numbers in every step.
 RECIPE = TrainConfig(
     model=MODEL,
-    loss=LossConfig(multi_similarity=MultiSimilarityConfig(base=0.5)),
+    loss=LossConfig(kind=MultiSimilarityConfig(base=0.5)),
     optimiser=OptimiserConfig(learning_rate=1e-3),
-    trains="all",
-    augment="light",
+    trainable="all",
+    augmentation="light",
     places_per_batch=3,
     images_per_place=2,
     min_images=2,
@@ -122,22 +117,30 @@ def assert_equal(found: Any, expected: Any) -> None:
 @pytest.fixture(scope="session")
 def scripts() -> Iterator[Callable[[str], ModuleType]]:
     """Imports a script by its name. What it sets in the environment ends with that."""
-    folder = str(pathlib.Path(__file__).parents[1] / "scripts")
+    root = pathlib.Path(__file__).parents[1] / "scripts"
+    folders = [str(root), str(root / "bench")]
 
     def load(name: str) -> ModuleType:
         with unittest.mock.patch.dict(os.environ):
             return importlib.import_module(name)
 
-    sys.path.insert(0, folder)
+    sys.path[:0] = folders
     yield load
-    sys.path.remove(folder)
+    for folder in folders:
+        sys.path.remove(folder)
 
 
 @pytest.fixture(autouse=True)
 def _own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     """No test fills the user's compile cache, nor changes for others how this process computes."""
-    monkeypatch.setattr(platform, "set_up", lambda: None)
+    monkeypatch.setattr(compiler, "set_up", lambda: None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@pytest.fixture
+def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As users run it: the types and shapes in annotations are checked in tests alone."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture
@@ -166,7 +169,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 def random_params(config: ModelConfig) -> Crisalad:
     """Parameters whose every number matters: an untrained model has zeros and ones."""
     generator = np.random.default_rng(3)
-    template = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+    template = parameter_shapes(config)
     leaves = []
     for name, leaf in named_leaves(template).items():
         noise = generator.standard_normal(leaf.shape)
@@ -180,7 +183,7 @@ def random_params(config: ModelConfig) -> Crisalad:
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-LONGEST = ("test_training.py", "test_processes.py", "test_interruption.py")
+LONGEST = ("test_step.py", "test_processes.py", "test_interruption.py")
 """Files that take minutes; run last, one of them would leave the other worker without work."""
 
 
@@ -208,3 +211,17 @@ def run(shared: pathlib.Path, params: Crisalad, benchmark: Benchmark) -> pathlib
     out = shared / "run"
     fit(recipe, places, out, validation=benchmark, initial=params, quiet=True)
     return out
+
+
+@pytest.fixture
+def own_parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a test registers ends with it."""
+    for registry in REGISTRIES.values():
+        for name in ("_parts", "_presets"):
+            monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
+    monkeypatch.setattr(plugins, "_FILES", {})
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if name.startswith("crisalad_plugin_"):
+            del sys.modules[name]

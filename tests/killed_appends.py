@@ -15,11 +15,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-import crisalad_jax.stores.files
-from crisalad_jax.config import ModelConfig
-from crisalad_jax.errors import InputError
-from crisalad_jax.map_description import MapDescription, read_description
-from crisalad_jax.maps import open_for_appending, open_map
+import crisalad_jax.retrieval.maps.file_store
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.maps.manifest import MapDescription, read_description
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.utils.errors import InputError
 
 LENGTH = 48
 
@@ -60,7 +60,7 @@ def check(folder: pathlib.Path) -> int:
     if not any((folder / "segments").glob("[0-9]*.json")):
         read_description(folder)
         return 0
-    with open_map(folder) as opened:
+    with Map.open(folder) as opened:
         opened.verify()
         count = len(opened)
         assert [image.name for image in opened.images] == names(0, count)
@@ -146,7 +146,7 @@ def at_every_step(folder: pathlib.Path, _store: str, _kills: int, _longest: floa
 
         for name in ("replace", "fsync", "mkdir", "unlink"):
             instead(os, name, lambda *_, **__: None)
-        instead(crisalad_jax.stores.files, "write_npy", half_array)
+        instead(crisalad_jax.retrieval.maps.file_store, "write_npy", half_array)
         instead(pathlib.Path, "write_text", half_text)
         append_until(target, 7)
 

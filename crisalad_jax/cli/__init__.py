@@ -1,62 +1,52 @@
 """The command line: parse, make a configuration, call the library; a module for each command.
 
-Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 143 told to end
-(SIGTERM) and its work saved, 1 anything else.
+Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 143 ended by
+SIGTERM with its work saved, 1 anything else.
 """
 
 import contextlib
+import importlib
 import io
 import sys
+import warnings
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
+from crisalad_jax.config.checks import choose
+from crisalad_jax.config.plugins import load_entry_points, load_plugin
+from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.extras import missing_extra
+from crisalad_jax.utils.notes import Note
 
-from crisalad_jax import platform
-from crisalad_jax.cli import (
-    ablate,
-    compare,
-    convert,
-    demo,
-    evaluate,
-    export,
-    extract,
-    index,
-    info,
-    pca,
-    query,
-    train,
-    vocabulary,
-)
-from crisalad_jax.config import choose
-from crisalad_jax.errors import InputError, Stopped
-
-# What only some commands need is imported when they run, for the others to start sooner.
-
-_COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
-    "demo": (demo.Demo, demo.run),
-    "train": (train.Train, train.run),
-    "convert": (convert.Convert, convert.run),
-    "evaluate": (evaluate.Evaluate, evaluate.run),
-    "compare": (compare.Compare, compare.run),
-    "ablate": (ablate.Ablate, ablate.run),
-    "extract": (extract.Extract, extract.run),
-    "index": (index.Index, index.run),
-    "query": (query.Query, query.run),
-    "vocabulary": (vocabulary.Vocabulary, vocabulary.run),
-    "export": (export.Export, export.run),
-    "pca": (pca.Pca, pca.run),
-    "info": (info.Info, info.run),
+_COMMANDS = {
+    "demo": "Render a small city, train a tiny model on it, and show Recall@K before and after.",
+    "train": "Train on places in the GSV-Cities layout; go on with the run that is there.",
+    "convert": "Convert a public torch checkpoint to a file of this package, or back.",
+    "evaluate": "Print what a model recalls of an evaluation set under each grouping.",
+    "compare": "Train or load methods, evaluate them alike, and table that (Table 1).",
+    "ablate": "Train CriSALAD with one part changed at a time (Tables 2 and 3).",
+    "extract": "Write the descriptors of a folder of images.",
+    "index": "Make a map of a folder of images, or append to it those that it lacks.",
+    "query": "Ask a map where images were taken.",
+    "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
+    "export": "Write a model as a StableHLO program that needs nothing of this package.",
+    "pca": "Fit principal components to descriptors, for shorter ones.",
+    "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
 }
+"""Summaries of the commands in the order of the help; each command is a module here."""
 
 
-def _parse(kind: Any, given: list[str], options: dict[str, Any]) -> Any:
-    """The flags as an instance of `kind`; what tyro finds wrong, in a box, becomes one line."""
-    program = f"crisalad {given[0]}"
+def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
+    """Parse the flags into an instance of a command's class; tyro's complaints become one line."""
+    import tyro
+
+    program = f"crisalad {name}"
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, prog=program, args=given[1:], **options)
+            if hasattr(module, "parse"):
+                return module.parse(program, given)
+            return tyro.cli(_class_of(name, module), prog=program, args=given)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -65,16 +55,22 @@ def _parse(kind: Any, given: list[str], options: dict[str, Any]) -> Any:
             error = error.__context__
         reason = _unboxed(complaint.getvalue()) if error is None else str(error)
         raise InputError(f"{reason} (see {program} --help)") from stop
+    except InputError as error:
+        raise InputError(f"{error} (see {program} --help)") from error
 
 
-# How the parts of tyro's boxes begin that say no more than the first.
+def _class_of(name: str, module: Any) -> type:
+    return getattr(module, name.capitalize())
+
+
+# Beginnings of the parts of tyro's boxes that repeat the first one.
 _ASIDES = ("Argument help", "Got errors", "For full")
 
 
 def _unboxed(box: str) -> str:
-    """The text of one of tyro's boxes, without its frame, the helptexts and the footer."""
+    """Extract the text of tyro's boxes, without frames, help texts and footer."""
     sections = [[]]
-    # The title goes; the frame is of spaces and hyphens where stdout is not known to take UTF-8.
+    # The title is dropped. Without UTF-8 on stdout, the frame is of spaces and hyphens.
     for line in box.splitlines()[1:]:
         row = line[2:].rstrip("│ ")
         if not row.strip("─╯-"):
@@ -87,29 +83,69 @@ def _unboxed(box: str) -> str:
 
 def _usage() -> str:
     lines = ["usage: crisalad COMMAND [--help] ...", "", "commands:"]
-    lines += [f"  {name:<12}{kind.__doc__}" for name, (kind, _) in _COMMANDS.items()]
+    lines += [f"  {name:<12}{summary}" for name, summary in _COMMANDS.items()]
     return "\n".join(lines)
 
 
+def _load_plugins(given: Sequence[str]) -> None:
+    """Register the parts of installed packages and of the plug-ins after --plugin."""
+    load_entry_points()
+    named = False
+    for argument in given:
+        flag, equals, value = argument.partition("=")
+        if flag == "--plugin":
+            named = not equals
+            if equals:
+                load_plugin(value)
+        elif argument.startswith("--"):
+            named = False
+        elif named:
+            load_plugin(argument)
+
+
+def _run(name: str, given: list[str]) -> None:
+    from crisalad_jax.cli import renamed
+    from crisalad_jax.utils import compiler
+
+    _load_plugins(given)
+    arguments = renamed.today(given, lambda line: print(f"crisalad: note: {line}", file=sys.stderr))
+    module = importlib.import_module(f"{__name__}.{name}")
+    chosen = _parse(name, module, arguments)
+    compiler.set_up()
+    module.run(chosen)
+
+
+def _show_note(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:
+    """Print a note in one line; other warnings stay as Python shows them."""
+    if issubclass(category, Note):
+        print(f"crisalad: note: {message}", file=sys.stderr)
+    else:
+        _show_warning(message, category, *rest, **more)
+
+
+_show_warning: Callable[..., None] = warnings.showwarning
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit code."""
+    """Run one command, and return its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if given else sys.stderr)
         return 0 if given else 2
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_note
+        warnings.simplefilter("always", Note)
+        return _exit_code(given)
+
+
+def _exit_code(given: list[str]) -> int:
     try:
-        kind, run = choose("command", given[0], _COMMANDS)
-        # Nested settings are annotated with an empty name, so their flags carry no prefix.
-        options: dict[str, Any] = {}
-        if kind is train.Train:
-            kind = Annotated[kind, tyro.conf.AvoidSubcommands]
-            options["default"] = train.Train(
-                data=tyro.MISSING, out=tyro.MISSING, settings=train.defaults(given[1:])
-            )
-        chosen = _parse(kind, given, options)
-        platform.set_up()
-        run(chosen)
-    except (InputError, OSError) as error:  # the disk's: it is full, or what no check foresaw
+        choose("command", given[0], _COMMANDS)
+        _run(given[0], given[1:])
+    except ModuleNotFoundError as error:
+        print(f"crisalad: {missing_extra(error, f'crisalad {given[0]}')}", file=sys.stderr)
+        return 2
+    except (InputError, OSError) as error:  # OSError: a full disk, or a fault that no check foresaw
         print("crisalad:", *str(error).splitlines(), file=sys.stderr)
         return 2
     except SystemExit:  # from tyro, after --help

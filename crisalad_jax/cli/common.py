@@ -1,18 +1,17 @@
-"""What several commands need: the terminal, and a model as their flags name it."""
+"""Helpers of several commands: the terminal, and loading a model as their flags name it."""
 
 import dataclasses
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
 import jax
 import rich.console
 
-from crisalad_jax.checkpoint import load_weights
-from crisalad_jax.config import ModelConfig, recipe
-from crisalad_jax.groupings import GROUPINGS
-from crisalad_jax.model import Crisalad, init_crisalad
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.training.recipes import recipe
 
 # Into a file or a pipe, wide enough that tables do not wrap. Brackets and colons in names are text.
 console = rich.console.Console(
@@ -20,7 +19,12 @@ console = rich.console.Console(
 )
 
 
-def model_of(
+def say(line: str) -> None:
+    """Print a line without wrapping it to the terminal's width."""
+    console.print(line, soft_wrap=True, highlight=False)
+
+
+def load_model(
     weights: Path | None,
     *,
     preset: str = "b14",
@@ -28,7 +32,21 @@ def model_of(
     image_size: tuple[int, int] | None = None,
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
 ) -> tuple[Crisalad, ModelConfig, str]:
-    """A model from a file, or without one an untrained preset, and what to call it."""
+    """Load a model from a file, or initialise an untrained preset without one.
+
+    Args:
+        weights: the file.
+        preset: the size of the untrained model.
+        seed: draws the parameters of the untrained model.
+        image_size: height and width in pixels; None is the model's.
+        compute_dtype: type of the matrix products; None is the model's.
+
+    Returns:
+        (params, config, name); the name stands in tables and titles.
+
+    Raises:
+        InputError: what `load_weights`, `recipe` and `ModelConfig.resized` raise.
+    """
     if weights is None:
         config = recipe(preset).model
         params = init_crisalad(jax.random.key(seed), config)
@@ -38,17 +56,4 @@ def model_of(
         name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
     if compute_dtype is not None:
         config = dataclasses.replace(config, compute_dtype=compute_dtype)
-    return params, resized(config, image_size), name
-
-
-def resized(config: ModelConfig, image_size: tuple[int, int] | None) -> ModelConfig:
-    """The configuration at another image size (height, width), where one is given."""
-    if image_size is None:
-        return config
-    config.check_image_size(image_size)
-    return dataclasses.replace(config, image_size=image_size)
-
-
-def grouping_words(groupings: Iterable[str]) -> str:
-    """What groupings mean, for under a table."""
-    return "; ".join(f"{name} = {GROUPINGS[name]}" for name in groupings)
+    return params, config.resized(image_size), name

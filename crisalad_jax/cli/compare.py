@@ -2,16 +2,17 @@
 
 import dataclasses
 
-from crisalad_jax.cli.comparing import Side, compare, names_of, settings_of
+from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
 
 @dataclasses.dataclass(frozen=True)
-class Compare(Side):
+class Compare(ComparisonFlags):
     """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""
 
     methods: str | None = None
-    """Comma-separated; by default all: netvlad, gem, conv-ap, patch-netvlad, transvpr, cosplace,
-    mixvpr, eigenplaces, anyloc, cricavpr, salad, crisalad, boq."""
+    """Comma-separated; by default all of the paper: netvlad, gem, conv-ap, patch-netvlad, transvpr,
+    cosplace, mixvpr, eigenplaces, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is
+    a method too, and any registered part, as NAME or KIND:NAME: CriSALAD with it in place."""
     weights: tuple[str, ...] = ()
     """NAME=FILE, for each method that is not to be trained: its weights."""
     rerank: int = 20
@@ -19,15 +20,14 @@ class Compare(Side):
 
 
 def run(arguments: Compare) -> None:
-    """Do what is left, and print the tables."""
-    from crisalad_jax.comparison import METHODS, ComparisonConfig
+    """Compare the methods, and print the tables."""
+    from crisalad_jax.experiments.comparison import METHODS, ComparisonConfig
 
-    names = tuple(METHODS) if arguments.methods is None else names_of(arguments.methods)
     config = ComparisonConfig(
         "compare",
-        names,
+        tuple(METHODS) if arguments.methods is None else names_of(arguments.methods),
         **settings_of(arguments),
         weights=arguments.weights,
         rerank=arguments.rerank,
     )
-    compare(config, arguments)
+    run_comparison(config, arguments)

@@ -1,4 +1,4 @@
-"""What `crisalad compare` and `crisalad ablate` share: their flags, and their work."""
+"""The flags that `crisalad compare` and `crisalad ablate` share, and what they print."""
 
 import dataclasses
 import pathlib
@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import rich.console
 
-from crisalad_jax.cli.common import console
-from crisalad_jax.files import around, check_target
+from crisalad_jax.cli.common import console, say
 
 if TYPE_CHECKING:
-    from crisalad_jax.comparison import AdapterCost, ComparisonConfig
+    from crisalad_jax.experiments.comparison import ComparisonConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class Side:
+class ComparisonFlags:
     """The flags of both commands."""
 
     test: tuple[pathlib.Path, ...]
@@ -42,74 +41,51 @@ class Side:
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
+    plugin: tuple[str, ...] = ()
+    """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
     """No progress."""
 
 
-def settings_of(arguments: Side) -> dict[str, Any]:
-    """What the flags say of a `ComparisonConfig`."""
+def settings_of(flags: ComparisonFlags) -> dict[str, Any]:
+    """Return the settings of a `ComparisonConfig` that both commands' flags set."""
 
     def text(path: pathlib.Path | None) -> str | None:
         return None if path is None else str(path)
 
     return {
-        "test": tuple(map(str, arguments.test)),
-        "train": text(arguments.train),
-        "backbone": text(arguments.backbone),
-        "preset": arguments.preset,
-        "epochs": arguments.epochs,
-        "image_size": arguments.image_size,
-        "batch_size": arguments.batch_size,
-        "grouping": arguments.grouping,
-        "seeds": arguments.seeds,
+        "test": tuple(map(str, flags.test)),
+        "train": text(flags.train),
+        "backbone": text(flags.backbone),
+        "preset": flags.preset,
+        "epochs": flags.epochs,
+        "image_size": flags.image_size,
+        "batch_size": flags.batch_size,
+        "grouping": flags.grouping,
+        "seeds": flags.seeds,
     }
 
 
 def names_of(text: str) -> tuple[str, ...]:
-    """Names between commas."""
+    """Split text at commas into names."""
     return tuple(name.strip() for name in text.split(","))
 
 
-def compare(config: "ComparisonConfig", arguments: Side) -> None:
-    """Check all that can be checked, do what is left, print and write the tables."""
-    from crisalad_jax.comparison import carry_out, claim, prepare, summarise, tables
-    from crisalad_jax.comparison.page import write_page
+def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
+    """Carry out a comparison, and print its tables."""
+    from crisalad_jax.experiments.comparison import compare
+    from crisalad_jax.experiments.comparison.tables import terminal_tables
 
-    out = arguments.out
-    check_target(out / "config.json")
-    place = out.resolve().name
-    if arguments.page is not None:
-        around(arguments.page, place)
-    prepared = prepare(config)
-    claim(out, prepared)
-    notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=arguments.quiet)
-    notes.print(_start_words(config), soft_wrap=True, highlight=False)
-
-    def say(line: str) -> None:
-        notes.print(line, soft_wrap=True, highlight=False)
-
-    carry_out(prepared, out, say=say, quiet=arguments.quiet)
-    summary = summarise(prepared, out, _adapters(config, out))
-    console.print(tables.recall_table(summary))
-    console.print(tables.cost_table(summary))
-    if summary.adapters:
-        console.print(tables.adapter_table(summary.adapters))
+    notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=flags.quiet)
+    summary = compare(
+        config,
+        flags.out,
+        page=flags.page,
+        say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
+        quiet=flags.quiet,
+    )
+    for table in terminal_tables(summary):
+        console.print(table)
     for note in summary.notes:
-        console.print(note, soft_wrap=True, highlight=False)
-    tables.write_tables(summary, out)
-    page = write_page(summary, out)
-    if arguments.page is not None:
-        tables.put_in_page(arguments.page, place, tables.markdown(summary))
-    console.print(f"table.md, table.csv, results.json, and a page: {page}", soft_wrap=True)
-
-
-def _start_words(config: "ComparisonConfig") -> str:
-    start = "from nothing" if config.backbone is None else f"from {config.backbone}"
-    return f"{len(config.names)} to compare, {config.preset}, what is trained starts {start}"
-
-
-def _adapters(config: "ComparisonConfig", out: pathlib.Path) -> "list[AdapterCost]":
-    """Table 3, of an ablation."""
-    from crisalad_jax.comparison import adapter_costs_once
-
-    return adapter_costs_once(out) if config.kind == "ablate" else []
+        say(note)
+    say(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")

@@ -6,9 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from crisalad_jax.cli.common import console
-from crisalad_jax.convert import convert
-from crisalad_jax.layouts import LAYOUTS
+from crisalad_jax.checkpoints.layouts import LAYOUTS
+from crisalad_jax.checkpoints.torch_io import convert
+from crisalad_jax.cli.common import say
+from crisalad_jax.training.summary import model_words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,20 +24,17 @@ class Convert:
     layout: str | None = None
     """dinov2, huggingface, dino-salad, cricavpr or reference, for a source of this package; by
     default the one its parts came from (huggingface if the target is a .safetensors)."""
+    plugin: tuple[str, ...] = ()
+    """Files FILE.py or modules that register parts of your own; their code is run."""
 
 
 def run(arguments: Convert) -> None:
-    """Convert, and say what was found."""
+    """Convert the file, and print both layouts and the model."""
     done = convert(arguments.source, arguments.target, arguments.layout)
-    config = done.config
-    backbone = config.backbone
-    console.print(
-        f"{arguments.source} ({_layout_words(done.source)}) -> {arguments.target} "
-        f"({_layout_words(done.target)}): backbone of width {backbone.dim}, {backbone.depth} "
-        f"blocks, {backbone.registers} registers, adapter {backbone.adapter.kind}; aggregator "
-        f"{config.aggregator}; {config.encoder.layers} encoder layers; descriptor of "
-        f"{config.descriptor_dim} numbers",
-        soft_wrap=True,
+    source, target = map(_layout_words, (done.source, done.target))
+    say(
+        f"{arguments.source} ({source}) -> {arguments.target} ({target}): "
+        + model_words(done.config)
     )
 
 

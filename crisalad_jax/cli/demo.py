@@ -3,7 +3,8 @@
 import dataclasses
 import pathlib
 
-from crisalad_jax.cli.common import console, grouping_words
+from crisalad_jax.cli.common import console, say
+from crisalad_jax.retrieval.grouping import grouping_words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,17 +20,13 @@ class Demo:
 
 def run(arguments: Demo) -> None:
     """Run the demo, and print its table."""
-    from crisalad_jax.demo import GROUPINGS, DemoConfig, run_demo
-    from crisalad_jax.report import recall_table
+    from crisalad_jax.experiments.demo import GROUPINGS, DemoConfig, run_demo
+    from crisalad_jax.experiments.report import recall_table
 
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
     console.print(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
-    console.print(
-        f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.",
-        soft_wrap=True,
-    )
-    console.print(
+    say(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
+    say(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "
-        f"Pictures: {', '.join(str(p) for p in summary.pictures)}",
-        soft_wrap=True,
+        f"Pictures: {', '.join(str(p) for p in summary.pictures)}"
     )

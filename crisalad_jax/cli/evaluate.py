@@ -2,30 +2,21 @@
 
 import dataclasses
 import pathlib
-import re
 from typing import Literal
 
-import numpy as np
-from jaxtyping import Float
-
-from crisalad_jax.checkpoint import load_weights
-from crisalad_jax.cli.common import console, grouping_words, model_of
-from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import evaluate, same_place_rule
-from crisalad_jax.files import check_target, write_json
-from crisalad_jax.groupings import DEFAULT_GROUPINGS, Grouping, check_grouping, parse_groupings
-from crisalad_jax.pca import load_pca
-from crisalad_jax.reranking import parse_reranking
-from crisalad_jax.results import GroupingResult, grouping_table, to_json
-from crisalad_jax.serial import to_plain
-from crisalad_jax.similarity import similarity_map
-
-_RECALLS = (
-    "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
-    "AP: area under precision and recall of the first retrievals, by similarity. R at 100 % P: of "
-    "the queries with a positive, the share retrieved rightly, above every wrong first retrieval."
-)
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.cli.common import console, load_model, say
+from crisalad_jax.cli.tables import grouping_table
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.record import evaluation_settings, table_notes, write_results
+from crisalad_jax.evaluation.similarity import FirstSimilarities
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS, check_grouping, parse_groupings
+from crisalad_jax.retrieval.pca import load_pca
+from crisalad_jax.retrieval.reranking import Reranking, parse_reranking
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_target, write_json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,37 +75,28 @@ class Evaluate:
     its pictures."""
     json: pathlib.Path | None = None
     """File for the table as JSON."""
+    plugin: tuple[str, ...] = ()
+    """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
     """No progress bars."""
 
 
 def run(arguments: Evaluate) -> None:
-    """Evaluate, print the table, and write what is asked for."""
-    groupings = parse_groupings(arguments.grouping.split(","))
-    if arguments.json is not None:
-        check_target(arguments.json)
-    if arguments.out is not None:
-        check_target(arguments.out / "config.json")
-    if arguments.report is not None:
-        check_target(arguments.report / "index.html")
+    """Evaluate the model, print the table, and write the files that are asked for."""
+    groupings = arguments.grouping.split(",")
+    parse_groupings(groupings)
     check_grouping((), arguments.batch_size, arguments.seed, arguments.seeds)
-    rerank = None if arguments.rerank is None else parse_reranking(arguments.rerank)
-    if rerank is None and arguments.rerank_weights is not None:
-        raise InputError(
-            "rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"
-        )
-    params, config, model_name = model_of(
+    _check_files(arguments)
+    if arguments.rerank is not None:
+        parse_reranking(arguments.rerank)
+    params, config, model_name = load_model(
         arguments.weights,
         preset=arguments.preset,
         seed=arguments.seed,
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
-    if rerank is not None and arguments.rerank_weights is not None:
-        own_params, own_config = load_weights(arguments.rerank_weights)
-        rerank = dataclasses.replace(rerank, params=own_params, config=own_config)
-    if rerank is not None:
-        rerank.check(config)
+    rerank = _reranking(arguments, config)
     pca = None if arguments.pca is None else load_pca(arguments.pca)
     benchmark = open_benchmark(
         arguments.data,
@@ -126,67 +108,48 @@ def run(arguments: Evaluate) -> None:
         queries=arguments.queries,
         layout=arguments.layout,
     )
-    if rerank is not None:
-        rerank.check(config, len(benchmark.database))
-    console.print(
+    say(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
-        f"images; positive: {benchmark.rule}\n{model_name}",
-        soft_wrap=True,
+        f"images; positive: {benchmark.rule}"
     )
-    seen = _FirstSimilarities()
+    say(model_name)
+    similarities = FirstSimilarities()
     results = evaluate(
         params,
         config,
         benchmark,
-        groupings=list(map(str, groupings)),
+        groupings=groupings,
         batch_size=arguments.batch_size,
         seed=arguments.seed,
         seeds=arguments.seeds,
         pca=pca,
-        observe=None if arguments.report is None else seen,
+        observe=None if arguments.report is None else similarities,
         rerank=rerank,
         quiet=arguments.quiet,
     )
+    settings = evaluation_settings(
+        benchmark,
+        config,
+        weights=arguments.weights,
+        batch_size=arguments.batch_size,
+        seed=arguments.seed,
+        seeds=arguments.seeds,
+        pca=arguments.pca,
+        rerank=arguments.rerank,
+        rerank_weights=arguments.rerank_weights,
+    )
     console.print(grouping_table(results))
-    same_place = same_place_rule(benchmark)
-    notes = [_RECALLS]
-    if params.encoder is None:
-        notes.append("No cross-image encoder: no descriptor depends on its batch.")
-    else:
-        notes += _notes(arguments, groupings, same_place)
-    if rerank is not None:
-        notes.append(
-            f"+ {rerank.label}: the first {rerank.top} retrievals by its scores, which stand for "
-            "similarities in AP and R at 100 % P."
-        )
-    for note in notes:
-        console.print(note, soft_wrap=True)
-    resolved = {
-        "weights": None if arguments.weights is None else str(arguments.weights),
-        "benchmark": benchmark.name,
-        "rule": benchmark.rule,
-        "same_place": same_place,
-        "batch_size": arguments.batch_size,
-        "seed": arguments.seed,
-        "seeds": arguments.seeds,
-        "pca": None if arguments.pca is None else str(arguments.pca),
-        "rerank": arguments.rerank,
-        "rerank_weights": None
-        if arguments.rerank_weights is None
-        else str(arguments.rerank_weights),
-        "model": to_plain(config),
-    }
+    for note in table_notes(results, settings):
+        say(note)
     if arguments.json is not None:
-        table = [
-            {"benchmark": benchmark.name, "model": model_name} | to_json(result)
-            for result in results
-        ]
-        write_json(arguments.json, resolved | {"results": table})
+        write_results(arguments.json, results, settings, model_name=model_name)
     if arguments.out is not None:
-        _write_galleries(arguments.out, benchmark, model_name, results)
-        write_json(arguments.out / "config.json", resolved)
+        from crisalad_jax.experiments.report import write_galleries
+
+        write_galleries(arguments.out, benchmark, results, model_name=model_name)
+        write_json(arguments.out / "config.json", settings)
     if arguments.report is not None:
-        from crisalad_jax.report import write_report
+        from crisalad_jax.experiments.report import write_report
 
         page = write_report(
             arguments.report,
@@ -195,54 +158,33 @@ def run(arguments: Evaluate) -> None:
             params=params,
             config=config,
             model_name=model_name,
-            settings=resolved,
-            similarities=seen.map,
+            settings=settings,
+            similarities=similarities.map,
         )
-        console.print(f"report: {page}", soft_wrap=True)
+        say(f"report: {page}")
 
 
-class _FirstSimilarities:
-    """Keeps a picture of the similarities under the first grouping, of which the report is."""
-
-    map: Float[np.ndarray, "rows columns"] | None = None
-
-    def __call__(
-        self,
-        grouping: str,
-        database: Float[np.ndarray, "image descriptor"],
-        queries: Float[np.ndarray, "image descriptor"],
-    ) -> None:
-        if self.map is None:
-            self.map = similarity_map(database, queries)
-
-
-def _notes(arguments: Evaluate, groupings: list[Grouping], same_place: str) -> list[str]:
-    """What the table's groupings are."""
-    kinds = dict.fromkeys(kind for each in groupings for kind in (each.queries, each.database))
-    notes = [
-        "A descriptor of this model depends on the images in its batch of "
-        f"{arguments.batch_size}: {grouping_words(kinds)}. Same place: of the others in sight, "
-        f"those that show the image's own place, told by {same_place}."
-    ]
-    if "shuffled" in kinds and arguments.seeds > 1:
-        notes.append(
-            f"Shuffled: mean of {arguments.seeds} seeds ± their standard deviation; the interval "
-            "is of the mean."
+def _check_files(arguments: Evaluate) -> None:
+    """Check before any work that files can be written and flags go together."""
+    if arguments.json is not None:
+        check_target(arguments.json)
+    if arguments.out is not None:
+        check_target(arguments.out / "config.json")
+    if arguments.report is not None:
+        check_target(arguments.report / "index.html")
+    if arguments.rerank is None and arguments.rerank_weights is not None:
+        raise InputError(
+            "rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"
         )
-    return notes
 
 
-def _write_galleries(
-    out: pathlib.Path, benchmark: Benchmark, model_name: str, results: list[GroupingResult]
-) -> None:
-    from crisalad_jax.report import prediction_gallery
-
-    for result in results:
-        prediction_gallery(
-            out / f"gallery_{re.sub(r'[/:]', '-', result.label).replace(' + ', '_')}.png",
-            benchmark.queries,
-            benchmark.database,
-            *result.neighbours,
-            benchmark.ground_truth(),
-            title=f"{benchmark.name}, {model_name}, {result.label}",
-        )
+def _reranking(arguments: Evaluate, config: ModelConfig) -> Reranking | None:
+    """Load the second stage, and check that it fits the first."""
+    if arguments.rerank is None:
+        return None
+    rerank = parse_reranking(arguments.rerank)
+    if arguments.rerank_weights is not None:
+        own_params, own_config = load_weights(arguments.rerank_weights)
+        rerank = dataclasses.replace(rerank, params=own_params, config=own_config)
+    rerank.check(config)
+    return rerank

@@ -4,8 +4,8 @@ import dataclasses
 import pathlib
 from typing import Literal
 
-from crisalad_jax.cli.common import console, model_of
-from crisalad_jax.files import check_new_folder
+from crisalad_jax.cli.common import load_model, say
+from crisalad_jax.utils.files import check_new_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,11 +29,13 @@ class Export:
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
+    plugin: tuple[str, ...] = ()
+    """Files FILE.py or modules that register parts of your own; their code is run."""
 
 
 def run(arguments: Export) -> None:
-    """Export, and say what was written."""
-    from crisalad_jax.export import ExportConfig, write_export
+    """Export the model, and print what was written."""
+    from crisalad_jax.checkpoints.export import ExportConfig, write_export
 
     check_new_folder(arguments.out)
     how = ExportConfig(
@@ -42,7 +44,7 @@ def run(arguments: Export) -> None:
         weights_inside=arguments.weights_inside,
         platforms=tuple(dict.fromkeys(arguments.platforms.split(","))),
     )
-    params, config, _ = model_of(
+    params, config, _ = load_model(
         arguments.weights,
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
@@ -52,9 +54,8 @@ def run(arguments: Export) -> None:
         f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"
         for name in ("images", "descriptors")
     )
-    console.print(
+    say(
         f"{arguments.out}: images {' -> descriptors '.join(shapes)}; "
         f"{manifest['grouping_means']}; weights {'inside' if how.weights_inside else 'beside'}; "
-        f"for {', '.join(manifest['platforms'])}",
-        soft_wrap=True,
+        f"for {', '.join(manifest['platforms'])}"
     )

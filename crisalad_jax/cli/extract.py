@@ -4,22 +4,9 @@ import dataclasses
 import pathlib
 from typing import Literal
 
-from crisalad_jax.cli.common import console, model_of
-from crisalad_jax.data.images import list_images, names_in
-from crisalad_jax.descriptors import (
-    Descriptors,
-    config_of,
-    read_descriptors,
-    targets,
-    writer_for,
-)
-from crisalad_jax.errors import InputError
-from crisalad_jax.evaluation import group, read_tokens
-from crisalad_jax.files import check_target, write_json
-from crisalad_jax.groupings import GROUPINGS, check_grouping
-from crisalad_jax.pairs import check_names, nearest_pairs, write_pairs
-from crisalad_jax.pca import load_pca
-from crisalad_jax.serial import to_plain
+from crisalad_jax.cli.common import load_model, say
+from crisalad_jax.retrieval.extract import check_extraction, extract
+from crisalad_jax.retrieval.grouping import GROUPINGS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,114 +42,49 @@ class Extract:
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
+    plugin: tuple[str, ...] = ()
+    """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
     """No progress bars."""
 
 
 def run(arguments: Extract) -> None:
-    """Describe the images, and write the descriptors."""
-    write = writer_for(arguments.out)
-    for target in (*targets(arguments.out), *([arguments.pairs] if arguments.pairs else [])):
-        check_target(target)
-    if arguments.pairs in targets(arguments.out):
-        raise InputError(f"--pairs: found {arguments.pairs}, which --out writes, expected another")
-    if arguments.database is not None and arguments.pairs is None:
-        raise InputError("--database: found without --pairs, expected both")
-    check_grouping([arguments.grouping], arguments.batch_size, arguments.seed)
-    params, config, _ = model_of(
+    """Describe the images, and print what was written."""
+    check_extraction(
+        arguments.out,
+        grouping=arguments.grouping,
+        batch_size=arguments.batch_size,
+        seed=arguments.seed,
+        pairs=arguments.pairs,
+        database=arguments.database,
+        k=arguments.k,
+    )
+    params, config, _ = load_model(
         arguments.weights,
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
     )
-    pca = None if arguments.pca is None else load_pca(arguments.pca)
-    if pca is not None:
-        pca.check(config.descriptor_dim, str(arguments.weights))
-        if arguments.pairs is not None and not pca.config.renormalise:
-            raise InputError(
-                f"--pairs: found {arguments.pca}, which leaves lengths as they are, expected "
-                "components that make unit vectors, which are paired by cosine"
-            )
-    paths = list_images(arguments.images)
-    names = _names(arguments, paths)
-    length = config.descriptor_dim if pca is None else len(pca.components)
-    database = _database(arguments, names, length)
-    folder = read_tokens(
+    result = extract(
         params,
         config,
-        paths,
+        arguments.images,
+        arguments.out,
+        weights=arguments.weights,
+        grouping=arguments.grouping,
         batch_size=arguments.batch_size,
-        label="images",
+        seed=arguments.seed,
+        root=arguments.root,
+        pairs=arguments.pairs,
+        database=arguments.database,
+        k=arguments.k,
+        pca=arguments.pca,
         on_bad_image=arguments.on_bad_image,
         quiet=arguments.quiet,
     )
-    descriptors = group(
-        params,
-        config,
-        folder,
-        arguments.grouping,
-        batch_size=arguments.batch_size,
-        seed=arguments.seed,
-        quiet=arguments.quiet,
-    )[folder.readable]
-    skipped = [name for name, ok in zip(names, folder.readable, strict=True) if not ok]
-    kept = [name for name, ok in zip(names, folder.readable, strict=True) if ok]
-    if not kept:
-        raise InputError(f"{arguments.images}: found {len(paths)} images, none of them readable")
-    if pca is not None:
-        descriptors = pca.apply(descriptors)
-    write(arguments.out, descriptors, kept)
-    write_json(
-        config_of(arguments.out),
-        {
-            "weights": str(arguments.weights),
-            "images": str(arguments.images),
-            "grouping": arguments.grouping,
-            "batch_size": arguments.batch_size,
-            "seed": arguments.seed,
-            "pca": None if arguments.pca is None else str(arguments.pca),
-            "skipped": skipped,
-            "model": to_plain(config),
-        },
+    if result.pairs is not None:
+        say(f"{arguments.pairs}: {len(result.pairs)} pairs")
+    skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""
+    say(
+        f"{arguments.out}: {len(result.names)} descriptors of {result.descriptors.shape[1]} "
+        f"numbers, grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]}){skipped}"
     )
-    if arguments.pairs is not None:
-        pairs = nearest_pairs(kept, descriptors, *(database or (kept, descriptors)), k=arguments.k)
-        write_pairs(arguments.pairs, pairs)
-        console.print(f"{arguments.pairs}: {len(pairs)} pairs", soft_wrap=True)
-    console.print(
-        f"{arguments.out}: {len(kept)} descriptors of {descriptors.shape[1]} numbers, "
-        f"grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]})"
-        + (f"; {len(skipped)} unreadable images left out" if skipped else ""),
-        soft_wrap=True,
-    )
-
-
-def _names(arguments: Extract, paths: list[pathlib.Path]) -> list[str]:
-    """Posix paths relative to --root, which holds --images."""
-    folder = pathlib.PurePath()
-    if arguments.root is not None:
-        images, root = arguments.images.resolve(), arguments.root.resolve()
-        if not images.is_relative_to(root):
-            raise InputError(f"--root: found {root}, expected a folder that holds {images}")
-        folder = images.relative_to(root)
-    return [(folder / name).as_posix() for name in names_in(arguments.images, paths)]
-
-
-def _database(
-    arguments: Extract, names: list[str], length: int
-) -> tuple[list[str], Descriptors] | None:
-    """What these images are to be paired with; all is checked that can be before the work."""
-    if arguments.pairs is None:
-        return None
-    if arguments.k < 1:
-        raise InputError(f"k: found {arguments.k}, expected at least 1")
-    check_names(arguments.pairs, names)
-    if arguments.database is None:
-        return None
-    listed, descriptors = read_descriptors(arguments.database)
-    check_names(arguments.pairs, listed)
-    if descriptors.shape[1] != length:
-        raise InputError(
-            f"{arguments.database}: found descriptors of {descriptors.shape[1]} numbers, expected "
-            f"{length} as of these images"
-        )
-    return listed, descriptors

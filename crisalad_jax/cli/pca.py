@@ -3,11 +3,10 @@
 import dataclasses
 import pathlib
 
-from crisalad_jax.cli.common import console
-from crisalad_jax.descriptors import open_npy
-from crisalad_jax.errors import InputError
-from crisalad_jax.files import check_target
-from crisalad_jax.pca import SAMPLES, PcaConfig, fit_pca, save_pca
+from crisalad_jax.cli.common import say
+from crisalad_jax.retrieval.descriptor_files import open_npy
+from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
+from crisalad_jax.utils.files import check_target
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,15 +32,11 @@ class Pca:
 
 
 def run(arguments: Pca) -> None:
-    """Fit, write, and say how much of the variance is kept."""
-    if arguments.out.suffix != ".safetensors":
-        raise InputError(
-            f"{arguments.out}: found the suffix {arguments.out.suffix!r}, expected .safetensors"
-        )
-    check_target(arguments.out)
-    found = open_npy(arguments.descriptors)
+    """Fit components, write them, and print their share of the variance."""
+    check_target(arguments.out, ".safetensors")
+    descriptors = open_npy(arguments.descriptors)
     pca = fit_pca(
-        found,
+        descriptors,
         arguments.dim,
         PcaConfig(arguments.whiten, arguments.renormalise),
         samples=arguments.samples,
@@ -49,9 +44,8 @@ def run(arguments: Pca) -> None:
         quiet=arguments.quiet,
     )
     save_pca(arguments.out, pca)
-    console.print(
-        f"{arguments.out}: {arguments.dim} of {found.shape[1]} components, "
+    say(
+        f"{arguments.out}: {arguments.dim} of {descriptors.shape[1]} components, "
         f"{100 * pca.kept:.1f} % of the variance of "
-        f"{min(arguments.samples, len(found))} descriptors",
-        soft_wrap=True,
+        f"{min(arguments.samples, len(descriptors))} descriptors"
     )

@@ -1,10 +1,10 @@
-"""What configurations check of their fields."""
+"""Checks of a configuration's fields."""
 
 import math
 from collections.abc import Mapping
 from typing import TypeVar, get_args, get_type_hints
 
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 _T = TypeVar("_T")
 
@@ -27,7 +27,7 @@ def require(condition: bool, message: str) -> None:
 
 
 def require_positive(config: object, *names: str) -> None:
-    """More than 0, and finite; whole numbers too, where fields are annotated `int`."""
+    """Check that fields are positive and finite, and whole numbers where annotated `int`."""
     hints = get_type_hints(type(config))
     for name in names:
         value = getattr(config, name)
@@ -42,7 +42,7 @@ def require_positive(config: object, *names: str) -> None:
 
 
 def require_choice(config: object, *names: str) -> None:
-    """Fields annotated `Literal` hold one of its values."""
+    """Check that fields annotated `Literal` hold one of its values."""
     hints = get_type_hints(type(config))
     for name in names:
         choices = dict.fromkeys(get_args(hints[name]))
@@ -50,7 +50,7 @@ def require_choice(config: object, *names: str) -> None:
 
 
 def require_fraction(config: object, *names: str) -> None:
-    """At least 0 and less than 1."""
+    """Check that fields are at least 0 and less than 1."""
     for name in names:
         value = getattr(config, name)
         require(

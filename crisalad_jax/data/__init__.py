@@ -1,1 +1,1 @@
-"""Pictures and data sets: numpy and OpenCV only, never jax."""
+"""Images and data sets, with numpy and OpenCV alone: this package does not import jax."""

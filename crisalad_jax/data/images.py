@@ -1,4 +1,4 @@
-"""Pictures from files: decode to 8-bit RGB, list a folder.
+"""Decode image files to 8-bit RGB, and list the images of a folder.
 
 JPEG markers are from ITU-T T.81 annex B, PNG chunks from the W3C PNG specification, section 5.
 """
@@ -13,17 +13,17 @@ import numpy as np
 from jaxtyping import UInt8
 
 from crisalad_jax.data.opencv import QUIET
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-"""What `list_images` takes for an image, in lower case. Reading goes by content, not by suffix."""
+"""Suffixes of images for `list_images`, in lower case. Decoding goes by content, not by suffix."""
 
 _FORMATS = "a JPEG, PNG, WebP, BMP or TIFF image"
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-# Any marker but the stuffed byte FF00, the restarts FFD0..FFD7 and the fill FFFF.
+# Any marker except the stuffed byte FF00, the restarts FFD0..FFD7 and the fill FFFF.
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-# The flags for grey pictures, beside which the one for colours still holds.
+# OpenCV's flags for reduced grey images; with the colour flag they reduce RGB images too.
 _REDUCED = (
     (8, cv2.IMREAD_REDUCED_GRAYSCALE_8),
     (4, cv2.IMREAD_REDUCED_GRAYSCALE_4),
@@ -36,9 +36,9 @@ def read_image(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image file as 8-bit RGB, upright.
 
-    For a size (height, width) that is `enough`, a JPEG is decoded at a half, a quarter or an eighth
-    of its own while that is twice as large at least: in less time, and once resized one or two
-    levels of 256 (root mean square) from the picture of all its pixels.
+    With `enough`, a JPEG is decoded at a half, a quarter or an eighth of its size, as long as that
+    is at least twice `enough`. Decoding is faster. After resizing, the image differs by one or two
+    levels of 256 (root mean square) from one decoded at full size.
 
     - The EXIF orientation is applied.
     - 16 bits become 8 by dropping the low byte (v >> 8), as OpenCV does.
@@ -48,9 +48,20 @@ def read_image(
       exception, where transparency shows black (libtiff composites).
     - The first page or frame of several is taken.
 
+    Args:
+        path: the image file.
+        enough: height and width in pixels that the image will be resized to; None for full size.
+
+    Returns:
+        The image, in red, green and blue.
+
     Raises:
         InputError: the file is missing, a folder, empty, cut short, larger than OpenCV's limit of
             2**30 pixels, or no image of the formats above. Never half a picture.
+
+    Example:
+        >>> read_image(pictures / "0.png").shape
+        (60, 80, 3)
     """
     try:
         data = pathlib.Path(path).read_bytes()
@@ -60,8 +71,8 @@ def read_image(
         ) from error
     if not data:
         raise InputError(f"{path}: found an empty file, expected {_FORMATS}")
-    # Not left to the decoders: OpenCV 4 fills what a JPEG misses with grey, and libpng and libjpeg
-    # write their complaints to stderr past OpenCV's log.
+    # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
+    # libjpeg write warnings to stderr that OpenCV's log level does not silence.
     if (data.startswith(b"\xff\xd8") and not _jpeg_is_whole(data)) or (
         data.startswith(_PNG_SIGNATURE) and not _png_is_whole(data)
     ):
@@ -81,16 +92,16 @@ def read_image(
 
 
 def _jpeg_is_whole(data: bytes) -> bool:
-    """Whether the segments lead to an end-of-image marker; bytes after it do not matter.
+    """Return whether a JPEG's segments reach an end-of-image marker; later bytes do not matter.
 
     Segments are skipped by their length, so the end of a thumbnail inside EXIF does not count.
     """
-    # Only a file cut off behind the thumbnail ends so too, which has nothing to decode.
+    # A file cut off behind its thumbnail passes too, but has no pixels to decode.
     return data.endswith(b"\xff\xd9") or any(code == 0xD9 for code, _ in _jpeg_segments(data))
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """Markers, and where what they hold begins: with its length."""
+    """Yield each marker and the offset of its payload, which begins with its length."""
     position = 2
     while marker := _JPEG_MARKER.search(data, position):
         position = marker.end()
@@ -99,20 +110,20 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _reduction(data: bytes, enough: tuple[int, int] | None) -> int:
-    """OpenCV's flag for the smallest size at which a JPEG is decoded, for `read_image`."""
+    """Return OpenCV's flag for the smallest size at which `read_image` decodes a JPEG."""
     if enough is None or not data.startswith(b"\xff\xd8"):
         return 0
     start = next((start for code, start in _jpeg_segments(data) if code in _JPEG_FRAMES), None)
     if start is None:
         return 0
     sides = (int.from_bytes(data[start + i : start + i + 2], "big") for i in (3, 5))
-    # The shorter side for the longer, because the picture may have to be turned.
+    # Compare the shorter side with the longer, because EXIF may rotate the image.
     spare = min(sides) / (2 * max(enough))
     return next((flag for factor, flag in _REDUCED if factor <= spare), 0)
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Whether the chunks lead to IEND; bytes after it do not matter."""
+    """Return whether a PNG's chunks reach IEND; bytes after it do not matter."""
     position = len(_PNG_SIGNATURE)
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")
@@ -126,19 +137,19 @@ def _png_is_whole(data: bytes) -> bool:
 def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
     """Find the images under `folder`, in the order of their posix paths relative to it.
 
-    Recursive, through links to folders too; suffixes in any case; hidden files and folders (a name
-    that starts with a dot) are left out.
+    The search is recursive and follows links to folders. Suffixes may have any case. Hidden files
+    and folders (a name that starts with a dot) are left out.
 
     Raises:
         InputError: the folder is missing, is a file, or holds no image.
     """
     folder = pathlib.Path(folder)
     if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        raise InputError(f"{folder}: found {found}, expected a folder of images")
+        kind = "a file" if folder.exists() else "nothing"
+        raise InputError(f"{folder}: found {kind}, expected a folder of images")
     images = []
     for parent, folders, files in os.walk(folder, followlinks=True):
-        # A link to a folder that holds it would be walked for ever.
+        # Skip a link to one of its parent folders: the walk would never end.
         here = pathlib.Path(parent)
         folders[:] = [
             name
@@ -159,18 +170,34 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
 
 
 def names_in(folder: pathlib.PurePath, images: Sequence[pathlib.PurePath]) -> list[str]:
-    """Posix paths of images relative to a folder that holds them, each fit to be a line of text.
+    """Return the images' posix paths relative to their folder, each checked to fit a line of text.
 
     Raises:
         InputError: a name has a line break in it, or bytes that are no UTF-8.
     """
     names = [image.relative_to(folder).as_posix() for image in images]
+    check_lines(names, folder)
+    return names
+
+
+def check_lines(names: Sequence[str], source: object) -> None:
+    """Check that each name fits in one line of text.
+
+    Args:
+        names: the names of images.
+        source: what the message begins with, such as their folder.
+
+    Raises:
+        InputError: a name has a line break in it, or bytes that are no UTF-8.
+
+    Example:
+        >>> check_lines(["street/a.jpg"], "images")
+    """
     for name in names:
         if len(name.splitlines()) != 1:
-            raise InputError(f"{folder}: found a line break in the name {name!r}, expected none")
+            raise InputError(f"{source}: found a line break in the name {name!r}, expected none")
         if not name.isprintable() and any("\ud800" <= letter <= "\udfff" for letter in name):
-            raise InputError(f"{folder}: found the name {name!r}, expected UTF-8")
-    return names
+            raise InputError(f"{source}: found the name {name!r}, expected UTF-8")
 
 
 def _holds(folder: pathlib.Path, inner: pathlib.Path) -> bool:

@@ -1,4 +1,4 @@
-"""Settings of OpenCV, of which a process has one each, changed while somebody asks for it."""
+"""Contexts that change a global setting of OpenCV while any thread is in them."""
 
 import threading
 from collections.abc import Callable
@@ -10,7 +10,7 @@ class _Setting:
     """A context that changes a setting; any number of threads may be in it."""
 
     def __init__(self, change: Callable[[], int], restore: Callable[[int], object]) -> None:
-        """`change` returns what it was before, which `restore` is given by the last to leave."""
+        """Take `change`, which returns the old value, and `restore`, which the last thread runs."""
         self._change, self._restore = change, restore
         self._lock = threading.Lock()
         self._users = self._before = 0
@@ -38,6 +38,6 @@ QUIET = _Setting(
     lambda: cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT),
     cv2.utils.logging.setLogLevel,
 )
-"""No log on stderr: our errors say what the user needs."""
+"""Context without OpenCV's log on stderr: our errors say what the user needs."""
 ONE_THREAD = _Setting(_one_thread, cv2.setNumThreads)
-"""No threads of its own, where images are already spread over all cores."""
+"""Context without OpenCV's own threads, for images that are already decoded on all cores."""

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Int, Int32, Int64
 
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
 IDS_PER_CITY = 10**5
@@ -31,7 +31,7 @@ class Places:
     root: pathlib.Path
     cities: tuple[str, ...]
     files: tuple[str, ...]
-    """Image -> path relative to `root`. Text, because a Path takes ten times the memory."""
+    """Image -> path relative to `root`, as text: a Path takes ten times the memory."""
     image_place: Int32[np.ndarray, " images"]
     """Image -> place, ascending."""
     place_city: Int32[np.ndarray, " places"]
@@ -42,11 +42,11 @@ class Places:
 
     @property
     def image_counts(self) -> Int64[np.ndarray, " places"]:
-        """Images of each place."""
+        """Number of images of each place."""
         return np.diff(self.place_start)
 
     def path(self, image: int | np.integer) -> pathlib.Path:
-        """Path of one image."""
+        """Return the path of one image."""
         return self.root / self.files[image]
 
     def describe_place(self, place: int | np.integer) -> str:
@@ -68,9 +68,16 @@ def read_places(
         cities: names of CSV files without the suffix; None reads all, in alphabetical order.
         min_images: places with fewer images are left out.
 
+    Returns:
+        The places, with their images' files.
+
     Raises:
         InputError: no `Dataframes` or nothing in it, an unknown or repeated city, a CSV without a
             column or with a field that is not a number, a missing image, no place large enough.
+
+    Example:
+        >>> read_places(places, min_images=3).image_counts.tolist()
+        [3, 3, 3, 3, 3, 3, 3, 3]
     """
     root = pathlib.Path(root)
     tables = _find_tables(root, cities)
@@ -125,8 +132,8 @@ def _find_tables(root: pathlib.Path, cities: Sequence[str] | None) -> list[pathl
 def _read_city(
     root: pathlib.Path, table: pathlib.Path, listings: dict[str, frozenset[str]]
 ) -> list[tuple[int, list[str]]]:
-    """Places of one city in ascending order of their id, with the images of each."""
-    # The inner dict is an ordered set.
+    """Read one city's places, ascending by id, with the images of each."""
+    # The inner dict serves as an ordered set.
     places: dict[int, dict[str, None]] = {}
     name = table.stem
     for line, row in _read_rows(table):
@@ -161,7 +168,7 @@ def _read_city(
 
 
 def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, tuple[str, ...]]]:
-    """Line number and the fields in the order of COLUMNS, of every row that is not blank."""
+    """Yield the line number and the fields, in the order of COLUMNS, of every nonblank row."""
     try:
         # utf-8-sig: a spreadsheet's byte order mark would spoil the first column's name.
         with table.open(newline="", encoding="utf-8-sig") as file:
@@ -188,7 +195,7 @@ def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, tuple[str, ...]]]:
 
 
 def _not_a_number(table: pathlib.Path, line: int, row: Sequence[str]) -> InputError:
-    """Which field of a row is none."""
+    """Make the error that names a row's field that is no number."""
     for name, text in zip(COLUMNS, row, strict=True):
         whole = name in COLUMNS[:4]
         if not whole and name not in ("lat", "lon"):
@@ -236,15 +243,15 @@ def epoch_batches(
     epoch: int,
     steps: int | None = None,
 ) -> Int[np.ndarray, "steps places images"]:
-    """Images of every batch of an epoch: a pure function of (seed, epoch).
+    """Draw the images of every batch of an epoch, as a pure function of (seed, epoch).
 
     Every place comes at most once, with `images_per_place` of its images sampled without
-    replacement; the last batch is dropped if incomplete. "within-city" shuffles the places of each
-    city and strings the cities together in random order, so that a batch is nearly always of one
-    city, whose places are hard to tell apart (the public loaders); "shuffled" mixes all.
+    replacement. An incomplete last batch is dropped. "within-city" shuffles the places of each
+    city and joins the cities in random order, as the public loaders do. A batch is then nearly
+    always of one city, whose places are hard to tell apart. "shuffled" mixes all cities.
 
-    With `steps` the epoch has so many batches: it is cut short, or drawn over and over, each time
-    anew.
+    With `steps` the epoch has exactly this number of batches: it is cut short, or continued with
+    new draws of all places.
 
     Raises:
         InputError: a place has fewer than `images_per_place` images, there are fewer places than
@@ -274,8 +281,8 @@ def epoch_batches(
     once = len(counts) // places_per_batch
     drawn = []
     for turn in range(1 if steps is None else -(-steps // once)):
-        # The spawn key keeps these numbers apart from those that the loader draws from (seed,
-        # epoch); the first turn's are those of an epoch without `steps`.
+        # The spawn key makes this stream independent of the loader's from (seed, epoch). The
+        # first turn draws the same as an epoch without `steps`.
         entropy = (seed, epoch, turn) if turn else (seed, epoch)
         generator = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(0,)))
         drawn.append(_draw(places, places_per_batch, images_per_place, order, generator))
@@ -289,7 +296,7 @@ def _draw(
     order: Order,
     generator: np.random.Generator,
 ) -> Int[np.ndarray, "steps places images"]:
-    """Every place once."""
+    """Draw the batches of one turn, in which every place comes once."""
     counts = places.image_counts
     if order == "within-city":
         city_rank = generator.permutation(len(places.cities))[places.place_city]
@@ -300,6 +307,6 @@ def _draw(
     place_order = np.lexsort((generator.random(len(counts)), city_rank))
     steps = len(counts) // places_per_batch
     chosen = place_order[: steps * places_per_batch].reshape(steps, places_per_batch)
-    # Sorting all images by (place, random key) shuffles each place's images where they stand.
+    # Sorting all images by (place, random key) shuffles the images within each place.
     shuffled = np.lexsort((generator.random(len(places.files)), places.image_place))
     return shuffled[places.place_start[chosen][..., None] + np.arange(images_per_place)]

@@ -1,4 +1,4 @@
-"""Where images were taken: from their @UTM names, or from a table."""
+"""Read where images were taken, from their @UTM names or from a table."""
 
 import csv
 import math
@@ -7,21 +7,21 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 AXES = (("east", "north"), ("lat", "lon"))
-"""What the two numbers of a position may be: metres of UTM, or degrees."""
+"""Names of a position's two numbers: metres of UTM, or degrees."""
 
 
 class Positions(NamedTuple):
-    """Positions by the names of images; images that have none are not in it."""
+    """Positions by image name; images without a position are absent."""
 
     axes: tuple[str, str]
     of: dict[str, tuple[float, float]]
 
 
 def utm_position(name: str) -> tuple[float, float] | None:
-    """East and north in metres, where a file's name says so: `@UTM_east@UTM_north@...`."""
+    """Read east and north in metres from a name `@UTM_east@UTM_north@...`; None for other names."""
     fields = name.split("@")
     try:
         east, north = float(fields[1]), float(fields[2])
@@ -31,17 +31,17 @@ def utm_position(name: str) -> tuple[float, float] | None:
 
 
 def utm_positions(names: Sequence[str]) -> Positions:
-    """East and north in metres of those images whose names say so, `@UTM_east@UTM_north@...`."""
-    found = {}
+    """Read east and north in metres of the images with names `@UTM_east@UTM_north@...`."""
+    positions = {}
     for name in names:
         position = utm_position(pathlib.PurePosixPath(name).name)
         if position is not None:
-            found[name] = position
-    return Positions(AXES[0], found)
+            positions[name] = position
+    return Positions(AXES[0], positions)
 
 
 def read_positions(path: str | os.PathLike[str]) -> Positions:
-    """Read a table with the header `name,east,north` or `name,lat,lon`; more columns do not matter.
+    """Read a table with the header `name,east,north` or `name,lat,lon`; other columns are ignored.
 
     Raises:
         InputError: the file cannot be read, has another header or one with both pairs, a row with
@@ -49,7 +49,7 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
             latitude or longitude.
     """
     path = pathlib.Path(path)
-    found: dict[str, tuple[float, float]] = {}
+    positions: dict[str, tuple[float, float]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
@@ -62,26 +62,26 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
                         f"{where}: found more fields than the header's {len(header)}, expected as "
                         "many (a decimal is written with a point)"
                     )
-                if row["name"] in found:
+                if row["name"] in positions:
                     raise InputError(f"{where}: found {row['name']!r} twice, expected it once")
-                found[row["name"]] = _position(row, axes, where)
+                positions[row["name"]] = _position(row, axes, where)
     except (OSError, ValueError, csv.Error) as error:
         if isinstance(error, InputError):
             raise
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot read these positions: {reason}") from error
-    return Positions(axes, found)
+    return Positions(axes, positions)
 
 
 def _axes(path: pathlib.Path, header: Sequence[str]) -> tuple[str, str]:
-    found = [axes for axes in AXES if {"name", *axes} <= set(header)]
-    if len(found) != 1:
-        both = ", not both" if found else ""
+    matching = [axes for axes in AXES if {"name", *axes} <= set(header)]
+    if len(matching) != 1:
+        both = ", not both" if matching else ""
         raise InputError(
             f"{path}: found columns {', '.join(header) or 'none'}, expected name,east,north or "
             f"name,lat,lon{both}"
         )
-    return found[0]
+    return matching[0]
 
 
 def _position(row: dict[str, str], axes: tuple[str, str], where: str) -> tuple[float, float]:

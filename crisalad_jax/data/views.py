@@ -1,4 +1,4 @@
-"""Where the images of a training set were taken, and which way they look: from their names."""
+"""Read the positions and headings of a training set's images from their names."""
 
 import re
 from typing import NamedTuple
@@ -7,42 +7,42 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from crisalad_jax.data.places import Places
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 _NAME = re.compile(r".*?_\d{7,}_\d{4,}_\d{2,}_(\d{3,})_([^_]+)_([^_]+)_")
 """`data.places` writes a row's northdeg, latitude and longitude into its image's name."""
 
 _EQUATOR, _FLATTENING = 6_378_137.0, 1 / 298.257223563
-"""Metres, of WGS84."""
+"""Ellipsoid of WGS84, in metres."""
 _SCALE, _FALSE_EAST = 0.9996, 500_000.0
 
 
 class Views(NamedTuple):
-    """Of every image of a training set; metres are of one UTM zone for each city."""
+    """Position and heading of every image; metres are of one UTM zone for each city."""
 
     east: Float64[np.ndarray, " images"]
     north: Float64[np.ndarray, " images"]
-    """Negative south of the equator, where maps add 10,000 km."""
+    """UTM north in metres; negative south of the equator, where maps add 10,000 km."""
     heading: Float64[np.ndarray, " images"]
-    """Degrees clockwise from north, 0 to 360."""
+    """Heading in degrees clockwise from north, 0 to 360."""
     known: Bool[np.ndarray, " cities"]
-    """False where all images of a city bear one position, which stands for none."""
+    """Whether a city's positions are real; False where all its images have the same position."""
 
 
 def views_of(places: Places) -> Views:
-    """Read positions and headings; a city's zone is that of the middle of its longitudes.
+    """Read positions and headings; a city's UTM zone is that of its median longitude.
 
     Raises:
         InputError: a file is not named in the way of GSV-Cities, or bears no latitude or longitude.
     """
-    found = np.array([_fields(places, file) for file in places.files])
-    heading, latitude, longitude = found.T
+    fields = np.array([_fields(places, file) for file in places.files])
+    heading, latitude, longitude = fields.T
     city = places.place_city[places.image_place]
     east, north = np.empty(len(city)), np.empty(len(city))
     known = np.zeros(len(places.cities), bool)
     for number in np.unique(city):
         of = city == number
-        # Continuous where a city lies on both sides of 180 degrees.
+        # Make longitudes continuous where a city lies on both sides of 180 degrees.
         first = longitude[of][0]
         here = first + (longitude[of] - first + 180) % 360 - 180
         known[number] = np.ptp(latitude[of]) > 0 or np.ptp(here) > 0
@@ -73,11 +73,11 @@ def _fields(places: Places, file: str) -> tuple[float, float, float]:
 def transverse_mercator(
     latitude: Float64[np.ndarray, " point"], longitude: Float64[np.ndarray, " point"]
 ) -> tuple[Float64[np.ndarray, " point"], Float64[np.ndarray, " point"]]:
-    """UTM's east and north in metres; north is negative in the south.
+    """Compute UTM's east and north in metres; north is negative in the south.
 
-    Krueger's series (1912) of third order in the third flattening, as in Karney, Transverse
-    Mercator with an accuracy of a few nanometers (J. Geodesy 2011): to a millimetre in a zone and
-    in those beside it.
+    The formula is Krueger's series (1912) of third order in the third flattening, as in Karney,
+    Transverse Mercator with an accuracy of a few nanometers (J. Geodesy 2011). It is exact to a
+    millimetre in a zone and its neighbours.
 
     Args:
         latitude: degrees on WGS84.

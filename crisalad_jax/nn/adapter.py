@@ -1,17 +1,19 @@
-"""The adapters beside a block's MLP: the paper's (section 3.2), and its Table 2's two others.
+"""The adapters beside a block's MLP: the paper's (section 3.2) and two others of its Table 2.
 
-All narrow the tokens, act on them, and widen them again with a projection that starts at 0, so that
-an untrained adapter changes nothing.
+All project the tokens down, act on them, and project them up again. The up-projection starts at 0,
+so that an untrained adapter changes nothing.
 """
 
+import dataclasses
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import ViTConfig
+from crisalad_jax.config.checks import require, require_choice, require_positive
 from crisalad_jax.nn.layers import (
     BatchNorm,
     Conv,
@@ -26,14 +28,63 @@ from crisalad_jax.nn.layers import (
     init_linear,
     linear,
 )
-from crisalad_jax.pytree import params
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 BATCH_NORM_EPSILON = 1e-3
 
 
-@params
+@dataclasses.dataclass(frozen=True)
+class AdapterConfig:
+    """The adapter beside the MLP of every block (paper section 3.2 and Table 2).
+
+    Example:
+        >>> AdapterConfig(kind="none").kind
+        'none'
+    """
+
+    kind: Literal["depthwise", "multi-resolution", "mlp", "none"] = "depthwise"
+    """Kind of adapter: the paper's depthwise-separable convolution, CricaVPR's multi-resolution
+    one, or a plain MLP; none leaves it out."""
+    bottleneck: float = 0.5
+    """Width of the adapter over the width of the backbone."""
+    kernel_size: int = 3
+    """Side of the depthwise filter."""
+    alpha: float = 0.2
+    """Weight of the adapter's output (paper Eq. 2)."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_choice(self, "kind")
+        require_positive(self, "bottleneck", "kernel_size")
+        require(
+            self.kernel_size % 2 == 1,
+            f"AdapterConfig.kernel_size: found {self.kernel_size}, expected an odd number",
+        )
+
+    def width(self, dim: int) -> int:
+        """Return the width of the bottleneck beside a backbone of width `dim`.
+
+        Raises:
+            InputError: it is 0, or does not divide into the branches of the adapter.
+        """
+        width = int(dim * self.bottleneck)
+        require(
+            self.kind == "none" or width >= 1,
+            f"AdapterConfig.bottleneck: found {self.bottleneck}, expected a width of at least 1 "
+            f"for dim {dim}",
+        )
+        require(
+            self.kind != "multi-resolution" or width % 16 == 0,
+            f"AdapterConfig.bottleneck: found {self.bottleneck}, which is a width of {width} for "
+            f"dim {dim}; expected a multiple of 16, for the branches of a multi-resolution adapter "
+            "take 1/2, 1/4 and 1/16 of it",
+        )
+        return width
+
+
+@pytree_dataclass
 class DepthwiseAdapter:
-    """741,504 parameters at the paper's width, its Table 3: the two linears carry no bias."""
+    """The paper's adapter, whose linears have no bias: 741,504 parameters (Table 3)."""
 
     down: Linear
     depthwise: DepthwiseConv
@@ -41,7 +92,7 @@ class DepthwiseAdapter:
     up: Linear
 
 
-@params
+@pytree_dataclass
 class ConvNorm:
     """A convolution and the batch norm after it."""
 
@@ -49,9 +100,9 @@ class ConvNorm:
     norm: BatchNorm
 
 
-@params
+@pytree_dataclass
 class MultiResolutionAdapter:
-    """CricaVPR's: convolutions of 1 x 1, 3 x 3 and 5 x 5 side by side, the last two narrowed."""
+    """CricaVPR's adapter: parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, the last two reduced."""
 
     down: Linear
     branch1: ConvNorm
@@ -60,9 +111,9 @@ class MultiResolutionAdapter:
     up: Linear
 
 
-@params
+@pytree_dataclass
 class MlpAdapter:
-    """No look at the neighbours at all."""
+    """A plain MLP, which acts on every token alone."""
 
     down: Linear
     up: Linear
@@ -71,21 +122,24 @@ class MlpAdapter:
 Adapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter
 
 
-def init_adapter(key: PRNGKeyArray, config: ViTConfig) -> Adapter | None:
-    """Random parameters of `config.adapter.kind`, the up-projection at 0; None for "none"."""
-    kind, width = config.adapter.kind, config.adapter_dim
+def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter | None:
+    """Draw random parameters beside a backbone of width `dim`; None for "none".
+
+    The up-projection starts at 0.
+    """
+    kind, width = config.kind, config.width(dim)
     if kind == "none":
         return None
     down_key, first, second, up_key = jax.random.split(key, 4)
     bias = kind != "depthwise"
-    down = init_linear(down_key, config.dim, width, bias=bias)
-    up = jax.tree.map(jnp.zeros_like, init_linear(up_key, width, config.dim, bias=bias))
+    down = init_linear(down_key, dim, width, bias=bias)
+    up = jax.tree.map(jnp.zeros_like, init_linear(up_key, width, dim, bias=bias))
     if kind == "mlp":
         return MlpAdapter(down, up)
     if kind == "depthwise":
         return DepthwiseAdapter(
             down=down,
-            depthwise=init_depthwise_conv(first, config.adapter.kernel_size, width),
+            depthwise=init_depthwise_conv(first, config.kernel_size, width),
             pointwise=init_linear(second, width, width),
             up=up,
         )
@@ -113,11 +167,11 @@ def _init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) 
 def adapter(
     params: Adapter, tokens: Float[Array, "*batch token dim"], grid: tuple[int, int]
 ) -> Float[Array, "*batch token dim"]:
-    """Down, ReLU, convolutions on the patch grid plus skip, up (Adapter of paper Eq. 2).
+    """Apply an adapter: down, ReLU, convolutions on the patch grid plus skip, up (paper Eq. 2).
 
-    The last `grid[0] * grid[1]` tokens are patches in row order. The class and register tokens
-    before them take no part in the convolutions, which act on them as the identity, so with the
-    skip they count twice, as in CricaVPR. The MLP adapter has neither convolutions nor skip.
+    The last `grid[0] * grid[1]` tokens are patches in row order. The convolutions are the identity
+    on the class and register tokens before them. With the skip these tokens therefore count twice,
+    as in CricaVPR. The MLP adapter has neither convolutions nor skip.
     """
     hidden = jax.nn.relu(checkpoint_name(linear(params.down, tokens), "down"))
     if isinstance(params, MlpAdapter):
@@ -149,8 +203,8 @@ def _multi_resolution(
     outputs = []
     for branch in branches:
         y = x
-        for one in branch:
-            y = batch_norm(one.norm, conv(one.conv, y), epsilon=BATCH_NORM_EPSILON)
+        for layer in branch:
+            y = batch_norm(layer.norm, conv(layer.conv, y), epsilon=BATCH_NORM_EPSILON)
             y = jax.nn.relu(y)
         outputs.append(y)
     return jnp.concatenate(outputs, axis=-1)

@@ -1,6 +1,6 @@
 """Multi-head attention: one function for patches of an image and for images of a batch.
 
-On a GPU, in bfloat16, it is cuDNN's fused one where nothing is masked or dropped.
+On a GPU it uses cuDNN's fused attention in bfloat16, without mask and dropout.
 """
 
 import math
@@ -12,20 +12,20 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.nn.layers import Linear, dropout, init_linear, linear
-from crisalad_jax.platform import has_fused_attention
-from crisalad_jax.pytree import params
+from crisalad_jax.utils.compiler import has_fused_attention
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 
-@params
+@pytree_dataclass
 class Attention:
-    """Query, key and value in one product, in this order, then the output projection."""
+    """The joint projection to query, key and value, in this order, and the output projection."""
 
     qkv: Linear
     proj: Linear
 
 
 def init_torch_attention(qkv_key: PRNGKeyArray, proj_key: PRNGKeyArray, dim: int) -> Attention:
-    """Start as torch's `nn.MultiheadAttention` does: Glorot-uniform inputs, zero biases."""
+    """Draw parameters as torch's `nn.MultiheadAttention`: Glorot-uniform inputs, zero biases."""
     bound = math.sqrt(6 / (dim + 3 * dim))
     qkv = jax.random.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound)
     proj = init_linear(proj_key, dim, dim).weight
@@ -41,34 +41,36 @@ def attention(
     dropout_rate: float = 0.0,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "*batch token dim"]:
-    """Scaled dot-product self-attention (Vaswani et al. 2017), of one sequence or a batch.
+    """Apply scaled dot-product self-attention (Vaswani et al. 2017) to a sequence or a batch.
 
-    `mask[i, j]` says that token i may look at token j; a row must allow at least one. Scores and
-    softmax are float32 whatever the type of `x`. `dropout_rate` falls on the attention weights.
+    `mask[i, j]` allows token i to attend to token j; a row must allow at least one. Scores and
+    softmax are float32 for every type of `x`. `dropout_rate` applies to the attention weights.
     """
     *batch, tokens, dim = x.shape
-    kept = None
+    dropout_mask = None
     if key is not None and dropout_rate > 0:
         every = jnp.ones((*batch, heads, tokens, tokens), _wide(x))
-        kept = dropout(every, dropout_rate, key=key)
+        dropout_mask = dropout(every, dropout_rate, key=key)
     qkv = checkpoint_name(linear(params.qkv, x), "qkv")
     qkv = qkv.reshape(*batch, tokens, 3 * heads, dim // heads)
     queries, keys, values = jnp.split(qkv, 3, axis=-2)
-    fits = x.dtype == jnp.bfloat16 and dim // heads % 8 == 0 and mask is None and kept is None
+    fits = (
+        x.dtype == jnp.bfloat16 and dim // heads % 8 == 0 and mask is None and dropout_mask is None
+    )
     if fits and has_fused_attention():
         queries, keys, values = (
-            one.reshape(-1, tokens, heads, dim // heads) for one in (queries, keys, values)
+            part.reshape(-1, tokens, heads, dim // heads) for part in (queries, keys, values)
         )
         mixed = jax.nn.dot_product_attention(queries, keys, values, implementation="cudnn")
         return linear(params.proj, mixed.reshape(x.shape))
-    # With the heads in front every product is a plain batched matmul. Queries are columns: so is
-    # what becomes of them, and the softmax runs down columns, which is faster on a CPU.
+    # With the heads in front every product is a plain batched matmul. Queries and outputs are
+    # columns, and the softmax runs down columns, which is faster on a CPU.
     mixed = _mix(
         jnp.moveaxis(queries / math.sqrt(dim // heads), -3, -1),
         jnp.moveaxis(keys, -3, -2),
         jnp.moveaxis(values, -3, -2),
         None if mask is None else mask.T,
-        kept,
+        dropout_mask,
     )
     return linear(params.proj, jnp.moveaxis(mixed, -1, -3).reshape(x.shape))
 
@@ -79,9 +81,9 @@ def cross_attention(
     x: Float[Array, "*batch token dim"],
     heads: int,
 ) -> Float[Array, "*batch query dim"]:
-    """Queries, the same for a whole batch, look at the tokens of `x` and not at each other.
+    """Attend from queries, shared by a whole batch, to the tokens of `x`.
 
-    As `attention` otherwise: the same scores, softmax and parameters.
+    Scores, softmax and parameters are those of `attention`.
     """
     *batch, tokens, dim = x.shape
     weight, bias = params.qkv.weight, params.qkv.bias
@@ -110,25 +112,25 @@ def _mix(
     keys: Float[Array, "*batch head token dim"],
     values: Float[Array, "*batch head token dim"],
     mask: Bool[Array, "token query"] | None,
-    kept: Float[Array, "*batch head token query"] | None,
+    dropout_mask: Float[Array, "*batch head token query"] | None,
 ) -> Float[Array, "*batch head dim query"]:
-    """Every query's mean of the values, weighted by the softmax of its scores, times `kept`.
+    """Average the values for every query, weighted by its scores' softmax times the dropout mask.
 
-    The gradient is written out: by itself JAX would make the result once more for it, and take the
-    product that leads to the queries in an order that takes twice as long on a CPU. Forward mode
-    (`jax.jvp`) it has not.
+    The gradient is a custom rule. JAX's own would recompute the result, and order the product for
+    the queries' cotangent such that it takes twice as long on a CPU. There is no forward mode
+    (`jax.jvp`).
     """
     weights, totals = _softmax(queries, keys, mask)
-    weights = weights if kept is None else weights * kept
+    weights = weights if dropout_mask is None else weights * dropout_mask
     mixed = _product("...jd,...ji->...di", values, weights.astype(values.dtype))
-    # The softmax's division, where there is less to divide.
+    # Do the softmax's division here, on the smaller array.
     return (mixed / totals).astype(values.dtype)
 
 
 def _softmax(
     queries: Array, keys: Array, mask: Array | None
 ) -> tuple[Float[Array, "*batch head token query"], Float[Array, "*batch head 1 query"]]:
-    """Exponentials of the scores, keys down the columns, and what to divide a column by."""
+    """Compute the scores' exponentials, with keys down the columns, and each column's total."""
     scores = _product("...jd,...di->...ji", keys, queries)
     if mask is not None:
         scores = jnp.where(mask, scores, -jnp.inf)
@@ -141,19 +143,19 @@ def _mix_forward(*inputs: Any) -> tuple[Array, tuple[Any, ...]]:
 
 
 def _mix_backward(inputs: tuple[Any, ...], change: Array) -> tuple[Any, ...]:
-    queries, keys, values, mask, kept = inputs
+    queries, keys, values, mask, dropout_mask = inputs
     weights, totals = _softmax(queries, keys, mask)
     change = (change / totals).astype(values.dtype)
     to_weights = _product("...jd,...di->...ji", values, change)
     used = weights
-    if kept is not None:
-        to_weights, used = to_weights * kept, weights * kept
+    if dropout_mask is not None:
+        to_weights, used = to_weights * dropout_mask, weights * dropout_mask
     to_values = _product("...ji,...di->...jd", used.astype(values.dtype), change)
     mean = (weights * to_weights).sum(axis=-2, keepdims=True) / totals
     to_scores = (weights * (to_weights - mean)).astype(keys.dtype)
     to_queries = _product("...jd,...ji->...di", keys, to_scores).astype(queries.dtype)
     to_keys = _product("...ji,...di->...jd", to_scores, queries).astype(keys.dtype)
-    nothing = None if kept is None else jnp.zeros_like(kept)
+    nothing = None if dropout_mask is None else jnp.zeros_like(dropout_mask)
     return to_queries, to_keys, to_values.astype(values.dtype), None, nothing
 
 

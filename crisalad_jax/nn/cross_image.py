@@ -3,10 +3,13 @@
 Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact GELU.
 """
 
+import dataclasses
+
 import jax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.config import CrossImageConfig
+from crisalad_jax.config.checks import require, require_fraction, require_positive
+from crisalad_jax.config.fields import free_field
 from crisalad_jax.nn.attention import Attention, attention, init_torch_attention
 from crisalad_jax.nn.layers import (
     LayerNorm,
@@ -19,12 +22,38 @@ from crisalad_jax.nn.layers import (
     linear,
     split_key,
 )
-from crisalad_jax.pytree import params
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 NORM_EPSILON = 1e-5
 
 
-@params
+@dataclasses.dataclass(frozen=True)
+class CrossImageConfig:
+    """The transformer encoder that attends across the images of a batch (paper section 3.4).
+
+    Example:
+        >>> CrossImageConfig(layers=0).layers
+        0
+    """
+
+    layers: int = 2
+    """Number of layers. 0 leaves the encoder out, so that descriptors depend on no other image."""
+    heads: int = 16
+    feedforward: int = 2048
+    dropout: float = free_field(0.1)
+    global_token: bool = True
+    """Whether the global token takes part too, cut into tokens of the clusters' width."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "heads", "feedforward")
+        require(
+            self.layers >= 0, f"CrossImageConfig.layers: found {self.layers}, expected at least 0"
+        )
+        require_fraction(self, "dropout")
+
+
+@pytree_dataclass
 class EncoderLayer:
     """Attention and feed-forward network, a layer norm after each."""
 
@@ -35,7 +64,7 @@ class EncoderLayer:
     norm2: LayerNorm
 
 
-@params
+@pytree_dataclass
 class CrossImageEncoder:
     """The layers, in order."""
 
@@ -43,13 +72,13 @@ class CrossImageEncoder:
 
 
 def init_cross_image(key: PRNGKeyArray, dim: int, config: CrossImageConfig) -> CrossImageEncoder:
-    """Start as torch does: Glorot-uniform attention with zero biases, default linears."""
+    """Draw parameters as torch does: Glorot-uniform attention, zero biases, default linears."""
     keys = jax.random.split(key, config.layers)
     return CrossImageEncoder(tuple(init_encoder_layer(k, dim, config.feedforward) for k in keys))
 
 
 def init_encoder_layer(key: PRNGKeyArray, dim: int, feedforward: int) -> EncoderLayer:
-    """Start as torch's `nn.TransformerEncoderLayer` does."""
+    """Draw parameters as torch's `nn.TransformerEncoderLayer` does."""
     qkv_key, proj_key, first, second = jax.random.split(key, 4)
     return EncoderLayer(
         attn=init_torch_attention(qkv_key, proj_key, dim),
@@ -68,10 +97,10 @@ def cross_image_encoder(
     mask: Bool[Array, "image image"] | None = None,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "image token dim"]:
-    """Each token looks at the same token of the other images.
+    """Let each token attend to the same token of the other images.
 
-    `mask[i, j]` says that image i may look at image j; None lets all look at all. `key` draws the
-    dropout; None means inference.
+    `mask[i, j]` allows image i to attend to image j; None allows all. `key` draws the dropout; None
+    means inference.
     """
     for layer, layer_key in zip(params.layers, split_key(key, config.layers), strict=True):
         tokens = _encoder_layer(layer, tokens, config, mask=mask, key=layer_key)

@@ -7,22 +7,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from crisalad_jax.platform import product_dtype
-from crisalad_jax.pytree import params
+from crisalad_jax.utils.compiler import product_dtype
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 Keys = Key[Array, "*keys"]
-"""One for all, or one for each of a batch."""
+"""One random key for all, or one for each entry of a batch."""
+TAPS = "taps"
+"""Scope of elementwise products that are the multiply-accumulates of a convolution."""
 
 
-@params
+@pytree_dataclass
 class Linear:
-    """Weights of `x @ weight + bias`; torch stores `weight` transposed."""
+    """The weights of `x @ weight + bias`; torch stores `weight` transposed."""
 
     weight: Float[Array, "*stack d_in d_out"]
     bias: Float[Array, "*stack d_out"] | None
 
 
-@params
+@pytree_dataclass
 class LayerNorm:
     """Gain and shift of a layer norm."""
 
@@ -30,15 +32,15 @@ class LayerNorm:
     bias: Float[Array, "*stack dim"]
 
 
-@params
+@pytree_dataclass
 class DepthwiseConv:
-    """One k x k filter a channel."""
+    """One k x k filter for each channel."""
 
     weight: Float[Array, "*stack k k dim"]
     bias: Float[Array, "*stack dim"]
 
 
-@params
+@pytree_dataclass
 class Conv:
     """A k x k convolution; torch stores `weight` as (dim_out, dim_in, k, k)."""
 
@@ -46,11 +48,11 @@ class Conv:
     bias: Float[Array, "*stack d_out"]
 
 
-@params
+@pytree_dataclass
 class BatchNorm:
     """Gain and shift of a batch norm, and the statistics it normalises by.
 
-    The statistics are constants: they do not train, and no batch changes them.
+    The statistics are constants: neither training nor a batch changes them.
     """
 
     weight: Float[Array, "*stack dim"]
@@ -60,7 +62,7 @@ class BatchNorm:
 
 
 def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
-    """Start as torch's `nn.Linear` does: weight and bias uniform within 1 / sqrt(d_in)."""
+    """Draw a linear layer as torch's `nn.Linear`: uniform within 1 / sqrt(d_in)."""
     weight_key, bias_key = jax.random.split(key)
     bound = 1 / math.sqrt(d_in)
     return Linear(
@@ -70,12 +72,12 @@ def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) 
 
 
 def init_layer_norm(dim: int) -> LayerNorm:
-    """Start at gain 1 and shift 0."""
+    """Make a layer norm with gain 1 and shift 0."""
     return LayerNorm(jnp.ones(dim), jnp.zeros(dim))
 
 
 def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> DepthwiseConv:
-    """Start as torch's `nn.Conv2d(groups=dim)` does: uniform within 1 / kernel_size."""
+    """Draw depthwise filters as torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
     weight_key, bias_key = jax.random.split(key)
     bound = 1 / kernel_size
     return DepthwiseConv(
@@ -87,7 +89,7 @@ def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> Depthw
 
 
 def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
-    """Start as torch's `nn.Conv2d` does: uniform within 1 / sqrt(kernel_size^2 d_in)."""
+    """Draw a convolution as torch's `nn.Conv2d`: uniform within 1 / sqrt(kernel_size^2 d_in)."""
     weight_key, bias_key = jax.random.split(key)
     bound = 1 / (kernel_size * math.sqrt(d_in))
     shape = (kernel_size, kernel_size, d_in, d_out)
@@ -98,29 +100,29 @@ def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Con
 
 
 def init_batch_norm(dim: int) -> BatchNorm:
-    """Start as torch's `nn.BatchNorm2d` does: with mean 0 and variance 1, it changes nothing."""
+    """Make a batch norm as torch's `nn.BatchNorm2d`: mean 0 and variance 1, the identity."""
     return BatchNorm(jnp.ones(dim), jnp.zeros(dim), jnp.zeros(dim), jnp.ones(dim))
 
 
-def widen(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """`x` in float32 at least.
+def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Convert `x` to float32 at least.
 
-    Elementwise work on bfloat16 is done wide and rounded once. What a parameter is broadcast over
-    must be wide above all: its gradient is a sum over all tokens and images, and hardware with
-    bfloat16 arithmetic of its own would add them up in 8 bits.
+    Elementwise work on bfloat16 is done in float32 and rounded once. Above all, operands that a
+    parameter is broadcast over must be float32. The parameter's gradient is a sum over all tokens
+    and images, which hardware with native bfloat16 would accumulate in 8 bits.
     """
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 
 
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
-    """Affine map of the last axis, in the type of `x`. On a CPU it is rounded once, at the end.
+    """Map the last axis affinely, in the type of `x`, on a CPU rounded once at the end.
 
-    All of the batch are rows of one matrix: for the gradient of a weight XLA would else turn what
-    comes back, by a copy.
+    The whole batch is rows of one matrix: otherwise, for the gradient of a weight, XLA would
+    transpose the cotangent by a copy.
     """
     rows, weight = x.reshape(-1, x.shape[-1]), params.weight.astype(x.dtype)
     y = jnp.matmul(rows, weight, preferred_element_type=product_dtype(x.dtype))
-    y = (y if params.bias is None else widen(y) + params.bias).astype(x.dtype)
+    y = (y if params.bias is None else at_least_float32(y) + params.bias).astype(x.dtype)
     return y.reshape(*x.shape[:-1], weight.shape[-1])
 
 
@@ -128,13 +130,13 @@ def layer_norm(
     params: LayerNorm, x: Float[Array, "*batch dim"], *, epsilon: float
 ) -> Float[Array, "*batch dim"]:
     """Normalise the last axis to mean 0 and variance 1, in float32, and return the type of `x`."""
-    y = _standardise(widen(x), epsilon) * params.weight + params.bias
+    y = _standardise(at_least_float32(x), epsilon) * params.weight + params.bias
     return y.astype(x.dtype)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _standardise(x: Array, epsilon: float) -> Array:
-    """Mean 0 and variance 1 along the last axis.
+    """Normalise the last axis to mean 0 and variance 1.
 
     The derivative is told to JAX because by itself it would keep three arrays for it, not one.
     """
@@ -160,20 +162,21 @@ def _standardise_jvp(
 def depthwise_conv(
     params: DepthwiseConv, x: Float[Array, "height width dim"]
 ) -> Float[Array, "height width dim"]:
-    """Convolve every channel with its own filter (cross-correlation, as torch), zero padding.
+    """Convolve every channel with its own filter (cross-correlation, as torch), with zero padding.
 
-    A sum of k x k shifted products: for small filters XLA fuses it into one pass over `x`, where
-    its grouped convolution is many times slower on a CPU.
+    It is a sum of k x k shifted products, which XLA fuses into one pass over `x` for small filters.
+    XLA's grouped convolution is many times slower on a CPU.
     """
     size = params.weight.shape[0]
     height, width, _ = x.shape
     margin = size // 2
-    padded = widen(jnp.pad(x, ((margin, margin), (margin, margin), (0, 0))))
-    taps = [
-        padded[i : i + height, j : j + width] * params.weight[i, j]
-        for i in range(size)
-        for j in range(size)
-    ]
+    padded = at_least_float32(jnp.pad(x, ((margin, margin), (margin, margin), (0, 0))))
+    with jax.named_scope(TAPS):
+        taps = [
+            padded[i : i + height, j : j + width] * params.weight[i, j]
+            for i in range(size)
+            for j in range(size)
+        ]
     return sum(taps, start=params.bias).astype(x.dtype)
 
 
@@ -186,25 +189,25 @@ def conv(params: Conv, x: Float[Array, "height width d_in"]) -> Float[Array, "he
         padding="SAME",
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
     )
-    return (widen(y[0]) + params.bias).astype(x.dtype)
+    return (at_least_float32(y[0]) + params.bias).astype(x.dtype)
 
 
 def batch_norm(
     params: BatchNorm, x: Float[Array, "*batch dim"], *, epsilon: float
 ) -> Float[Array, "*batch dim"]:
-    """Normalise by the stored statistics, as torch does in evaluation; returns the type of `x`."""
-    wide = widen(x)
+    """Normalise by the stored statistics, as torch in evaluation mode; return the type of `x`."""
+    wide = at_least_float32(x)
     scale = params.weight * jax.lax.rsqrt(params.running_var + epsilon)
     return ((wide - params.running_mean) * scale + params.bias).astype(x.dtype)
 
 
 @jax.custom_jvp
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Exact GELU. The erf form: `jax.nn.gelu`'s erfc form takes twice as long on a CPU.
+    """Apply the exact GELU, by erf: `jax.nn.gelu`'s erfc takes twice as long on a CPU.
 
     The derivative is told to JAX because by itself it would keep three arrays for it, not one.
     """
-    wide = widen(x)
+    wide = at_least_float32(x)
     return (wide * _normal_cdf(wide)).astype(x.dtype)
 
 
@@ -215,17 +218,17 @@ def _normal_cdf(x: Array) -> Array:
 @gelu.defjvp
 def _gelu_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     (x,), (change,) = primals, tangents
-    wide = widen(x)
+    wide = at_least_float32(x)
     below = _normal_cdf(wide)
     density = jnp.exp(-0.5 * jnp.square(wide)) / math.sqrt(2 * math.pi)
     slope = below + wide * density
-    return (wide * below).astype(x.dtype), (slope * widen(change)).astype(x.dtype)
+    return (wide * below).astype(x.dtype), (slope * at_least_float32(change)).astype(x.dtype)
 
 
 def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys | None) -> Float[Array, "*shape"]:
-    """Zero a share `rate` of `x` and scale the rest up. `key=None` means inference: `x` itself.
+    """Zero a share `rate` of `x` and scale the rest up; return `x` for `key=None` (inference).
 
-    Given a key for each of the leading axis, what one draws does not depend on the others.
+    With one key for each entry of the leading axis, an entry's draws do not depend on the others.
     """
     if key is None or rate == 0:
         return x
@@ -235,7 +238,7 @@ def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys | None) -> Floa
 
 
 def split_key(key: Keys | None, count: int) -> list[Keys | None]:
-    """`count` keys from one, or from each of several; None as often where nothing is random."""
+    """Split one key, or each of several, into `count` keys; return Nones for None."""
     if key is None:
         return [None] * count
     split = functools.partial(jax.random.split, num=count)
@@ -245,7 +248,8 @@ def split_key(key: Keys | None, count: int) -> list[Keys | None]:
 def l2_normalise(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
     """Scale the last axis to length 1, as torch's `F.normalize`: below 1e-12 counts as 1e-12.
 
-    The root is taken of a number kept from 0, so that a zero vector has gradient 0 and not NaN.
+    The squared length is clamped above 0 before the root, so that a zero vector has gradient 0 and
+    not NaN.
     """
     squared = jnp.sum(x * x, axis=-1, keepdims=True)
     return x * jax.lax.rsqrt(jnp.maximum(squared, 1e-24))

@@ -1,4 +1,4 @@
-"""What an aggregator makes of an image: the tokens that become a descriptor."""
+"""The tokens that an aggregator makes of an image, and that become a descriptor."""
 
 from typing import NamedTuple
 
@@ -7,37 +7,43 @@ from jaxtyping import Array, Float
 
 
 class TransportStatistics(NamedTuple):
-    """How SALAD's transport went, for a log."""
+    """Statistics of a transport, for a log."""
 
     column_error: Float[Array, "*batch"]
     """Largest relative error of a cluster's mass."""
     dustbin_share: Float[Array, "*batch"]
     """Share of all mass that went to the dustbin."""
     patches_per_cluster: Float[Array, "*batch"]
-    """Effective number of patches in a cluster: the exponential of its mass's entropy, the mean."""
+    """Effective number of patches in a cluster, exp(entropy of its mass), as a mean of clusters."""
 
 
 class Tokens(NamedTuple):
-    """One global token an image, and local ones: SALAD's clusters', or a pyramid's regions'."""
+    """One global token an image, and local tokens: of SALAD's clusters, or a pyramid's regions.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> Tokens.of_local(jnp.ones((4, 8))).global_token.shape
+        (0,)
+    """
 
     global_token: Float[Array, "*batch global_dim"]
     local: Float[Array, "*batch token dim"]
     transport: TransportStatistics | None = None
-    """An image's; None where there is no transport, or other images have been looked at since."""
+    """Statistics of the image; None without a transport, or after the cross-image encoder."""
 
+    @classmethod
+    def of_global(cls, token: Float[Array, "*batch dim"]) -> "Tokens":
+        """Return a global token, and zero local tokens of its width."""
+        return cls(token, token[..., None, :][..., :0, :])
 
-def global_alone(token: Float[Array, "*batch dim"]) -> Tokens:
-    """A global token, and no local ones of its width."""
-    return Tokens(token, token[..., None, :][..., :0, :])
-
-
-def local_alone(tokens: Float[Array, "*batch token dim"]) -> Tokens:
-    """Local tokens, and a global one of no numbers."""
-    return Tokens(tokens[..., 0, :0], tokens)
+    @classmethod
+    def of_local(cls, tokens: Float[Array, "*batch token dim"]) -> "Tokens":
+        """Return local tokens, and a global token of width 0."""
+        return cls(tokens[..., 0, :0], tokens)
 
 
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "token dim"]:
-    """The local tokens, behind the global one cut to their width if it takes part."""
+    """Return the local tokens, after the global one cut to their width if it takes part."""
     if not global_token:
         return tokens.local
     pieces = tokens.global_token.reshape(-1, tokens.local.shape[1])

@@ -1,26 +1,28 @@
 """What is compared: one list of layers, whole models and training runs, all of them tiny."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from crisalad_jax.config import (
-    AdapterConfig,
-    AnyLocConfig,
-    BoqConfig,
-    ConvApConfig,
-    CosPlaceConfig,
-    CrossImageConfig,
-    MixVprConfig,
-    ModelConfig,
-    NetVladConfig,
-    SaladConfig,
-    SinkhornConfig,
-    TransVprConfig,
-    ViTConfig,
-)
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators import Aggregator
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import GemConfig
+from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.sinkhorn import SinkhornConfig
 from parity.cases import parts
 from parity.cases.case import Case, Draw, check_case
 from parity.cases.run import Run, check_run
@@ -30,9 +32,26 @@ BATCH = 4
 PATCHES = parts.GRID[0] * parts.GRID[1]
 SIZE = (14 * parts.GRID[0], 14 * parts.GRID[1])
 
+SALAD = SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0)
+AGGREGATORS: Mapping[str, Aggregator] = {
+    "anyloc": AnyLocConfig(clusters=5, layer=-1, facet="token"),
+    # Two heads.
+    "boq": BoqConfig(channels=128, queries=5, rows=3),
+    "class-token": ClassTokenConfig(),
+    "conv-ap": ConvApConfig(channels=20),
+    "cosplace": CosPlaceConfig(dim=20),
+    "gem": GemConfig(),
+    "gem-pyramid": GemPyramidConfig(),
+    "mixvpr": MixVprConfig(channels=20, rows=3, depth=2),
+    "netvlad": NetVladConfig(clusters=5),
+    "salad": SALAD,
+    "transvpr": TransVprConfig(levels=2, dim=24),
+}
+"""Tiny ones, by their names."""
+
 
 def _model(
-    kind: Any = "none", *, encoder: int = 0, aggregator: Any = "salad", **backbone: Any
+    kind: Any = "none", *, encoder: int = 0, aggregator: str = "salad", **backbone: Any
 ) -> ModelConfig:
     # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
     bottleneck = 2.0 if kind == "multi-resolution" else 0.5
@@ -46,24 +65,15 @@ def _model(
             adapter=AdapterConfig(kind, bottleneck),
             **backbone,
         ),
-        aggregator=aggregator,
-        netvlad=NetVladConfig(clusters=5),
-        anyloc=AnyLocConfig(clusters=5, layer=-1, facet="token"),
-        salad=SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0),
-        transvpr=TransVprConfig(levels=2, dim=24),
-        conv_ap=ConvApConfig(channels=20),
-        cosplace=CosPlaceConfig(dim=20),
-        mixvpr=MixVprConfig(channels=20, rows=3, depth=2),
-        # Two heads.
-        boq=BoqConfig(channels=128, queries=5, rows=3),
-        encoder=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
+        aggregator=AGGREGATORS[aggregator],
+        cross_image=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
     )
 
 
 def _transport(iterations: int, epsilon: float) -> ModelConfig:
-    model = _model()
-    sinkhorn = SinkhornConfig(iterations=iterations, epsilon=epsilon)
-    return dataclasses.replace(model, salad=dataclasses.replace(model.salad, sinkhorn=sinkhorn))
+    sinkhorn = SinkhornConfig(iterations=iterations)
+    salad = dataclasses.replace(SALAD, epsilon=epsilon, sinkhorn=sinkhorn)
+    return dataclasses.replace(_model(), aggregator=salad)
 
 
 PLAIN = _model()
@@ -263,8 +273,8 @@ CASES: tuple[Case, ...] = (
             inputs,
             forward="descriptor",
             # A patch that rounding gives to another word makes another descriptor.
-            bfloat16=model.aggregator != "anyloc",
-            smooth=model.aggregator in ("class-token", "netvlad", "transvpr"),
+            bfloat16=model is not ANYLOC,
+            smooth=model in (CLASS_TOKEN, NETVLAD, TRANSVPR),
         )
         for name, model, inputs in (
             ("CriSALAD", CRISALAD, IMAGES),

@@ -15,10 +15,11 @@ import numpy as np
 import optax
 import torch
 
-from crisalad_jax.config import ModelConfig, OptimiserConfig
-from crisalad_jax.layouts import to_params, to_state
-from crisalad_jax.model import Crisalad
-from crisalad_jax.training import make_optimiser
+from crisalad_jax.checkpoints.layouts import to_params, to_state
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.training.config import OptimiserConfig
+from crisalad_jax.training.optimiser import make_optimiser
 from parity.cases.parts import Part
 from parity.cases.weights import random_state
 from parity.compare import (

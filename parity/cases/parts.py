@@ -11,16 +11,24 @@ import jax
 import torch
 from torch import Tensor
 
-from crisalad_jax.config import LossConfig, ModelConfig, MultiSimilarityConfig
-from crisalad_jax.losses import all_pairs, metric_loss, mine
-from crisalad_jax.model import Crisalad, describe
-from crisalad_jax.nn.aggregators import aggregate
+from crisalad_jax.losses import LossConfig, all_pairs, metric_loss, mine
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import attention
+from crisalad_jax.nn.backbones import Features
+from crisalad_jax.nn.backbones.vit import (
+    Block,
+    ViTConfig,
+    block,
+    embed,
+    feed_forward,
+    interpolate_positions,
+)
+from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import cross_image_encoder
+from crisalad_jax.nn.model import Crisalad, describe
 from crisalad_jax.nn.pixels import normalise
-from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.nn.vit import Block, Features, block, embed, feed_forward, interpolate_positions
-from crisalad_jax.sinkhorn import assign
+from crisalad_jax.sinkhorn import assign_with_dustbin
 from parity.reference import losses as torch_losses
 from parity.reference import sinkhorn as torch_sinkhorn
 from parity.reference.model import Crisalad as TorchCrisalad
@@ -29,7 +37,7 @@ from parity.reference.vit import Features as TorchFeatures
 
 GRID = (3, 4)
 """Rows and columns of patches wherever a case needs a grid: not square, so axes cannot be mixed."""
-LOSS = LossConfig(multi_similarity=MultiSimilarityConfig(base=0.5))
+LOSS = LossConfig(kind=MultiSimilarityConfig(base=0.5))
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """ImageNet's, as torchvision's models publish them: our own constants are what is tested."""
 
@@ -45,6 +53,16 @@ class Part(NamedTuple):
 
 def _last_block(params: Crisalad) -> Block:
     return jax.tree.map(lambda x: x[-1], params.backbone.blocks)
+
+
+def _vit(config: ModelConfig) -> ViTConfig:
+    assert isinstance(config.backbone, ViTConfig)
+    return config.backbone
+
+
+def _salad(config: ModelConfig) -> SaladConfig:
+    assert isinstance(config.aggregator, SaladConfig)
+    return config.aggregator
 
 
 def _channels_first(images: Tensor) -> Tensor:
@@ -69,7 +87,7 @@ PIXELS = Part(_our_pixels, _their_pixels)
 
 
 def _our_embed(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    one = jax.vmap(lambda image: embed(params.backbone, image, config.backbone))
+    one = jax.vmap(lambda image: embed(params.backbone, image, _vit(config)))
     return {"tokens": one(x["images"])}
 
 
@@ -83,7 +101,7 @@ def positions(grid: tuple[int, int]) -> Part:
     """Position embeddings resized to a grid of patches."""
 
     def ours(params: Crisalad, _: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-        resized = interpolate_positions(params.backbone.pos_embed, grid, config.backbone)
+        resized = interpolate_positions(params.backbone.pos_embed, grid, _vit(config))
         return {"positions": resized}
 
     def theirs(model: TorchCrisalad, _: Inputs, __: ModelConfig) -> dict[str, Tensor]:
@@ -93,7 +111,7 @@ def positions(grid: tuple[int, int]) -> Part:
 
 
 def _our_attention(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    weights, heads = _last_block(params).attn, config.backbone.heads
+    weights, heads = _last_block(params).attn, _vit(config).heads
     return {"tokens": attention(weights, x["tokens"], heads, key=None)}
 
 
@@ -108,7 +126,7 @@ FEED_FORWARD = Part(
 
 
 def _our_block(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    return {"tokens": block(_last_block(params), x["tokens"], GRID, config.backbone)}
+    return {"tokens": block(_last_block(params), x["tokens"], GRID, _vit(config))}
 
 
 BLOCK = Part(
@@ -117,11 +135,8 @@ BLOCK = Part(
 
 
 def _our_aggregate(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    def one(class_token: jax.Array, patches: jax.Array) -> Tokens:
-        features = Features(class_token, patches)
-        return aggregate(params.aggregator, features, GRID, config, key=None)
-
-    tokens = jax.vmap(one)(x["class_token"], x["patches"])
+    features = Features(x["class_token"], x["patches"])
+    tokens = config.aggregator.apply(params.aggregator, features, GRID, key=None)
     return {"global_token": tokens.global_token, "local": tokens.local}
 
 
@@ -134,23 +149,31 @@ def _their_aggregate(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[st
 AGGREGATE = Part(_our_aggregate, _their_aggregate)
 
 
+def _our_sinkhorn(_: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
+    salad = _salad(config)
+    result = assign_with_dustbin(
+        x["scores"], x["dustbin"], salad.dustbin, epsilon=salad.epsilon, config=salad.sinkhorn
+    )
+    return {"log_plan": result.log_plan}
+
+
 def _their_sinkhorn(_: TorchCrisalad, x: Inputs, config: ModelConfig) -> dict[str, Tensor]:
-    log_plan = torch_sinkhorn.assign(x["scores"].mT, x["dustbin"], config.salad.sinkhorn)
+    salad = _salad(config)
+    log_plan = torch_sinkhorn.assign_with_dustbin(
+        x["scores"].mT, x["dustbin"], epsilon=salad.epsilon, config=salad.sinkhorn
+    )
     return {"log_plan": log_plan.mT}
 
 
-SINKHORN = Part(
-    lambda _, x, config: {
-        "log_plan": assign(x["scores"], x["dustbin"], config.salad.sinkhorn).log_plan
-    },
-    _their_sinkhorn,
-)
+SINKHORN = Part(_our_sinkhorn, _their_sinkhorn)
 
 
 def _our_encoder(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    assert params.encoder is not None
+    assert params.cross_image is not None
     mask = x.get("mask")
-    tokens = cross_image_encoder(params.encoder, x["tokens"], config.encoder, mask=mask, key=None)
+    tokens = cross_image_encoder(
+        params.cross_image, x["tokens"], config.cross_image, mask=mask, key=None
+    )
     return {"tokens": tokens}
 
 
@@ -160,17 +183,18 @@ ENCODER = Part(
 
 MINER = Part(
     lambda _, x, __: mine(
-        x["similarities"], all_pairs(x["labels"]), epsilon=LOSS.epsilon
+        x["similarities"], all_pairs(x["labels"]), margin=LOSS.miner_margin
     )._asdict(),
     lambda _, x, __: torch_losses.mine(
-        x["similarities"], x["labels"], epsilon=LOSS.epsilon
+        x["similarities"], x["labels"], margin=LOSS.miner_margin
     )._asdict(),
 )
 
 
 def _our_loss(_: Crisalad, x: Inputs, __: ModelConfig) -> dict[str, jax.Array]:
     valid = x.get("valid")
-    return metric_loss(x["descriptors"], x["labels"], LOSS, valid=valid)._asdict()
+    found = metric_loss(x["descriptors"], x["labels"], LOSS, valid=valid)
+    return {"loss": found.loss, "easy_anchor_fraction": found.easy_anchor_fraction}
 
 
 def _their_loss(_: TorchCrisalad, x: Inputs, __: ModelConfig) -> dict[str, Tensor]:

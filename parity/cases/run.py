@@ -13,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from crisalad_jax.config import ModelConfig, OptimiserConfig, TrainConfig
-from crisalad_jax.layouts import to_state
-from crisalad_jax.model import Crisalad
-from crisalad_jax.training import StepConfig, init_state, merge_params, train_step
+from crisalad_jax.checkpoints.layouts import to_state
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.step import StepConfig, init_train_state, train_step
+from crisalad_jax.training.trainable import merge_params
 from parity.cases.case import LAYOUT, STEPS, build, cancelling, convert, random, split
 from parity.cases.parts import LOSS, torch_normalise
 from parity.compare import FROZEN, TOLERANCES, Arrays, Row, as_double, compare
@@ -35,7 +37,7 @@ class Run:
 
     name: str
     model: ModelConfig
-    trains: str
+    trainable: str
     size: tuple[int, int] = (42, 56)
 
 
@@ -51,7 +53,9 @@ def check_run(run: Run, precision: str, seed: int) -> list[Row]:
     rng = random(run.name, seed)
     model = build(run.model, precision, rng)
     batches = [_batch(run, step, rng) for step in range(STEPS)]
-    config = TrainConfig(model=model.config, loss=LOSS, optimiser=OPTIMISER, trains=run.trains)
+    config = TrainConfig(
+        model=model.config, loss=LOSS, optimiser=OPTIMISER, trainable=run.trainable
+    )
     start = {name: as_double(tensor) for name, tensor in model.state_dict().items()}
     with jax.enable_x64(precision == "float64"):
         params, extras = convert(model)
@@ -111,14 +115,14 @@ def _our_training(
 ) -> tuple[Arrays, Arrays]:
     """Losses by step, and the final parameters by the reference's names."""
     step_config = StepConfig(model, config.loss, config.optimiser, STEPS)
-    state, frozen = init_state(params, config.trains, step_config)
+    state, frozen = init_train_state(params, config.trainable, step_config)
     labels, key = jnp.asarray(LABELS), jax.random.key(0)
     losses = []
     for batch in batches:
         images, valid = jnp.asarray(batch.images), jnp.asarray(batch.valid)
         state, metrics = train_step(state, frozen, images, labels, valid, key, step_config)
         losses.append(float(metrics.loss))
-    final = merge_params(state.trainable, frozen)
+    final = merge_params(state.trainable, frozen, model)
     by_name = to_state(jax.tree.map(as_double, final), model, LAYOUT, extras)
     return {"losses": np.array(losses)}, by_name
 

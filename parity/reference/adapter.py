@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.config import ViTConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from parity.reference.layers import BatchNorm2d, Conv2d, Linear
 
 BATCH_NORM_EPSILON = 1e-3

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from parity.reference.layers import Linear, widen
+from parity.reference.layers import Linear, at_least_float32
 
 
 def attend(qkv: Tensor, heads: int, *, mask: Tensor | None, dropout_rate: float) -> Tensor:
@@ -23,7 +23,7 @@ def attend(qkv: Tensor, heads: int, *, mask: Tensor | None, dropout_rate: float)
     """
     # Each (batch, head, token, head_dim).
     queries, keys, values = qkv.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4).unbind()
-    scores = widen(queries / math.sqrt(queries.shape[-1])) @ widen(keys).mT
+    scores = at_least_float32(queries / math.sqrt(queries.shape[-1])) @ at_least_float32(keys).mT
     if mask is not None:
         scores = scores.masked_fill(~mask, -torch.inf)
     weights = F.dropout(scores.softmax(dim=-1), dropout_rate)

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from crisalad_jax.config import BoqConfig
-from parity.reference.layers import Conv2d, LayerNorm, Linear, widen
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from parity.reference.layers import Conv2d, LayerNorm, Linear, at_least_float32
 
 
 class BoqBlock(nn.Module):
@@ -50,7 +50,7 @@ class Boq(nn.Module):
         for block in self.boqs:
             x, answer = block(x)
             answers.append(answer)
-        return widen(self.fc(torch.cat(answers, dim=1).mT)).mT
+        return at_least_float32(self.fc(torch.cat(answers, dim=1).mT)).mT
 
 
 def _cast(module: nn.Module, *inputs: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from torch import Tensor, nn
 
-from parity.reference.layers import Conv2d, widen
+from parity.reference.layers import Conv2d, at_least_float32
 
 
 class ConvAp(nn.Module):
@@ -16,4 +16,4 @@ class ConvAp(nn.Module):
 
     def forward(self, patches: Tensor) -> Tensor:
         """(batch, dim, rows, columns) to (batch, region, channels)."""
-        return self.means(widen(self.channel_pool(patches))).flatten(2).mT
+        return self.means(at_least_float32(self.channel_pool(patches))).flatten(2).mT

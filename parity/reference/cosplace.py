@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 
 from parity.reference.gem import GeM, UnitPatches
-from parity.reference.layers import Linear, widen
+from parity.reference.layers import Linear, at_least_float32
 
 
 class CosPlace(nn.Sequential):
@@ -16,4 +16,4 @@ class CosPlace(nn.Sequential):
     def forward(self, patches: Tensor) -> Tensor:
         """(batch, dim, rows, columns) to (batch, descriptor)."""
         unit, mean, _, fc = self
-        return widen(fc(mean(unit(widen(patches))).to(patches.dtype)))
+        return at_least_float32(fc(mean(unit(at_least_float32(patches))).to(patches.dtype)))

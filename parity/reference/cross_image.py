@@ -6,7 +6,7 @@ Its layers are CricaVPR's: post-norm, exact GELU.
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.config import CrossImageConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from parity.reference.attention import MultiheadAttention
 from parity.reference.layers import LayerNorm, Linear
 

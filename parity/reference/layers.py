@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 
-def widen(x: Tensor) -> Tensor:
+def at_least_float32(x: Tensor) -> Tensor:
     """`x` in float32, or in its own type if that is wider: for norms, softmax and transport."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
@@ -36,7 +36,9 @@ class LayerNorm(nn.LayerNorm):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., dim) to (..., dim)."""
-        y = F.layer_norm(widen(x), self.normalized_shape, self.weight, self.bias, self.eps)
+        y = F.layer_norm(
+            at_least_float32(x), self.normalized_shape, self.weight, self.bias, self.eps
+        )
         return y.to(x.dtype)
 
 
@@ -46,7 +48,7 @@ class BatchNorm2d(nn.BatchNorm2d):
     def forward(self, x: Tensor) -> Tensor:
         """(batch, dim, height, width) to the same, in float32 at least inside."""
         statistics = self.running_mean, self.running_var
-        y = F.batch_norm(widen(x), *statistics, self.weight, self.bias, eps=self.eps)
+        y = F.batch_norm(at_least_float32(x), *statistics, self.weight, self.bias, eps=self.eps)
         return y.to(x.dtype)
 
 

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from crisalad_jax.config import LossConfig
-from parity.reference.layers import widen
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from parity.reference.layers import at_least_float32
 
 
 class MinedPairs(NamedTuple):
@@ -24,17 +25,17 @@ class LossResult(NamedTuple):
     """The loss and what is logged beside it, both ()."""
 
     loss: Tensor
-    b_acc: Tensor
+    easy_anchor_fraction: Tensor
     """Share of the anchors without a mined positive."""
 
 
-def mine(similarities: Tensor, labels: Tensor, *, epsilon: float) -> MinedPairs:
-    """Pairs that violate the order within their row by less than `epsilon` of margin, strictly.
+def mine(similarities: Tensor, labels: Tensor, *, margin: float) -> MinedPairs:
+    """Pairs that violate the order within their row by less than `margin`, strictly.
 
     Args:
         similarities: (anchor, image).
         labels: (image,) of integers.
-        epsilon: the margin.
+        margin: epsilon of the paper.
     """
     same = labels[:, None] == labels
     positives = same & ~torch.eye(len(labels), dtype=torch.bool, device=labels.device)
@@ -43,8 +44,8 @@ def mine(similarities: Tensor, labels: Tensor, *, epsilon: float) -> MinedPairs:
     hardest_negative = similarities.masked_fill(~negatives, -torch.inf).amax(1, keepdim=True)
     hardest_positive = similarities.masked_fill(~positives, torch.inf).amin(1, keepdim=True)
     return MinedPairs(
-        positives & (similarities - epsilon < hardest_negative),
-        negatives & (similarities + epsilon > hardest_positive),
+        positives & (similarities - margin < hardest_negative),
+        negatives & (similarities + margin > hardest_positive),
     )
 
 
@@ -56,17 +57,18 @@ def multi_similarity_loss(descriptors: Tensor, labels: Tensor, config: LossConfi
         labels: (image,): the place of each image.
         config: constants.
     """
-    wide = widen(descriptors)
+    wide = at_least_float32(descriptors)
     similarities = wide @ wide.T
-    pairs = mine(similarities.detach(), labels, epsilon=config.epsilon)
-    constants = config.multi_similarity
+    pairs = mine(similarities.detach(), labels, margin=config.miner_margin)
+    constants = config.kind
+    assert isinstance(constants, MultiSimilarityConfig)
     centred = similarities - constants.base
     per_anchor = (
         _log1p_sum_exp(-constants.alpha * centred, pairs.positives) / constants.alpha
         + _log1p_sum_exp(constants.beta * centred, pairs.negatives) / constants.beta
     )
     loss = per_anchor.mean()
-    if config.library_quirk and max(pairs.positives.sum(), pairs.negatives.sum()) <= 1:
+    if config.match_pml_zero and max(pairs.positives.sum(), pairs.negatives.sum()) <= 1:
         loss = 0 * loss
     return LossResult(loss, 1 - pairs.positives.any(dim=1).to(loss.dtype).mean())
 

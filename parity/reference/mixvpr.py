@@ -2,7 +2,7 @@
 
 from torch import Tensor, nn
 
-from parity.reference.layers import LayerNorm, Linear, widen
+from parity.reference.layers import LayerNorm, Linear, at_least_float32
 
 
 class FeatureMixer(nn.Module):
@@ -39,4 +39,4 @@ class MixVpr(nn.Module):
     def forward(self, patches: Tensor) -> Tensor:
         """(batch, dim, rows, columns) to (batch, row, channel)."""
         maps = self.mix(patches.flatten(2))
-        return widen(self.row_proj(self.channel_proj(maps.mT).mT)).mT
+        return at_least_float32(self.row_proj(self.channel_proj(maps.mT).mT)).mT

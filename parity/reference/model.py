@@ -6,26 +6,46 @@ DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
 import torch
 from torch import Tensor, nn
 
-from crisalad_jax.config import ModelConfig
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import GemConfig
+from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.utils.errors import InputError
 from parity.reference.boq import Boq
 from parity.reference.conv_ap import ConvAp
 from parity.reference.cosplace import CosPlace
 from parity.reference.cross_image import CrossImageEncoder
 from parity.reference.gem import GeM, UnitPatches
-from parity.reference.layers import l2_normalise, widen
+from parity.reference.layers import at_least_float32, l2_normalise
 from parity.reference.mixvpr import MixVpr
 from parity.reference.pyramid import GemPyramid
 from parity.reference.salad import Salad, published_order
-from parity.reference.tokens import (
-    Tokens,
-    as_sequence,
-    from_sequence,
-    global_alone,
-    local_alone,
-)
+from parity.reference.tokens import Tokens, as_sequence, from_sequence
 from parity.reference.transvpr import TransVpr
 from parity.reference.vit import Features, ViT
 from parity.reference.vlad import AnyLoc, NetVlad
+
+TRANSPOSED = (SaladConfig, ConvApConfig, MixVprConfig, BoqConfig)
+"""Whose public descriptors have all local tokens' first number, then all their second."""
+HELD = (
+    *TRANSPOSED,
+    AnyLocConfig,
+    ClassTokenConfig,
+    CosPlaceConfig,
+    GemConfig,
+    GemPyramidConfig,
+    NetVladConfig,
+    TransVprConfig,
+)
 
 
 class Crisalad(nn.Module):
@@ -36,16 +56,27 @@ class Crisalad(nn.Module):
     """
 
     def __init__(self, config: ModelConfig) -> None:
-        """Random parameters; for those of a checkpoint, `load_state_dict`."""
+        """Random parameters; for those of a checkpoint, `load_state_dict`.
+
+        Raises:
+            InputError: a part that is none of `crisalad_jax`'s own.
+        """
         super().__init__()
+        if not isinstance(config.backbone, ViTConfig):
+            raise InputError(f"backbone: found {config.backbone.part_name}, expected vit")
+        if not isinstance(config.aggregator, HELD):
+            raise InputError(
+                f"aggregator: found {config.aggregator.part_name}, expected one that comes with "
+                "crisalad_jax"
+            )
         self.config = config
         self.compute_dtype: torch.dtype = getattr(torch, config.compute_dtype)
         self.backbone = ViT(config.backbone)
         self.aggregator = _aggregator(config)
         self.aggregation = _aggregation(config)
         self.encoder = (
-            CrossImageEncoder(config.shape.token_dim, config.encoder)
-            if config.encoder.layers
+            CrossImageEncoder(config.token_shape.token_dim, config.cross_image)
+            if config.cross_image.layers
             else None
         )
 
@@ -63,18 +94,17 @@ class Crisalad(nn.Module):
         Raises:
             InputError: wrong sides, or too few patches for the aggregator.
         """
-        return self.relate(self.tokenise(images), mask)
+        return self.attend_across_images(self.extract_tokens(images), mask)
 
-    def tokenise(self, images: Tensor) -> Tokens:
+    def extract_tokens(self, images: Tensor) -> Tokens:
         """The first half of `forward`: every image's tokens, which owe nothing to other images."""
         self.config.check_image_size((images.shape[2], images.shape[3]))
         images = images.to(self.compute_dtype)
-        if self.config.aggregator == "anyloc":
-            number = self.config.anyloc.block(self.config.backbone.depth)
-            return self.aggregate(self.backbone.facet(images, number, self.config.anyloc.facet))
-        if self.config.aggregator == "transvpr":
-            depths = self.config.transvpr.depths(self.config.backbone.depth)
-            return self.aggregate(self.backbone(images, depths))
+        depth, found = self.config.backbone.depth, self.config.aggregator
+        if isinstance(found, AnyLocConfig):
+            return self.aggregate(self.backbone.facet(images, found.block(depth), found.facet))
+        if isinstance(found, TransVprConfig):
+            return self.aggregate(self.backbone(images, found.features(depth).levels))
         return self.aggregate(self.backbone(images))
 
     def aggregate(self, features: Features) -> Tokens:
@@ -82,55 +112,56 @@ class Crisalad(nn.Module):
         if isinstance(self.aggregator, Salad | NetVlad | AnyLoc | TransVpr):
             return self.aggregator(features)
         if self.aggregator is not None:
-            return local_alone(self.aggregator(features.patches))
+            return Tokens.of_local(self.aggregator(features.patches))
         if isinstance(self.aggregation, CosPlace):
-            return global_alone(self.aggregation(features.patches))
-        class_token, patches = widen(features.class_token), widen(features.patches)
+            return Tokens.of_global(self.aggregation(features.patches))
+        class_token = at_least_float32(features.class_token)
         if self.aggregation is None:
-            return global_alone(class_token)
-        pooled = self.aggregation(patches)
-        return global_alone(pooled) if pooled.ndim == 2 else Tokens(class_token, pooled)
+            return Tokens.of_global(class_token)
+        pooled = self.aggregation(at_least_float32(features.patches))
+        return Tokens.of_global(pooled) if pooled.ndim == 2 else Tokens(class_token, pooled)
 
-    def relate(self, tokens: Tokens, mask: Tensor | None = None) -> Tensor:
+    def attend_across_images(self, tokens: Tokens, mask: Tensor | None = None) -> Tensor:
         """The second half: images look at each other, then become descriptors."""
         if self.encoder is not None:
-            global_token = self.config.encoder.global_token
+            global_token = self.config.cross_image.global_token
             sequence = as_sequence(tokens, global_token=global_token).to(self.compute_dtype)
             sequence = self.encoder(sequence, mask).to(tokens.local.dtype)
             tokens = from_sequence(sequence, tokens, global_token=global_token)
-        return self.join(tokens)
+        return self.to_descriptor(tokens)
 
-    def join(self, tokens: Tokens) -> Tensor:
+    def to_descriptor(self, tokens: Tokens) -> Tensor:
         """One unit descriptor: the global token, then the local ones in the published order."""
-        transposed = self.config.aggregator in ("salad", "conv-ap", "mixvpr", "boq")
+        transposed = isinstance(self.config.aggregator, TRANSPOSED)
         local = published_order(tokens.local) if transposed else tokens.local
         return l2_normalise(torch.cat([tokens.global_token, local.flatten(1)], dim=1))
 
 
 def _aggregator(config: ModelConfig) -> nn.Module | None:
     """What is called `aggregator` in a state, as most public checkpoints have it."""
-    dim = config.backbone.dim
-    conv_ap, mixvpr = config.conv_ap, config.mixvpr
-    if config.aggregator == "salad":
-        return Salad(dim, config.salad)
-    if config.aggregator == "conv-ap":
-        return ConvAp(dim, conv_ap.channels, conv_ap.side)
-    if config.aggregator == "transvpr":
-        return TransVpr(dim, config.transvpr)
-    if config.aggregator == "netvlad":
-        return NetVlad(dim, config.netvlad.clusters)
-    if config.aggregator == "anyloc":
-        return AnyLoc(dim, config.anyloc.clusters)
-    if config.aggregator == "mixvpr":
-        return MixVpr(dim, config.patches, mixvpr.channels, mixvpr.rows, mixvpr.depth)
-    return Boq(dim, config.boq) if config.aggregator == "boq" else None
+    dim, found = config.backbone.dim, config.aggregator
+    if isinstance(found, SaladConfig):
+        return Salad(dim, found)
+    if isinstance(found, ConvApConfig):
+        return ConvAp(dim, found.channels, found.side)
+    if isinstance(found, TransVprConfig):
+        return TransVpr(dim, found)
+    if isinstance(found, NetVladConfig):
+        return NetVlad(dim, found.clusters)
+    if isinstance(found, AnyLocConfig):
+        return AnyLoc(dim, found.clusters)
+    if isinstance(found, MixVprConfig):
+        return MixVpr(dim, config.patches, found.channels, found.rows, found.depth)
+    return Boq(dim, found) if isinstance(found, BoqConfig) else None
 
 
 def _aggregation(config: ModelConfig) -> nn.Module | None:
     """What others name `aggregation`."""
-    if config.aggregator == "cosplace":
-        return CosPlace(config.backbone.dim, config.cosplace.dim)
-    pools = {"gem": GeM, "gem-pyramid": GemPyramid}
-    if config.aggregator not in pools:
-        return None
-    return nn.Sequential(UnitPatches(), pools[config.aggregator]())
+    found = config.aggregator
+    if isinstance(found, CosPlaceConfig):
+        return CosPlace(config.backbone.dim, found.dim)
+    if isinstance(found, GemConfig):
+        return nn.Sequential(UnitPatches(), GeM())
+    if isinstance(found, GemPyramidConfig):
+        return nn.Sequential(UnitPatches(), GemPyramid())
+    return None

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from crisalad_jax.config import SaladConfig
-from parity.reference.layers import Conv2d, Linear, l2_normalise, widen
-from parity.reference.sinkhorn import assign
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from parity.reference.layers import Conv2d, Linear, at_least_float32, l2_normalise
+from parity.reference.sinkhorn import assign_with_dustbin
 from parity.reference.tokens import Tokens
 from parity.reference.vit import Features
 
@@ -16,6 +16,7 @@ class Salad(nn.Module):
     def __init__(self, dim: int, config: SaladConfig) -> None:
         """For features of width `dim`. Torch's default start, dustbin score 1."""
         super().__init__()
+        self.epsilon = config.epsilon
         self.sinkhorn = config.sinkhorn
         self.token_features = nn.Sequential(
             Linear(dim, config.hidden),
@@ -28,16 +29,18 @@ class Salad(nn.Module):
 
     def forward(self, features: Features) -> Tokens:
         """Global and cluster tokens (paper Eq. 6), each L2-normalised, in float32 at least."""
-        global_token = widen(self.token_features(features.class_token))
-        local = widen(self.cluster_features(features.patches)).flatten(2)
+        global_token = at_least_float32(self.token_features(features.class_token))
+        local = at_least_float32(self.cluster_features(features.patches)).flatten(2)
         plan = self.transport(features.patches)[:, :-1].exp()
         clusters = torch.einsum("bkn,bdn->bkd", plan, local)
         return Tokens(l2_normalise(global_token), l2_normalise(clusters))
 
     def transport(self, patches: Tensor) -> Tensor:
         """(batch, dim, rows, columns) to logarithms of the plan, (batch, cluster + 1, patch)."""
-        scores = widen(self.score(patches)).flatten(2)
-        return assign(scores, self.dust_bin, self.sinkhorn)
+        scores = at_least_float32(self.score(patches)).flatten(2)
+        return assign_with_dustbin(
+            scores, self.dust_bin, epsilon=self.epsilon, config=self.sinkhorn
+        )
 
 
 def _pointwise_network(dim: int, d_out: int, config: SaladConfig) -> nn.Sequential:

@@ -8,10 +8,12 @@ import math
 import torch
 from torch import Tensor
 
-from crisalad_jax.config import SinkhornConfig
+from crisalad_jax.sinkhorn import SinkhornConfig
 
 
-def assign(scores: Tensor, dust_bin: Tensor, config: SinkhornConfig) -> Tensor:
+def assign_with_dustbin(
+    scores: Tensor, dust_bin: Tensor, *, epsilon: float, config: SinkhornConfig
+) -> Tensor:
     """SALAD's assignment of patches to clusters, as logarithms (paper Eqs. 4 and 5).
 
     Each patch has mass 1, each cluster 1, the dustbin the rest. Few iterations leave the clusters'
@@ -20,14 +22,15 @@ def assign(scores: Tensor, dust_bin: Tensor, config: SinkhornConfig) -> Tensor:
     Args:
         scores: (batch, cluster, patch), with more patches than clusters.
         dust_bin: () score of the dustbin, the same for every patch.
-        config: how many iterations, and the regularisation that scores are divided by.
+        epsilon: regularisation that scores are divided by.
+        config: how many iterations.
 
     Returns:
         (batch, cluster + 1, patch), the dustbin last.
     """
     batch, clusters, patches = scores.shape
     dust = dust_bin.to(scores.dtype).expand(batch, 1, patches)
-    kernel = torch.cat([scores, dust], dim=1) / config.epsilon
+    kernel = torch.cat([scores, dust], dim=1) / epsilon
     log_mass = kernel.new_zeros(clusters + 1, 1)
     log_mass[-1] = math.log(patches - clusters)
     cluster_potential = kernel.new_zeros(batch, clusters + 1, 1)

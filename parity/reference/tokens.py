@@ -14,15 +14,15 @@ class Tokens(NamedTuple):
     local: Tensor
     """(batch, token, dim)."""
 
+    @classmethod
+    def of_global(cls, token: Tensor) -> "Tokens":
+        """(batch, dim), and no local tokens of that width."""
+        return cls(token, token.new_zeros(len(token), 0, token.shape[1]))
 
-def global_alone(token: Tensor) -> Tokens:
-    """(batch, dim), and no local tokens of that width."""
-    return Tokens(token, token.new_zeros(len(token), 0, token.shape[1]))
-
-
-def local_alone(tokens: Tensor) -> Tokens:
-    """(batch, token, dim), and a global one of no numbers."""
-    return Tokens(tokens.new_zeros(len(tokens), 0), tokens)
+    @classmethod
+    def of_local(cls, tokens: Tensor) -> "Tokens":
+        """(batch, token, dim), and a global one of no numbers."""
+        return cls(tokens.new_zeros(len(tokens), 0), tokens)
 
 
 def as_sequence(tokens: Tokens, *, global_token: bool) -> Tensor:

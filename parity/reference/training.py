@@ -6,16 +6,16 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from crisalad_jax.config import OptimiserConfig, TrainConfig
-from crisalad_jax.errors import InputError
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.utils.errors import InputError
 from parity.reference.losses import multi_similarity_loss
 from parity.reference.model import Crisalad
 
 HEAD = ("aggregator.", "aggregation.", "encoder.")
 
 
-def freeze(model: Crisalad, trains: str) -> list[nn.Parameter]:
-    """Let gradients flow to the parameters that `trains` names alone, and return those.
+def freeze(model: Crisalad, trainable: str) -> list[nn.Parameter]:
+    """Let gradients flow to the parameters that `trainable` names alone, and return those.
 
     "head" (aggregator and cross-image encoder), "adapters+head" (the paper), "last-N-blocks+head"
     (SALAD: the last N blocks, the final layer norm, and the head), or "all". Batch-norm statistics
@@ -25,20 +25,20 @@ def freeze(model: Crisalad, trains: str) -> list[nn.Parameter]:
         InputError: an unknown name, or more blocks than there are.
     """
     depth = len(model.backbone.blocks)
-    match = re.fullmatch(r"last-(\d+)-blocks\+head", trains)
-    if trains == "all":
+    match = re.fullmatch(r"last-(\d+)-blocks\+head", trainable)
+    if trainable == "all":
         prefixes: tuple[str, ...] = ("",)
-    elif trains == "head":
+    elif trainable == "head":
         prefixes = HEAD
-    elif trains == "adapters+head":
+    elif trainable == "adapters+head":
         prefixes = (*HEAD, *(f"backbone.blocks.{i}.adapter." for i in range(depth)))
     elif match and int(match[1]) <= depth:
         last = range(depth - int(match[1]), depth)
         prefixes = (*HEAD, "backbone.norm.", *(f"backbone.blocks.{i}." for i in last))
     else:
         raise InputError(
-            f"trains: found {trains!r}, expected head, adapters+head, last-N-blocks+head with N at "
-            f"most {depth}, or all"
+            f"trainable: found {trainable!r}, expected head, adapters+head, last-N-blocks+head "
+            f"with N at most {depth}, or all"
         )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name.startswith(prefixes))
@@ -48,12 +48,12 @@ def freeze(model: Crisalad, trains: str) -> list[nn.Parameter]:
 def learning_rate_factor(config: OptimiserConfig, step: int, steps: int) -> float:
     """Share of the peak at `step`: 1 / n to 1 in a warm-up of n steps, then linearly down.
 
-    `config.final_fraction` is reached after the last of `steps`, counted from 0.
+    `config.end_lr_fraction` is reached after the last of `steps`, counted from 0.
     """
     if step < config.warmup_steps:
         return (step + 1) / config.warmup_steps
     done = (step - config.warmup_steps) / max(steps - config.warmup_steps, 1)
-    return 1 - (1 - config.final_fraction) * min(done, 1.0)
+    return 1 - (1 - config.end_lr_fraction) * min(done, 1.0)
 
 
 def train(
@@ -72,9 +72,9 @@ def train(
         steps: length of the schedule.
 
     Raises:
-        InputError: `config.trains` does not fit the model.
+        InputError: `config.trainable` does not fit the model.
     """
-    parameters = freeze(model, config.trains)
+    parameters = freeze(model, config.trainable)
     optimiser = torch.optim.AdamW(
         parameters,
         lr=config.optimiser.learning_rate,

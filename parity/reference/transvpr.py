@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
-from crisalad_jax.config import TransVprConfig
-from parity.reference.layers import Linear, l2_normalise, widen
+from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from parity.reference.layers import Linear, at_least_float32, l2_normalise
 from parity.reference.tokens import Tokens
 from parity.reference.vit import Features
 
@@ -22,8 +22,8 @@ class TransVpr(nn.Module):
     def forward(self, features: Features) -> Tokens:
         """Features hold (batch, level x dim, rows, columns); one global token, in float32."""
         tokens = features.patches.flatten(2).mT
-        maps = widen(self.attention(tokens)).softmax(dim=1).mT
-        levels = widen(tokens).split(self.dim, dim=2)
+        maps = at_least_float32(self.attention(tokens)).softmax(dim=1).mT
+        levels = at_least_float32(tokens).split(self.dim, dim=2)
         pooled = torch.cat([maps[:, i : i + 1] @ level for i, level in enumerate(levels)], dim=2)
         descriptor = l2_normalise(self.reduction(l2_normalise(pooled[:, 0])))
         return Tokens(descriptor, descriptor.new_zeros(len(descriptor), 0, descriptor.shape[1]))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.config import PATCH_SIZE, ViTConfig
+from crisalad_jax.nn.backbones.vit import PATCH_SIZE, ViTConfig
 from parity.reference.adapter import make_adapter
 from parity.reference.attention import Attention
 from parity.reference.layers import Conv2d, LayerNorm, Linear
@@ -89,10 +89,10 @@ class Block(nn.Module):
         self.alpha = config.adapter.alpha
         self.norm1 = LayerNorm(config.dim, eps=NORM_EPSILON)
         self.attn = Attention(config.dim, config.heads)
-        self.ls1 = LayerScale(config.dim, config.layer_scale_start)
+        self.ls1 = LayerScale(config.dim, config.layer_scale_init)
         self.norm2 = LayerNorm(config.dim, eps=NORM_EPSILON)
         self.mlp = feed_forward(config.dim, config.hidden)
-        self.ls2 = LayerScale(config.dim, config.layer_scale_start)
+        self.ls2 = LayerScale(config.dim, config.layer_scale_init)
         self.adapter = make_adapter(config)
 
     def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -112,7 +112,7 @@ class ViT(nn.Module):
         """Start as DINOv2 does before training: matrices normal of deviation 0.02, biases 0."""
         super().__init__()
         dim, side = config.dim, config.position_grid
-        if config.position_start == "sincos":
+        if config.position_init == "sincos":
             positions = _sincos_positions(side, dim)
         else:
             positions = 0.02 * torch.randn(side * side, dim)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from parity.reference.layers import l2_normalise, widen
+from parity.reference.layers import at_least_float32, l2_normalise
 from parity.reference.tokens import Tokens
 from parity.reference.vit import Features
 
@@ -20,7 +20,7 @@ class NetVlad(nn.Module):
 
     def forward(self, features: Features) -> Tokens:
         """V(k) = sum of a_k(x) (x - c_k) over the patches (Eq. 4), each of length 1."""
-        patches = F.normalize(widen(features.patches), dim=1)
+        patches = F.normalize(at_least_float32(features.patches), dim=1)
         shares = self.conv(patches).softmax(dim=1).flatten(2)
         return _tokens(features, _vlad(shares, patches.flatten(2), self.centroids))
 
@@ -29,14 +29,13 @@ class AnyLoc(nn.Module):
     """Every patch counts for the nearest word."""
 
     def __init__(self, dim: int, clusters: int) -> None:
-        """Random words, of no backbone."""
+        """Random words."""
         super().__init__()
         self.words = nn.Parameter(l2_normalise(torch.randn(clusters, dim)))
-        self.backbone = nn.Buffer(torch.zeros(()))
 
     def forward(self, features: Features) -> Tokens:
         """V(k) = sum of x - c_k over the patches nearest to word k, each of length 1."""
-        patches = F.normalize(widen(features.patches), dim=1).flatten(2)
+        patches = F.normalize(at_least_float32(features.patches), dim=1).flatten(2)
         nearest = torch.cdist(patches.mT, self.words.expand(len(patches), -1, -1)).argmin(dim=2)
         shares = F.one_hot(nearest, len(self.words)).mT.to(patches.dtype)
         return _tokens(features, _vlad(shares, patches, self.words))
@@ -49,4 +48,4 @@ def _vlad(shares: Tensor, patches: Tensor, centroids: Tensor) -> Tensor:
 
 
 def _tokens(features: Features, clusters: Tensor) -> Tokens:
-    return Tokens(widen(features.class_token)[:, :0], clusters)
+    return Tokens(at_least_float32(features.class_token)[:, :0], clusters)

@@ -5,9 +5,9 @@ import pathlib
 
 import pytest
 
+from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH
-from tests.report.test_page import Page
-from tests.test_cli import fails, succeeds
+from tests.experiments.report.test_page import Page
 
 
 def test_the_page_holds_the_numbers_of_the_json(

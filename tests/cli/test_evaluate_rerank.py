@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from crisalad_jax.checkpoint import save_weights
+from crisalad_jax.checkpoints.weights import save_weights
+from tests.cli.test_cli import fails, files_in, succeeds
 from tests.conftest import BATCH, random_params
-from tests.report.test_page import Page
-from tests.reranking.test_stage import TRANSVPR
-from tests.test_cli import fails, files_in, succeeds
+from tests.experiments.report.test_page import Page
+from tests.retrieval.reranking.test_stage import TRANSVPR
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_rows_come_in_pairs(capfd, tmp_path, shared, weights):
 
 
 def test_bad_input_is_named_before_any_work(capfd, shared, weights, monkeypatch):
-    monkeypatch.setattr("crisalad_jax.cli.evaluate.evaluate", None)
+    monkeypatch.setattr("crisalad_jax.evaluation.evaluate.read_tokens", None)
     own = shared / "weights.safetensors"
     start = ("evaluate", "--data", shared / "town", "--weights", own, "--quiet")
     nowhere = ("evaluate", "--data", shared / "none", "--weights", own, "--quiet")

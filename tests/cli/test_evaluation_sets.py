@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
+from tests.cli.test_cli import BATCH, fails, succeeds, train
 from tests.conftest import write_picture
-from tests.test_cli import BATCH, fails, succeeds, train
 
 
 @pytest.fixture
@@ -81,6 +81,6 @@ def test_validation_by_lists(capfd, tmp_path, shared, benchmark: Benchmark, monk
         assert validation.queries == benchmark.queries
         raise InputError(f"enough of {validation.name}")
 
-    monkeypatch.setattr("crisalad_jax.fit.fit", handed_on)
+    monkeypatch.setattr("crisalad_jax.experiments.train.fit", handed_on)
     words = ("crisalad: enough of town (SALAD's lists)",)
     fails(capfd, *start, "--val", lists, "--val-images", root, words=words)

@@ -5,7 +5,7 @@ import pathlib
 
 import pytest
 
-from tests.test_cli import fails, succeeds
+from tests.cli.test_cli import fails, succeeds
 
 
 def test_flags_become_the_manifest(

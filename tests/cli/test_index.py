@@ -12,17 +12,17 @@ import cv2
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoint import load_weights, save_weights
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.images import list_images
-from crisalad_jax.descriptors import read_descriptors, writer_for
-from crisalad_jax.evaluation import group, read_tokens
-from crisalad_jax.map_description import describe_map
-from crisalad_jax.maps import open_for_appending, open_map
+from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.descriptor_files import read_descriptors, writer_for
+from crisalad_jax.retrieval.maps.manifest import describe_map
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from tests.cli.test_cli import fails, files_in, succeeds
 from tests.conftest import BATCH, MODEL, random_params
-from tests.stores.test_stores import ROUNDING, brute_force
-from tests.test_cli import fails, files_in, succeeds
-from tests.test_pairs import brute_force as nearest
-from tests.test_pairs import by_name, pairs_as_hloc_reads_them
+from tests.retrieval.maps.test_stores import ROUNDING, brute_force
+from tests.retrieval.test_hloc_pairs import brute_force as nearest
+from tests.retrieval.test_hloc_pairs import by_name, pairs_as_hloc_reads_them
 
 MILVUS = "milvus:{map}/rows.db"
 
@@ -140,7 +140,7 @@ def test_queries_are_searched_for_in_portions_all_the_same(
 ):
     found = []
     for number, at_once in enumerate((1024, 1)):
-        monkeypatch.setattr("crisalad_jax.cli.query._AT_ONCE", at_once)
+        monkeypatch.setattr("crisalad_jax.retrieval.maps.query.AT_ONCE", at_once)
         path = tmp_path / f"{number}.jsonl"
         succeeds(capfd, *query(folder, queries, "--json", path))
         found.append([json.loads(line) for line in path.read_text().splitlines()])
@@ -199,7 +199,7 @@ def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
     said = succeeds(capfd, *index(shared, database, out, "--positions", table))
     assert "7 images added, 1 with positions" in said
     assert "1 positions given are of no image here, 'other.jpg' the first" in said
-    with open_map(out) as found:
+    with Map.open(out) as found:
         assert found.axes == ("lat", "lon")
         assert [image.position for image in found.images][:3] == [None, (1.5, -2.5), None]
     table.write_text("name,lat,lon\nother.jpg,0,0\n")
@@ -222,9 +222,9 @@ def test_files_may_keep_half_precision(shared, database, queries, tmp_path, capf
 
 def test_a_map_of_another_model_is_refused(shared, folder, database, queries, tmp_path, capfd):
     salad = dataclasses.replace(
-        MODEL.salad, sinkhorn=dataclasses.replace(MODEL.salad.sinkhorn, iterations=5)
+        MODEL.aggregator, sinkhorn=dataclasses.replace(MODEL.aggregator.sinkhorn, iterations=5)
     )
-    config = dataclasses.replace(MODEL, salad=salad)
+    config = dataclasses.replace(MODEL, aggregator=salad)
     other = tmp_path / "other.safetensors"
     save_weights(other, random_params(config), config)
     before = files_in(folder)
@@ -295,7 +295,7 @@ def test_a_command_that_failed_binds_the_corrected_one_to_nothing(
     with open_for_appending(out, other):
         pass
     succeeds(capfd, *index(shared, database, out, "--dtype", "float32"))
-    with open_map(out) as found:
+    with Map.open(out) as found:
         assert (len(found), found.description.dtype) == (7, "float32")
 
 
@@ -307,13 +307,15 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
     table.write_text(f"name,east,north\n{known[0].name},1,2\n{known[1].name},3,4\nno.jpg,5,6\n")
     made = index(shared, database, folder, "--positions", table)
     assert "2 positions given are of such, and stay as they are" in succeeds(capfd, *made)
-    with open_map(folder) as found:
+    with Map.open(folder) as found:
         assert found.images[0].position not in ((1.0, 2.0), None)
     images = tmp_path / "images"
     images.mkdir()
     (images / "new.png").write_bytes(known[0].read_bytes())
     table.write_text("name,lat,lon\nnew.png,1,2\n")
-    monkeypatch.setattr("crisalad_jax.indexing.describe_alone", None)  # nothing is described
+    monkeypatch.setattr(
+        "crisalad_jax.retrieval.maps.build.describe_alone", None
+    )  # nothing is described
     made = index(shared, images, folder, "--positions", table)
     fails(capfd, *made, words=("found positions in lat, lon, expected east, north as in the map",))
 
@@ -322,8 +324,8 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
 def test_the_command_killed_while_it_appends_goes_on(shared, database, tmp_path):
     """The real program, two images a segment, killed as soon as another segment is there."""
     program = (
-        "import sys, crisalad_jax.indexing, crisalad_jax.cli as cli\n"
-        "crisalad_jax.indexing.SEGMENT = 2\n"
+        "import sys, crisalad_jax.retrieval.maps.build, crisalad_jax.cli as cli\n"
+        "crisalad_jax.retrieval.maps.build.SEGMENT = 2\n"
         "sys.exit(cli.main(sys.argv[1:]))"
     )
     out = tmp_path / "map"
@@ -349,7 +351,7 @@ def test_the_command_killed_while_it_appends_goes_on(shared, database, tmp_path)
     whole = tmp_path / "whole"
     made = [str(part) for part in index(shared, database, whole, "--batch-size", 1)]
     subprocess.run([sys.executable, "-c", program, *made], check=True, env=environment)
-    with open_map(out) as one, open_map(whole) as other:
+    with Map.open(out) as one, Map.open(whole) as other:
         one.verify()
         assert one.images == other.images
         np.testing.assert_array_equal(

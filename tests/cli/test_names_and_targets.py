@@ -6,8 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
-from crisalad_jax.pca import PcaConfig, fit_pca, save_pca
-from tests.test_cli import extract, fails, files_in, succeeds
+from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
+from tests.cli.test_cli import extract, fails, files_in, succeeds
 
 
 @pytest.mark.parametrize("folder", ["x[/b]", "fo[red]x", "a:smile:b"])

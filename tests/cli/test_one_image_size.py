@@ -5,16 +5,16 @@ import pathlib
 
 import pytest
 
-from crisalad_jax.checkpoint import save_weights
-from crisalad_jax.config import CrossImageConfig, MixVprConfig
+from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from tests.cli.test_cli import fails
 from tests.conftest import MODEL, random_params
-from tests.test_cli import fails
 
 CONFIG = dataclasses.replace(
     MODEL,
-    aggregator="mixvpr",
-    mixvpr=MixVprConfig(channels=8, rows=2, depth=1),
-    encoder=CrossImageConfig(layers=0),
+    aggregator=MixVprConfig(channels=8, rows=2, depth=1),
+    cross_image=CrossImageConfig(layers=0),
 )
 
 

@@ -6,8 +6,8 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from crisalad_jax.pca import PcaConfig, fit_pca, load_pca, save_pca
-from tests.test_cli import extract, fails, succeeds
+from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, load_pca, save_pca
+from tests.cli.test_cli import extract, fails, succeeds
 
 DESCRIPTORS = np.random.default_rng(0).standard_normal((60, 48)).astype(np.float32)
 

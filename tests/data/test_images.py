@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 
 from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
 

@@ -12,14 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
-from crisalad_jax.config import LightAugmentConfig, RandAugmentConfig
 from crisalad_jax.data import loader
-from crisalad_jax.data.augment import augment
+from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.data.augmentations.light import LightAugmentConfig
+from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig, rand_augment
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageBatch, ImageCache, image_batches, training_batches
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 SIZE = (28, 42)
 LIGHT = LightAugmentConfig(flip=0.5)
@@ -58,7 +59,7 @@ def train(places: Places, **changes) -> list[ImageBatch]:
         "places_per_batch": 2,
         "images_per_place": 3,
         "order": "within-city",
-        "augment": None,
+        "augmentation": NoAugmentation(),
         "seed": 1,
         "epoch": 4,
     }
@@ -98,16 +99,16 @@ def test_training_batches_hold_the_images_that_the_epoch_drew(places):
             np.testing.assert_array_equal(image, plain(places.path(index)))
 
 
-@pytest.mark.parametrize("augment", [None, LIGHT, RandAugmentConfig()])
-def test_threads_restarts_and_caches_do_not_change_a_bit(places, augment):
-    whole = train(places, augment=augment)
+@pytest.mark.parametrize("augmentation", [NoAugmentation(), LIGHT, RandAugmentConfig()])
+def test_threads_restarts_and_caches_do_not_change_a_bit(places, augmentation):
+    whole = train(places, augmentation=augmentation)
     for threads in (0, 1, 5):
-        assert_same(train(places, augment=augment, threads=threads), whole)
-    assert_same(train(places, augment=augment, start_step=1), whole[1:])
-    assert train(places, augment=augment, start_step=3) == []
+        assert_same(train(places, augmentation=augmentation, threads=threads), whole)
+    assert_same(train(places, augmentation=augmentation, start_step=1), whole[1:])
+    assert train(places, augmentation=augmentation, start_step=3) == []
     cache = ImageCache()
     for _ in range(2):
-        assert_same(train(places, augment=augment, cache=cache), whole)
+        assert_same(train(places, augmentation=augmentation, cache=cache), whole)
 
 
 def test_opencv_has_one_thread_while_batches_are_read(places):
@@ -129,17 +130,18 @@ def test_opencv_has_one_thread_while_batches_are_read(places):
 
 
 def test_processes_read_the_same_and_name_what_they_cannot(places):
-    options = {"augment": RandAugmentConfig(), "start_step": 1}
+    options = {"augmentation": RandAugmentConfig(), "start_step": 1}
     whole = train(places, **options)
-    assert_same(train(places, workers=2, cache=ImageCache(), **options), whole)
+    assert_same(train(places, num_workers=2, cache=ImageCache(), **options), whole)
     path = places.path(int(whole[1].indices[2]))
     path.write_bytes(b"no image")
     with pytest.raises(InputError, match=f"^{path}: found 8 bytes"):
-        train(places, workers=1, **options)
+        train(places, num_workers=1, **options)
 
 
 READER = """
-import sys, time
+import sys
+from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.loader import training_batches
 from crisalad_jax.data.places import read_places
 
@@ -147,15 +149,15 @@ if __name__ == "__main__":
     for epoch in range(2):
         for batch in training_batches(
             read_places(sys.argv[1], min_images=3), image_size=(224, 224), places_per_batch=2,
-            images_per_place=3, order="within-city", augment=None, seed=1, epoch=epoch, workers=2
+            images_per_place=3, order="within-city", augmentation=NoAugmentation(), seed=1,
+            epoch=epoch, num_workers=2
         ):
             assert batch.valid.all()
-    time.sleep(1)  # a thread of grain's gives the memory back
 """
 
 
 @pytest.mark.slow
-def test_processes_that_read_leave_no_shared_memory(places, tmp_path):
+def test_processes_that_read_leave_without_a_word(places, tmp_path):
     program = tmp_path / "program.py"
     program.write_text(READER)
     done = subprocess.run(
@@ -166,7 +168,7 @@ def test_processes_that_read_leave_no_shared_memory(places, tmp_path):
 
 def test_parts_of_a_batch_are_the_whole(places):
     """For processes, each of which reads one: also on from the middle of an epoch."""
-    options = {"augment": RandAugmentConfig(), "start_step": 1}
+    options = {"augmentation": RandAugmentConfig(), "start_step": 1}
     whole = train(places, **options)
     parts = [train(places, part=(number, 3), **options) for number in range(3)]
     assert_same(
@@ -199,6 +201,7 @@ SLOW_READER = """
 import sys, time
 import numpy as np
 from crisalad_jax.data import loader
+from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.places import read_places
 
 def read(path, image_size, *, quickly):
@@ -209,7 +212,8 @@ if __name__ == "__main__":
     loader._read = read
     batches = loader.training_batches(
         read_places(sys.argv[1], min_images=3), image_size=(28, 28), places_per_batch=2,
-        images_per_place=3, order="within-city", augment=None, seed=1, epoch=1, workers=2
+        images_per_place=3, order="within-city", augmentation=NoAugmentation(), seed=1,
+        epoch=1, num_workers=2
     )
     next(batches)
     print("reading", flush=True)
@@ -229,7 +233,7 @@ def test_processes_that_read_end_with_the_one_they_read_for(places, tmp_path):
     assert process.stdout.readline() == "reading\n"
     tasks = Path(f"/proc/{process.pid}/task").iterdir()
     children = [child for task in tasks for child in (task / "children").read_text().split()]
-    assert len(children) >= 2  # and one that cleans up after all
+    assert len(children) >= 2
     process.kill()
     process.communicate()
     deadline = time.monotonic() + 60
@@ -248,24 +252,24 @@ def is_running(process: str) -> bool:
 
 def test_augmentation_draws_from_seed_epoch_step_and_slot(places):
     config = RandAugmentConfig()
-    for step, batch in enumerate(train(places, augment=config)):
+    for step, batch in enumerate(train(places, augmentation=config)):
         for slot, index in enumerate(batch.indices):
             generator = np.random.default_rng((1, 4, step, slot))
-            expected = augment(plain(places.path(index)), config, generator)
+            expected = rand_augment(plain(places.path(index)), config, generator)
             np.testing.assert_array_equal(batch.images[slot], expected)
 
 
 def test_seed_and_epoch_change_the_augmentation(places):
-    whole = train(places, augment=LIGHT)
-    assert not same(whole, train(places, augment=LIGHT, seed=2))
-    assert not same(whole, train(places, augment=LIGHT, epoch=5))
+    whole = train(places, augmentation=LIGHT)
+    assert not same(whole, train(places, augmentation=LIGHT, seed=2))
+    assert not same(whole, train(places, augmentation=LIGHT, epoch=5))
     assert not same(whole, train(places))
 
 
 def test_a_place_is_mirrored_as_a_whole(places):
     mirrored = []
     for epoch in range(20):
-        for batch in train(places, augment=STILL, epoch=epoch):
+        for batch in train(places, augmentation=STILL, epoch=epoch):
             for slot, index in enumerate(batch.indices):
                 image = plain(places.path(index))
                 flipped = np.array_equal(batch.images[slot], image[:, ::-1])
@@ -311,7 +315,7 @@ def test_batches_before_a_bad_image_arrive(places):
         places_per_batch=2,
         images_per_place=3,
         order="within-city",
-        augment=None,
+        augmentation=NoAugmentation(),
         seed=1,
         epoch=4,
     )
@@ -427,7 +431,7 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
         ({"start_step": -1}, "start_step: found -1"),
         ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
         ({"threads": -1}, "threads: found -1"),
-        ({"workers": -1}, "workers: found -1"),
+        ({"num_workers": -1}, "num_workers: found -1"),
         ({"image_size": (0, 14)}, "image_size"),
         ({"images_per_place": 4}, "place 0 of A has 3 images"),
     ],
@@ -438,7 +442,7 @@ def test_bad_arguments_raise_at_the_call(places, changes, message):
         "places_per_batch": 2,
         "images_per_place": 3,
         "order": "within-city",
-        "augment": None,
+        "augmentation": NoAugmentation(),
         "seed": 1,
         "epoch": 4,
     }

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.places import Places, epoch_batches, read_places
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
 REAL = Path(__file__).parents[2].parent / "shared" / "data"

@@ -3,7 +3,7 @@
 import pytest
 
 from crisalad_jax.data.positions import read_positions, utm_positions
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 
 def test_names_say_east_and_north():

@@ -11,7 +11,7 @@ from PIL import Image
 
 from crisalad_jax.data import resize
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 SIZES = [(224, 224), (322, 322), (70, 126), (448, 420)]
 

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.views import transverse_mercator, views_of
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
 SQUARE = FLATTENING * (2 - FLATTENING)

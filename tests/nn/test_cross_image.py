@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.config import CrossImageConfig
 from crisalad_jax.nn.cross_image import (
+    CrossImageConfig,
     cross_image_encoder,
     init_cross_image,
 )

@@ -1,4 +1,4 @@
-"""What every reader returns: database, queries, and which database images are right for each."""
+"""The evaluation set that every reader returns: database, queries and ground truth."""
 
 import dataclasses
 import pathlib
@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -14,7 +14,7 @@ class Benchmark:
     """One evaluation set, in the order in which its images are described."""
 
     name: str
-    """Exactly what was read, for instance "sped_val/test (@UTM, 25 m)"."""
+    """Name of exactly the images that were read, such as "sped_val/test (@UTM, 25 m)"."""
     root: pathlib.Path
     database: tuple[pathlib.Path, ...]
     queries: tuple[pathlib.Path, ...]
@@ -22,7 +22,7 @@ class Benchmark:
     """Query -> ascending database indices; empty where the query has no match, which counts as a
     miss. None where the set has no ground truth at all."""
     rule: str
-    """What makes a database image positive, in words."""
+    """Rule that makes a database image positive, in words."""
     database_positions: Float64[np.ndarray, "database 2"] | None = None
     """East and north in metres, for maps; None where there are none, or only placeholders."""
     query_positions: Float64[np.ndarray, "q 2"] | None = None
@@ -30,7 +30,7 @@ class Benchmark:
     """Metres within which two positions show the same place."""
 
     def ground_truth(self) -> tuple[Int64[np.ndarray, " _"], ...]:
-        """`positives`, for those who cannot do without.
+        """Return `positives`, or raise where the set has no ground truth.
 
         Raises:
             InputError: the set has none.

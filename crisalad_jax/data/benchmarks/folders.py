@@ -1,4 +1,4 @@
-"""Two plain folders, `database/` and `queries/`: with a table of matches, frames, or nothing."""
+"""Two plain folders, `database/` and `queries/`, with or without a table of matches."""
 
 import csv
 import os
@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import find_split, list_part
-from crisalad_jax.errors import InputError
+from crisalad_jax.data.benchmarks.folders_on_disk import find_split, list_part
+from crisalad_jax.utils.errors import InputError
 
 TRUTH = "ground_truth.csv"
 _HEADER = ["query", "database"]
@@ -20,12 +20,11 @@ _HEADER = ["query", "database"]
 def read_folders(
     root: str | os.PathLike[str], split: str | None = None, *, frames: int | None = None
 ) -> Benchmark:
-    """Read `database/` and `queries/`, whatever their images are called.
+    """Read `database/` and `queries/`, whose images may have any names.
 
-    Which database images are right for a query is told by `ground_truth.csv` beside them: lines of
-    `query,database`, paths relative to the two folders, as many lines for a query as it has
-    matches; `query,` alone where it has none. Every query has a line. Or by `frames`. Or nothing
-    tells, and the set has no ground truth.
+    The ground truth is `ground_truth.csv` beside the folders, or `frames`, or there is none. The
+    table has lines of `query,database`, with paths relative to the two folders: one line for each
+    match of a query, or the line `query,` for a query without a match. Every query has a line.
 
     Args:
         root: the folder that holds the two, or one with `images/{test,val,train}` that do.
@@ -88,13 +87,13 @@ def _by_frames(
 
 
 def _in_numbers(path: pathlib.Path) -> list[str | int]:
-    """Sorts the numbers in a path by their value. Odd parts are numbers, so like meets like."""
+    """Return a sort key that orders the numbers in a path by value. Its odd parts are numbers."""
     parts = re.split(r"(\d+)", path.as_posix())
     return [int(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
 def _numbers(folder: pathlib.Path, paths: tuple[pathlib.Path, ...]) -> dict[str, int]:
-    """By the path below database/ or queries/."""
+    """Number the images by their path below `database/` or `queries/`."""
     depth = len(folder.parts) + 1
     return {"/".join(path.parts[depth:]): number for number, path in enumerate(paths)}
 
@@ -102,7 +101,7 @@ def _numbers(folder: pathlib.Path, paths: tuple[pathlib.Path, ...]) -> dict[str,
 def _by_table(
     table: pathlib.Path, database: dict[str, int], queries: dict[str, int]
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
-    found: dict[str, set[int]] = {}
+    matches: dict[str, set[int]] = {}
     without: set[str] = set()
     for line, query, match in _rows(table):
         for side, name, numbers in (("query", query, queries), ("database", match, database)):
@@ -112,26 +111,26 @@ def _by_table(
                     f"{table}: line {line}: found {side} {name!r}, expected the path of an image "
                     f"below {table.parent / folder}"
                 )
-        found.setdefault(query, set())
+        matches.setdefault(query, set())
         if match:
-            found[query].add(database[match])
+            matches[query].add(database[match])
         else:
             without.add(query)
-        if query in without and found[query]:
+        if query in without and matches[query]:
             raise InputError(
                 f"{table}: line {line}: found {query!r} with a match and without, expected either"
             )
-    missing = queries.keys() - found.keys()
+    missing = queries.keys() - matches.keys()
     if missing:
         raise InputError(
             f"{table}: found {len(missing)} of {len(queries)} queries without a line, expected all "
             f"('{min(missing)},' where there is no match)"
         )
-    return tuple(np.array(sorted(found[query]), np.int64) for query in queries)
+    return tuple(np.array(sorted(matches[query]), np.int64) for query in queries)
 
 
 def _rows(table: pathlib.Path) -> Iterator[tuple[int, str, str]]:
-    """Line number, query and match, of every row that is not blank."""
+    """Yield the line number, query and match of every row that is not blank."""
     try:
         # utf-8-sig: a spreadsheet's byte order mark would spoil the first name.
         with table.open(newline="", encoding="utf-8-sig") as file:

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import find_images, listing, shown
-from crisalad_jax.data.benchmarks.positives import DEFAULT_RADIUS, check_radius, within
-from crisalad_jax.errors import InputError
+from crisalad_jax.data.benchmarks.folders_on_disk import find_images, listing, shown
+from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.utils.errors import InputError
 
 MSLS_CITIES = {
     "val": ("cph", "sf"),
@@ -31,7 +31,7 @@ MSLS_CITIES = {
 
 
 def msls_title(cities: Collection[str]) -> str:
-    """What images of these cities are: "MSLS val", "MSLS train", or MSLS of the cities by name."""
+    """Name a set of these cities: "MSLS val", "MSLS train", or MSLS and the cities' names."""
     for split, expected in MSLS_CITIES.items():
         if set(cities) == set(expected):
             return f"MSLS {split}"
@@ -45,9 +45,9 @@ def read_msls(
     *,
     max_heading_difference: float | None = None,
 ) -> Benchmark:
-    """Read raw MSLS: all images but panoramas; a query without a match counts as a miss.
+    """Read raw MSLS: all images but panoramas. A query without a match counts as a miss.
 
-    That is what VPR-datasets-downloader takes: about 11,000 queries of val.
+    VPR-datasets-downloader takes the same images: about 11,000 queries of val.
 
     Args:
         root: the folder with `train_val/`, or that one.
@@ -73,9 +73,9 @@ def read_msls_subtask(
 ) -> Benchmark:
     """Read raw MSLS as the official code does for val: the list of 740 queries.
 
-    Of the images that `subtask_index.csv` marks as `all`, and are no panoramas, the queries with an
-    image of the database within `radius`. (By distance alone: with a largest difference of headings
-    the queries remain the same, and those without a match count as misses.)
+    Images are those that `subtask_index.csv` marks as `all`, without panoramas. Queries need a
+    database image within `radius`, by distance alone. A `max_heading_difference` leaves the queries
+    the same, and those that it leaves without a match count as misses.
 
     Arguments and errors are those of `read_msls`.
     """
@@ -122,14 +122,16 @@ def _read(
         )
         near = within(there.positions, asked.positions, radius)
         if subtask:
-            chosen = np.array([i for i, found in enumerate(near) if found.size], np.int64)
+            chosen = np.array([i for i, matches in enumerate(near) if matches.size], np.int64)
             asked, near = asked.only(chosen), tuple(near[i] for i in chosen)
         if max_heading_difference is not None:
             near = tuple(
-                found[heading_difference(there.headings[found], heading) <= max_heading_difference]
-                for found, heading in zip(near, asked.headings, strict=True)
+                matches[
+                    heading_difference(there.headings[matches], heading) <= max_heading_difference
+                ]
+                for matches, heading in zip(near, asked.headings, strict=True)
             )
-        positives += [found + start for found in near]
+        positives += [matches + start for matches in near]
         database.append(there)
         queries.append(asked)
         start += len(there.images)
@@ -160,34 +162,34 @@ def _read(
 def heading_difference(
     first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"] | float
 ) -> Float64[np.ndarray, " n"]:
-    """The angle between two compass angles, all in degrees: from 0 to 180."""
+    """Compute the angle between two compass angles in degrees, from 0 to 180."""
     turn = np.abs(np.subtract(first, second, dtype=np.float64)) % 360
     return np.minimum(turn, 360 - turn)
 
 
 def is_msls(root: pathlib.Path) -> bool:
-    """Whether a folder is raw MSLS: has train_val/, or is it."""
+    """Return whether a folder is raw MSLS: it holds train_val/ or is itself train_val/."""
     return (root / "train_val").is_dir() or root.resolve().name == "train_val"
 
 
 def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
-    """Those of the cities of a split that are there."""
+    """List the folders of a split's cities that are on disk."""
     if split not in MSLS_CITIES:
         raise InputError(
             f"split: found {split!r}, expected val or train: no other part of MSLS has positions"
         )
     parent = root / "train_val" if (root / "train_val").is_dir() else root
-    found = [parent / city for city in MSLS_CITIES[split] if (parent / city).is_dir()]
-    if not found:
+    folders = [parent / city for city in MSLS_CITIES[split] if (parent / city).is_dir()]
+    if not folders:
         raise InputError(
             f"{parent}: found {listing(parent)}, expected some of "
             f"{shown(f'{city}/' for city in MSLS_CITIES[split])} for {split}"
         )
-    return found
+    return folders
 
 
 def _read_side(folder: pathlib.Path, *, headings: bool, subtask: bool) -> _Side:
-    """The images of a folder that are no panoramas, in the order of the tables."""
+    """Read a folder's images that are no panoramas, in the order of the tables."""
     raw = _read_table(folder / "raw.csv", ("key", "pano", *(["ca"] if headings else [])))
     columns = ("key", "easting", "northing")
     tables = {"postprocessed.csv": _read_table(folder / "postprocessed.csv", columns)}
@@ -200,22 +202,22 @@ def _read_side(folder: pathlib.Path, *, headings: bool, subtask: bool) -> _Side:
                 f"{folder / name}: found {len(table)} rows, expected the same {len(raw)} images as "
                 "in raw.csv, in the same order"
             )
-    kept = []
+    chosen = []
     for row, first in enumerate(raw):
         marked = not subtask or _truth(
             folder / "subtask_index.csv", row, "all", tables["subtask_index.csv"]
         )
         if marked and not _truth(folder / "raw.csv", row, "pano", raw):
-            kept.append((row, first["key"]))
-    if not kept:
+            chosen.append((row, first["key"]))
+    if not chosen:
         raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
-    names = [f"{key}.jpg" for _, key in kept]
+    names = [f"{key}.jpg" for _, key in chosen]
     path = folder / "postprocessed.csv"
     positions = [
         [_number(path, row, name, tables[path.name]) for name in ("easting", "northing")]
-        for row, _ in kept
+        for row, _ in chosen
     ]
-    angles = [_number(folder / "raw.csv", row, "ca", raw) if headings else 0.0 for row, _ in kept]
+    angles = [_number(folder / "raw.csv", row, "ca", raw) if headings else 0.0 for row, _ in chosen]
     return _Side(
         images=find_images(folder / "raw.csv", folder / "images", names),
         positions=np.array(positions),

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import find_image_root, find_images
-from crisalad_jax.data.benchmarks.positives import check_radius, within
-from crisalad_jax.errors import InputError
-from crisalad_jax.files import check_source
+from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images
+from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source
 
 _FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
 _DATABASE_FOLDERS = (".", "images")
-# The folders of queries first: names in them may be those of database images, too.
+# Look in the queries' folders first: a query may have the same name as a database image.
 _QUERY_FOLDERS = ("queries_real", "queries", "query", ".")
 
 
@@ -77,7 +77,7 @@ def read_netvlad(
 
 
 def _read_struct(path: pathlib.Path) -> np.void:
-    # Half a second to import, for this layout alone.
+    # Import here: scipy takes half a second, and no other layout needs it.
     import scipy.io
 
     check_source(path, "a .mat file with dbStruct")

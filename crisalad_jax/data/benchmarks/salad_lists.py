@@ -1,7 +1,7 @@
-"""The `.npy` lists of GSV-Cities and SALAD: names of images, and indices that match.
+"""Read the `.npy` lists of GSV-Cities and SALAD: names of images, and indices of matches.
 
-`pitts30k_test_dbImages.npy`, `..._qImages.npy`, `..._gt.npy`; for MSLS `..._qIdx.npy` (which of the
-queries are asked) and `..._pIdx.npy` (their matches) in place of `gt`.
+Files are `pitts30k_test_dbImages.npy`, `..._qImages.npy` and `..._gt.npy`. MSLS has `..._qIdx.npy`
+(indices of the evaluated queries) and `..._pIdx.npy` (their matches) in place of `gt`.
 """
 
 import os
@@ -12,15 +12,15 @@ import numpy as np
 from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import find_image_root, find_images, listing
+from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images, listing
+from crisalad_jax.data.benchmarks.ground_truth import indices, is_nordland_star, matches
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.benchmarks.pickled import read_npy
-from crisalad_jax.data.benchmarks.positives import indices, is_nordland_star, matches
-from crisalad_jax.errors import InputError
+from crisalad_jax.data.benchmarks.safe_npy import read_npy
+from crisalad_jax.utils.errors import InputError
 
 _FILE = re.compile(r"(?P<prefix>(?:.*_)?)(?P<kind>dbImages|qImages|gt|qIdx|pIdx)\.npy")
 _MSLS_IMAGE = re.compile(r"train_val/([^/]+)/(?:database|query)/images/[^/]+")
-# The folder of queries first: names in it may be those of database images, too.
+# Look in the queries' folders first: a query may have the same name as a database image.
 _QUERY_FOLDERS = ("queries_real", ".")
 
 _Lists = dict[str, pathlib.Path]
@@ -37,7 +37,7 @@ def read_salad_lists(
 
     Args:
         root: a folder with such lists, or one of the files.
-        split: where the folder has the lists of several sets, a part of the name of one: `val`.
+        split: part of a set's name, such as `val`, where the folder has the lists of several sets.
         images: the folder to which the names are relative; None looks beside the files and one
             folder further up.
 
@@ -59,13 +59,13 @@ def read_salad_lists(
     if nordland:
         rule += ", which are 10i - 1, 10i and 10i + 1 for query i: by that it is Nordland*"
 
-    found = {}
+    images_of = {}
     for kind, names, folders in (
         ("dbImages", database_names, (".",)),
         ("qImages", query_names, _QUERY_FOLDERS),
     ):
         folder = find_image_root(files[kind], images, names[0], folders)
-        found[kind] = find_images(files[kind], folder, names)
+        images_of[kind] = find_images(files[kind], folder, names)
     cities = _msls_cities(database_names + query_names)
     if nordland:
         name = "Nordland*, winter database, summer queries (SALAD's lists)"
@@ -73,21 +73,21 @@ def read_salad_lists(
         name = f"{msls_title(cities)}, {len(query_names)} queries (SALAD's list)"
     else:
         name = f"{prefix.strip('_') or files['dbImages'].resolve().parent.name} (SALAD's lists)"
-    return Benchmark(name, root, found["dbImages"], found["qImages"], positives, rule)
+    return Benchmark(name, root, images_of["dbImages"], images_of["qImages"], positives, rule)
 
 
 def is_list(path: pathlib.Path) -> bool:
-    """Whether a file is called like one of the lists."""
+    """Return whether a file has the name of one of the lists."""
     return path.is_file() and _FILE.fullmatch(path.name) is not None
 
 
 def has_lists(folder: pathlib.Path) -> bool:
-    """Whether a folder holds the lists of any set."""
+    """Return whether a folder holds the lists of any set."""
     return folder.is_dir() and bool(_find(folder))
 
 
 def _find(folder: pathlib.Path) -> dict[str, _Lists]:
-    """By the prefix of their names, the files of every set that lists a database."""
+    """Find the files of every set that lists a database, by the prefix of their names."""
     sets: dict[str, _Lists] = {}
     for path in sorted(folder.glob("*.npy")):
         parts = _FILE.fullmatch(path.name)
@@ -133,7 +133,7 @@ def _names(path: pathlib.Path) -> list[str]:
 
 
 def _chosen(path: pathlib.Path, queries: int) -> Int64[np.ndarray, " _"]:
-    """Which of all queries are asked."""
+    """Read the indices of the queries that are evaluated."""
     try:
         chosen = indices(read_npy(path))
     except (TypeError, OverflowError) as error:
@@ -164,6 +164,6 @@ def _positives(
 
 
 def _msls_cities(names: list[str]) -> frozenset[str] | None:
-    """The cities in the paths, where all are those of MSLS."""
-    found = [_MSLS_IMAGE.fullmatch(name) for name in names]
-    return None if None in found else frozenset(match[1] for match in found if match)
+    """Return the cities in the paths; None unless all are paths of MSLS."""
+    cities = [_MSLS_IMAGE.fullmatch(name) for name in names]
+    return None if None in cities else frozenset(match[1] for match in cities if match)

@@ -1,7 +1,7 @@
-"""`@UTM` file names, as VPR-datasets-downloader and the tools around it write them.
+"""Read sets with `@UTM` file names, as VPR-datasets-downloader and related tools write them.
 
 The fields of a name, between @: east, north, zone number, zone letter, latitude, longitude,
-panorama, tile, heading, pitch, roll, height, time, note, suffix. Those of no use are empty.
+panorama, tile, heading, pitch, roll, height, time, note, suffix. Unused fields are empty.
 """
 
 import os
@@ -12,20 +12,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import (
+from crisalad_jax.data.benchmarks.folders_on_disk import (
     find_database,
     find_split,
     list_part,
     listing,
     shown,
 )
+from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.benchmarks.positives import DEFAULT_RADIUS, check_radius, within
 from crisalad_jax.data.positions import utm_position
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 
 QUERIES = "queries"
-"""The folder of the queries, unless another is named."""
+"""Default folder of the queries."""
 _PLACE_METRES = 1000.0
 _PAIRED = {607: "SPED", 1231: "AmsterTime"}
 """Sets whose places have an image on each side, and no coordinates, by how many they are."""
@@ -33,8 +33,8 @@ _NORDLANDS = {
     25 / 10.5: "Nordland, Patch-NetVLAD split (summer database, winter queries)",
     25 / 1.5: "Nordland subset of VPR-datasets-downloader (summer database, winter queries)",
 }
-"""By the metres that a frame stands for."""
-# Names have one decimal, cut off.
+"""Versions of Nordland by the metres between two frames."""
+# Names have one decimal, truncated.
 _NAME_METRES = 0.1
 _MSLS_NOTE = re.compile(r"(?:day|night)_[a-z]+_([a-z]+)")
 
@@ -48,9 +48,9 @@ def read_utm(
 ) -> Benchmark:
     """Read `@UTM_east@UTM_north@...` images; a positive is at most `radius` metres away.
 
-    Where the coordinates are placeholders of VPR-datasets-downloader (Nordland: easting 0, frames
-    25 / 10.5 m apart; SPED and AmsterTime: easting 0, places 1 km apart), name and rule say what
-    they stand for. So does the name of MSLS, which is told by the notes in the names.
+    VPR-datasets-downloader writes placeholder coordinates for Nordland (easting 0, frames
+    25 / 10.5 m apart), SPED and AmsterTime (easting 0, places 1 km apart). The benchmark's name
+    and rule then say what they stand for. MSLS is recognised by the notes in the file names.
 
     Args:
         root: a folder with `images/{test,val,train}`, or one that itself holds `database/` and
@@ -74,7 +74,7 @@ def read_utm(
     nordland = _nordland(places, asked)
     if nordland is not None:
         metres, there, here = nordland
-        # Whole frames, because the names' cut decimals would blur the radius.
+        # Count in whole frames: the names' truncated decimals would make the radius inexact.
         frames = int(radius / metres + 1e-9)
         words = f"{frames} frame{'s' * (frames != 1)}"
         return Benchmark(
@@ -114,22 +114,22 @@ def read_utm(
 
 
 def has_utm_names(folder: pathlib.Path, queries: str = QUERIES) -> bool:
-    """Whether any image of the database or the queries has a name that begins with @."""
+    """Return whether any image of the database or the queries has a name that begins with @."""
     paths = list_part(find_database(folder)) + _list_queries(folder, queries)
     return any(path.name.startswith("@") for path in paths)
 
 
 def _list_queries(folder: pathlib.Path, queries: str) -> tuple[pathlib.Path, ...]:
-    """The images of one of the folders of queries."""
+    """List the images of one of the queries' folders."""
     there = [path.name for path in folder.glob(f"{QUERIES}*") if path.is_dir()]
     if queries not in there:
-        found = shown(f"{name}/" for name in there) if there else listing(folder)
-        raise InputError(f"{folder}: found {found}, expected a folder {queries}")
+        others = shown(f"{name}/" for name in there) if there else listing(folder)
+        raise InputError(f"{folder}: found {others}, expected a folder {queries}")
     return list_part(folder / queries)
 
 
 def _coordinates(paths: tuple[pathlib.Path, ...]) -> Float64[np.ndarray, "images 2"]:
-    """East and north in metres."""
+    """Read each image's east and north in metres from its name."""
     coordinates = np.empty((len(paths), 2))
     for row, path in zip(coordinates, paths, strict=True):
         position = utm_position(path.name)
@@ -144,11 +144,11 @@ def _coordinates(paths: tuple[pathlib.Path, ...]) -> Float64[np.ndarray, "images
 def _nordland(
     database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"]
 ) -> tuple[float, Float64[np.ndarray, "images 2"], Float64[np.ndarray, "q 2"]] | None:
-    """One of `_NORDLANDS`, and (0, frame) for every image; None where it is none of them."""
+    """Return the Nordland spacing and (0, frame) for every image; None for other sets."""
     for metres in _NORDLANDS:
         sides = [np.round(side / metres) for side in (database, queries)]
         off = [np.abs(f * metres - c) for f, c in zip(sides, (database, queries), strict=True)]
-        # The last digits of the product are no more than 1e-9 m wrong.
+        # The product's rounding error is at most 1e-9 m.
         if max(side.max() for side in off) > _NAME_METRES + 1e-6:
             continue
         line = np.stack([np.zeros(len(database)), np.arange(len(database))], axis=1)
@@ -161,14 +161,14 @@ def _nordland(
 def _are_placeholders(
     database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"]
 ) -> bool:
-    """Whether northings are whole kilometres at easting 0, one database image each."""
+    """Return whether all eastings are 0 and northings whole kilometres, unique in the database."""
     both = np.concatenate([database, queries])
     whole = not both[:, 0].any() and not (both[:, 1] % _PLACE_METRES).any()
     return whole and len(np.unique(database[:, 1])) == len(database) > 1
 
 
 def _msls_cities(paths: tuple[pathlib.Path, ...]) -> frozenset[str] | None:
-    """The cities in the notes, where all names have MSLS's."""
+    """Return the cities in the names' notes; None unless all notes are those of MSLS."""
     cities = set()
     for path in paths:
         fields = path.name.split("@")

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.disk import list_part
-from crisalad_jax.data.benchmarks.pickled import read_npy
-from crisalad_jax.data.benchmarks.positives import indices, is_nordland_star, matches
-from crisalad_jax.errors import InputError
+from crisalad_jax.data.benchmarks.folders_on_disk import list_part
+from crisalad_jax.data.benchmarks.ground_truth import indices, is_nordland_star, matches
+from crisalad_jax.data.benchmarks.safe_npy import read_npy
+from crisalad_jax.utils.errors import InputError
 
 TRUTH = "ground_truth_new.npy"
 
@@ -39,13 +39,13 @@ def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
 
 
 def _numbered(paths: tuple[pathlib.Path, ...]) -> tuple[pathlib.Path, ...]:
-    """Sort by number where all names are numbers: 10.jpg follows 9.jpg, not 1.jpg."""
+    """Sort paths by number where all names are numbers: 10.jpg follows 9.jpg, not 1.jpg."""
     if not all(path.stem.isdecimal() for path in paths):
         return paths
     paths = tuple(sorted(paths, key=lambda path: int(path.stem)))
     first = int(paths[0].stem)
     for position, path in enumerate(paths):
-        # A gap would shift every later position against the ground truth, unnoticed.
+        # A gap would silently shift every later position against the ground truth.
         if int(path.stem) != first + position:
             raise InputError(
                 f"{path}: found after number {first + position - 1}, expected number "
@@ -65,7 +65,7 @@ def _match(
     for number, (query, references) in enumerate(rows):
         try:
             index = indices(query)
-            found = matches(references, database)
+            matching = matches(references, database)
         except (InputError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: row {number}: {error}") from error
         if index.size != 1 or not 0 <= index[0] < queries or int(index[0]) in positives:
@@ -73,5 +73,5 @@ def _match(
                 f"{path}: row {number}: found query {index[:3].tolist()}, expected one from 0 to "
                 f"{queries - 1} that no other row has"
             )
-        positives[int(index[0])] = found
+        positives[int(index[0])] = matching
     return tuple(positives[query] for query in range(queries))

@@ -1,90 +1,127 @@
-"""AnyLoc: hard VLAD of features that nobody trained for places (Keetha et al., RA-L 2023)."""
+"""AnyLoc: hard VLAD of features that are not trained for places (Keetha et al., RA-L 2023)."""
 
-import zlib
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import ModelConfig
-from crisalad_jax.errors import InputError
+from crisalad_jax.config.checks import require, require_choice, require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.netvlad import residual_sums
-from crisalad_jax.nn.layers import Keys, l2_normalise, widen
-from crisalad_jax.nn.tokens import Tokens, local_alone
-from crisalad_jax.nn.vit import Features, ViT
-from crisalad_jax.pytree import named_leaves, params
-
-_MARKS = 2**24
-"""Below it whole numbers are float32."""
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import named_leaves, pytree_dataclass, static_field
 
 
-@params
+@pytree_dataclass
 class AnyLoc:
-    """The words, and whose they are."""
+    """The visual words, and the backbone that they belong to."""
 
     words: Float[Array, "cluster dim"]
     """k-means centroids of unit features."""
-    backbone: Float[Array, ""]
-    """The `mark` of the backbone that they are features of; 0 where none were built."""
+    backbone: str | None = static_field(default=None)
+    """Digest of the words' backbone; None before a vocabulary is built."""
 
 
-def init(key: PRNGKeyArray, config: ModelConfig) -> AnyLoc:
-    """Unit vectors at random in the place of words, until `crisalad_jax.vocabulary` builds some."""
-    shape = (config.anyloc.clusters, config.backbone.dim)
-    return AnyLoc(l2_normalise(jax.random.normal(key, shape)), jnp.zeros(()))
+@AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
+@dataclasses.dataclass(frozen=True)
+class AnyLocConfig(Aggregator):
+    """AnyLoc: hard VLAD of a facet of one layer, nothing learnt (Keetha et al., RA-L 2023)."""
 
+    learns: ClassVar[bool] = False
+    clusters: int = 32
+    """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
+    layer: int = -9
+    """Block of the facet, from 0, or from the end where negative: -9 is block 31 of ViT-g's 40,
+    AnyLoc's choice."""
+    facet: Literal["query", "key", "value", "token"] = "value"
+    """Facet of the block: queries, keys or values of its attention, or its output tokens."""
 
-def from_words(words: Float[Array, "cluster dim"], backbone: ViT) -> AnyLoc:
-    """A vocabulary that knows its backbone."""
-    return AnyLoc(words, jnp.float32(mark(backbone)))
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "clusters")
+        require_choice(self, "facet")
 
+    def block(self, depth: int) -> int:
+        """Return the number of the facet's block among `depth` blocks, from 0.
 
-def mark(backbone: ViT) -> int:
-    """A checksum of all of a backbone's parameters that float32 holds exactly; never 0."""
-    value = 0
-    for name, leaf in named_leaves(backbone).items():
-        value = zlib.crc32(np.ascontiguousarray(leaf).data, zlib.crc32(name.encode(), value))
-    return 1 + value % (_MARKS - 1)
+        Raises:
+            InputError: there is no such block.
+        """
+        require(
+            -depth <= self.layer < depth,
+            f"AnyLocConfig.layer: found {self.layer}, expected {-depth} to {depth - 1} for a "
+            f"backbone of {depth} blocks",
+        )
+        return self.layer % depth
 
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the facet, without the last layer norm."""
+        return FeatureRequest((self.block(depth) + 1,), self.facet, norm=False)
 
-def check_vocabulary(params: AnyLoc, backbone: ViT, source: str) -> None:
-    """Check that a vocabulary, where one was built, is of this backbone's features.
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one sum of residuals for each word."""
+        return TokenShape(0, self.clusters, dim)
 
-    Raises:
-        InputError: it is of another's; the message begins with `source`.
-    """
-    built = float(params.backbone)
-    if built and built != mark(backbone):
-        raise InputError(
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> AnyLoc:
+        """Draw random unit vectors as words, until a vocabulary is built."""
+        return AnyLoc(l2_normalise(jax.random.normal(key, (self.clusters, backbone.dim))))
+
+    def from_centroids(
+        self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
+    ) -> AnyLoc:
+        """Use the centroids as words."""
+        return AnyLoc(centroids)
+
+    def bind(self, params: AnyLoc, backbone: Any) -> AnyLoc:
+        """Return the vocabulary with its backbone's digest."""
+        return AnyLoc(params.words, _digest(backbone))
+
+    def check_backbone(self, params: AnyLoc, backbone: Any, source: str) -> None:
+        """Raise InputError where a vocabulary, if one was built, is of another backbone."""
+        require(
+            params.backbone is None or params.backbone == _digest(backbone),
             f"{source}: found a vocabulary of another backbone, expected one of these weights' "
-            "(`crisalad vocabulary` builds it)"
+            "(`crisalad vocabulary` builds it)",
         )
 
+    def metadata(self, params: AnyLoc) -> dict[str, str]:
+        """Return the backbone's digest, where a vocabulary was built."""
+        return {} if params.backbone is None else {"backbone": params.backbone}
 
-def apply(
-    params: AnyLoc,
-    features: Features,
-    grid: tuple[int, int],
-    config: ModelConfig,
-    *,
-    key: Keys | None,
-) -> Tokens:
-    """A sum of residuals for each word, of length 1, or 0 where no patch is near; nothing global.
+    def with_metadata(self, params: AnyLoc, metadata: Mapping[str, str]) -> AnyLoc:
+        """Return the words with the backbone's digest."""
+        return AnyLoc(params.words, metadata.get("backbone"))
 
-    The features are those of `config.anyloc.facet`.
-    """
-    return local_alone(hard_vlad(params.words, features.patches))
+    def apply(
+        self, params: AnyLoc, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return a sum of residuals for each word, of length 1, or 0 where no patch is near."""
+        return Tokens.of_local(hard_vlad(params.words, features.patches))
+
+
+def _digest(backbone: Any) -> str:
+    digest = hashlib.sha256()
+    for name, leaf in named_leaves(backbone).items():
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(leaf).data)
+    return digest.hexdigest()
 
 
 def hard_vlad(
     words: Float[Array, "cluster dim"], patches: Float[Array, "*batch patch dim"]
 ) -> Float[Array, "*batch cluster dim"]:
-    """VLAD (Jegou et al. 2010) of unit patches, each of the nearest word, intra-normalised.
+    """Compute VLAD (Jegou et al. 2010) of unit patches, each at its nearest word, intra-normalised.
 
-    In float32 at least, and as exact as the hardware is: rounding would change words.
+    It computes in float32 at least, at the highest precision: rounding would change words.
     """
-    patches = l2_normalise(widen(patches))
+    patches = l2_normalise(at_least_float32(patches))
     products = jnp.matmul(patches, words.T, precision="highest")
     # |p - w|^2 = 1 - 2 p w + |w|^2.
     nearest = jnp.argmax(products - 0.5 * jnp.square(words).sum(axis=-1), axis=-1)

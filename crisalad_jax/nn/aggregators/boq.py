@@ -4,39 +4,43 @@ Layers and attentions are torch's: `nn.TransformerEncoderLayer` (post-norm, ReLU
 four times the width) and `nn.MultiheadAttention`.
 """
 
+import dataclasses
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import ModelConfig
+from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.attention import (
     Attention,
     attention,
     cross_attention,
     init_torch_attention,
 )
+from crisalad_jax.nn.backbones.base import Backbone, Features
 from crisalad_jax.nn.cross_image import NORM_EPSILON, EncoderLayer, init_encoder_layer
 from crisalad_jax.nn.layers import (
     Conv,
     Keys,
     LayerNorm,
     Linear,
+    at_least_float32,
     conv,
     init_conv,
     init_layer_norm,
     init_linear,
     layer_norm,
     linear,
-    widen,
 )
-from crisalad_jax.nn.tokens import Tokens, local_alone
-from crisalad_jax.nn.vit import Features
-from crisalad_jax.pytree import params
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 
-@params
+@pytree_dataclass
 class BoqBlock:
-    """An encoder layer over the patches, and queries that look at each other, then at them."""
+    """An encoder layer over the patches, and queries that attend to each other, then to patches."""
 
     encoder: EncoderLayer
     queries: Float[Array, "query channel"]
@@ -46,9 +50,9 @@ class BoqBlock:
     norm_out: LayerNorm
 
 
-@params
+@pytree_dataclass
 class Boq:
-    """Fewer channels, the blocks in order, then what makes rows of all their answers."""
+    """The channel reduction, the blocks in order, and the linear layer from answers to rows."""
 
     proj_c: Conv
     norm_input: LayerNorm
@@ -56,16 +60,69 @@ class Boq:
     fc: Linear
 
 
-def init(key: PRNGKeyArray, config: ModelConfig) -> Boq:
-    """Start as the public implementation: queries normal of deviation 1, the rest as torch's."""
-    boq, (conv_key, blocks_key, rows_key) = config.boq, jax.random.split(key, 3)
-    keys = jax.random.split(blocks_key, boq.layers)
-    return Boq(
-        proj_c=init_conv(conv_key, 3, config.backbone.dim, boq.channels),
-        norm_input=init_layer_norm(boq.channels),
-        boqs=tuple(_init_block(one, boq.channels, boq.queries) for one in keys),
-        fc=init_linear(rows_key, boq.layers * boq.queries, boq.rows),
-    )
+@AGGREGATORS.register("boq", tiny={"channels": 64, "queries": 16, "rows": 8})
+@dataclasses.dataclass(frozen=True)
+class BoqConfig(Aggregator):
+    """Bag of queries (Ali-bey et al., CVPR 2024)."""
+
+    width_field: ClassVar[str] = "channels"
+    channels: int = 384
+    """Number of channels after the 3 x 3 convolution."""
+    queries: int = 64
+    """Number of learnt queries of a block."""
+    layers: int = 2
+    """Number of blocks, each an encoder layer and its queries."""
+    rows: int = 32
+    """Number of rows that a linear layer makes of all blocks' answers."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "channels", "queries", "layers", "rows")
+        require(
+            self.channels % self.heads == 0,
+            f"BoqConfig.channels: found {self.channels}, expected a multiple of its heads, "
+            f"{self.heads}: one for every 64 channels",
+        )
+
+    @property
+    def heads(self) -> int:
+        """Number of heads of every attention, as the public code has them."""
+        return max(1, self.channels // 64)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one token for each row."""
+        return TokenShape(0, self.rows, self.channels)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Boq:
+        """Draw parameters as the public code: standard normal queries, the rest as torch's."""
+        conv_key, blocks_key, rows_key = jax.random.split(key, 3)
+        keys = jax.random.split(blocks_key, self.layers)
+        return Boq(
+            proj_c=init_conv(conv_key, 3, backbone.dim, self.channels),
+            norm_input=init_layer_norm(self.channels),
+            boqs=tuple(_init_block(block_key, self.channels, self.queries) for block_key in keys),
+            fc=init_linear(rows_key, self.layers * self.queries, self.rows),
+        )
+
+    def apply(
+        self, params: Boq, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return a token of `channels` numbers for each row."""
+        patches = features.patches
+        maps = patches.reshape(-1, *grid, patches.shape[-1])
+        maps = jax.vmap(lambda image: conv(params.proj_c, image))(maps)
+        x = maps.reshape(*patches.shape[:-1], maps.shape[-1])
+        x = layer_norm(params.norm_input, x, epsilon=NORM_EPSILON)
+        answers = []
+        for block in params.boqs:
+            x = encoder_layer(block.encoder, x, self.heads)
+            answers.append(ask(block, x, self.heads))
+        rows = linear(params.fc, jnp.concatenate(answers, axis=-2).swapaxes(-2, -1))
+        return Tokens.of_local(at_least_float32(rows).swapaxes(-2, -1))
+
+    def order(self, local: Float[Array, "token dim"]) -> Array:
+        """Return all rows' first channel, then all their second."""
+        return local.T
 
 
 def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
@@ -80,32 +137,10 @@ def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
     )
 
 
-def apply(
-    params: Boq,
-    features: Features,
-    grid: tuple[int, int],
-    config: ModelConfig,
-    *,
-    key: Keys | None,
-) -> Tokens:
-    """A token of `channels` numbers for each row."""
-    patches = features.patches
-    maps = patches.reshape(-1, *grid, patches.shape[-1])
-    maps = jax.vmap(lambda one: conv(params.proj_c, one))(maps)
-    x = maps.reshape(*patches.shape[:-1], maps.shape[-1])
-    x = layer_norm(params.norm_input, x, epsilon=NORM_EPSILON)
-    answers = []
-    for block in params.boqs:
-        x = encoder_layer(block.encoder, x, config.boq.heads)
-        answers.append(ask(block, x, config.boq.heads))
-    rows = linear(params.fc, jnp.concatenate(answers, axis=-2).swapaxes(-2, -1))
-    return local_alone(widen(rows).swapaxes(-2, -1))
-
-
 def encoder_layer(
     params: EncoderLayer, x: Float[Array, "*batch patch channel"], heads: int
 ) -> Float[Array, "*batch patch channel"]:
-    """Patches look at each other; a feed-forward network with ReLU; a layer norm after each."""
+    """Apply self-attention of the patches and a ReLU network, with a layer norm after each."""
     attended = attention(params.attn, x, heads, key=None)
     x = layer_norm(params.norm1, x + attended, epsilon=NORM_EPSILON)
     update = linear(params.linear2, jax.nn.relu(linear(params.linear1, x)))
@@ -115,12 +150,12 @@ def encoder_layer(
 def ask(
     params: BoqBlock, x: Float[Array, "*batch patch channel"], heads: int
 ) -> Float[Array, "*batch query channel"]:
-    """What the queries find in the patches, normalised.
+    """Attend from the queries to the patches, and normalise the answers.
 
-    Their look at each other owes nothing to the image: it is made once for a whole batch.
+    The queries' self-attention does not depend on the image: it runs once for a whole batch.
     """
     queries = params.queries.astype(x.dtype)
     queries = queries + attention(params.self_attn, queries, heads, key=None)
     queries = layer_norm(params.norm_q, queries, epsilon=NORM_EPSILON)
-    found = cross_attention(params.cross_attn, queries, x, heads)
-    return layer_norm(params.norm_out, found, epsilon=NORM_EPSILON)
+    answers = cross_attention(params.cross_attn, queries, x, heads)
+    return layer_norm(params.norm_out, answers, epsilon=NORM_EPSILON)

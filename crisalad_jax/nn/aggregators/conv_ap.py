@@ -1,48 +1,75 @@
 """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
+import dataclasses
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import ModelConfig
-from crisalad_jax.nn.layers import Keys, Linear, init_linear, linear, widen
-from crisalad_jax.nn.tokens import Tokens, local_alone
-from crisalad_jax.nn.vit import Features
-from crisalad_jax.pytree import params
+from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape, require_side
+from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, linear
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 
-@params
+@pytree_dataclass
 class ConvAp:
     """The 1 x 1 convolution: a linear layer at every patch."""
 
     channel_pool: Linear
 
 
-def init(key: PRNGKeyArray, config: ModelConfig) -> ConvAp:
-    """Start as torch's convolutions do."""
-    return ConvAp(init_linear(key, config.backbone.dim, config.conv_ap.channels))
+@AGGREGATORS.register("conv-ap", tiny={"channels": 128})
+@dataclasses.dataclass(frozen=True)
+class ConvApConfig(Aggregator):
+    """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
+    width_field: ClassVar[str] = "channels"
+    channels: int = 1024
+    """Channels of the 1 x 1 convolution."""
+    side: int = 2
+    """Number of regions along each side; means are taken over side x side regions."""
 
-def apply(
-    params: ConvAp,
-    features: Features,
-    grid: tuple[int, int],
-    config: ModelConfig,
-    *,
-    key: Keys | None,
-) -> Tokens:
-    """A token for each of side x side regions, row by row.
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "channels", "side")
 
-    Published as convolution, then means. Both are linear and the weights of a mean add up to 1, so
-    the order is free; means first leave the convolution fewer products by patches over regions.
-    """
-    means = adaptive_means(widen(features.patches), grid, config.conv_ap.side)
-    return local_alone(widen(linear(params.channel_pool, means.astype(features.patches.dtype))))
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one mean for each region."""
+        return TokenShape(0, self.side**2, self.channels)
+
+    def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
+        """Require a patch in every region."""
+        require_side(self.part_name, grid, self.side, patch_size)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> ConvAp:
+        """Draw parameters as torch's convolutions do."""
+        return ConvAp(init_linear(key, backbone.dim, self.channels))
+
+    def apply(
+        self, params: ConvAp, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return a token for each of side x side regions, row by row.
+
+        The published order is convolution, then means. Both are linear and the weights of a mean
+        add up to 1, so the order is free. Means first make the convolution cheaper, by the ratio
+        of patches to regions.
+        """
+        means = adaptive_means(at_least_float32(features.patches), grid, self.side)
+        tokens = linear(params.channel_pool, means.astype(features.patches.dtype))
+        return Tokens.of_local(at_least_float32(tokens))
+
+    def order(self, local: Float[Array, "token dim"]) -> Array:
+        """Return all regions' first channel, then all their second."""
+        return local.T
 
 
 def adaptive_means(
     patches: Float[Array, "*batch patch dim"], grid: tuple[int, int], side: int
 ) -> Float[Array, "*batch region dim"]:
-    """Means over side x side regions of the patches, as torch's `AdaptiveAvgPool2d` cuts them.
+    """Average the patches over side x side regions, as torch's `AdaptiveAvgPool2d` cuts them.
 
     Region i of a side of n patches goes from floor(i n / side) to ceil((i + 1) n / side): where
     `side` does not divide n, neighbours share a row or column.

@@ -1,50 +1,61 @@
 """CricaVPR's pyramid of generalised means (Lu et al., CVPR 2024)."""
 
+import dataclasses
 import itertools
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import PYRAMID_LEVELS, ModelConfig
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape, require_side
 from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
-from crisalad_jax.nn.layers import Keys, widen
+from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.layers import Keys, at_least_float32
 from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.nn.vit import Features
-from crisalad_jax.pytree import params
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+PYRAMID_LEVELS = (2, 3)
+"""Cuts of a side, as CricaVPR's: 4 and 9 regions."""
 
 
-@params
+@pytree_dataclass
 class GemPyramid:
     """The exponent of the generalised means, one for all regions (CricaVPR, CVPR 2024)."""
 
     p: Float[Array, ""]
 
 
-def init(key: PRNGKeyArray, config: ModelConfig) -> GemPyramid:
-    """Start as the public implementation, at an exponent of 3."""
-    return GemPyramid(jnp.full((), START))
+@AGGREGATORS.register("gem-pyramid")
+@dataclasses.dataclass(frozen=True)
+class GemPyramidConfig(Aggregator):
+    """CricaVPR's class token and generalised means over 13 regions (Lu et al., CVPR 2024)."""
 
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of tokens as wide as the backbone."""
+        return TokenShape(dim, sum(level**2 for level in PYRAMID_LEVELS), dim)
 
-def apply(
-    params: GemPyramid,
-    features: Features,
-    grid: tuple[int, int],
-    config: ModelConfig,
-    *,
-    key: Keys | None,
-) -> Tokens:
-    """The class token, and a generalised mean for each region."""
-    means = gem_pyramid(params, widen(features.patches), grid)
-    return Tokens(widen(features.class_token), means)
+    def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
+        """Require a patch in every region."""
+        require_side(self.part_name, grid, max(PYRAMID_LEVELS), patch_size)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> GemPyramid:
+        """Start at an exponent of 3, as the public implementation does."""
+        return GemPyramid(jnp.full((), START))
+
+    def apply(
+        self, params: GemPyramid, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return the class token, and a generalised mean for each region."""
+        means = gem_pyramid(params, at_least_float32(features.patches), grid)
+        return Tokens(at_least_float32(features.class_token), means)
 
 
 def gem_pyramid(
     params: GemPyramid, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
 ) -> Float[Array, "*batch region dim"]:
-    """Generalised means (Radenovic et al. 2018) of unit patches over 2 x 2 and 3 x 3 regions.
+    """Compute generalised means (Radenovic et al. 2018) of unit patches in 2 x 2 and 3 x 3 regions.
 
-    Regions come level by level in row order. A side of n patches is cut at round(i n / level):
-    CricaVPR's 8, and 5 and 11, for the 16 x 16 grid that it was published for and fixed to.
+    Regions come level by level in row order. A side of n patches is cut at round(i n / level). For
+    CricaVPR's fixed 16 x 16 grid that gives its published cuts at 8, and at 5 and 11.
     """
     cells = log_units(patches)
     cells = cells.reshape(*cells.shape[:-2], *grid, cells.shape[-1])

@@ -1,61 +1,105 @@
 """MixVPR: networks that mix all positions of a feature map (Ali-bey et al., WACV 2023).
 
-The parameters belong to the patches of one grid: a model describes images of one size.
+The parameters fit one grid of patches, so a model describes images of one size only.
 """
+
+import dataclasses
+import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import ModelConfig
+from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.backbones.base import Backbone, Features
 from crisalad_jax.nn.layers import (
     Keys,
     LayerNorm,
     Linear,
+    at_least_float32,
     init_layer_norm,
     init_linear,
     layer_norm,
     linear,
-    widen,
 )
-from crisalad_jax.nn.tokens import Tokens, local_alone
-from crisalad_jax.nn.vit import Features
-from crisalad_jax.pytree import params
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 NORM_EPSILON = 1e-5
 
 
-@params
+@pytree_dataclass
 class FeatureMixer:
-    """Layer norm and a network of one hidden layer, over the patches of a channel."""
+    """A layer norm and a network of one hidden layer, along the patches of each channel."""
 
     norm: LayerNorm
     fc1: Linear
     fc2: Linear
 
 
-@params
+@pytree_dataclass
 class MixVpr:
-    """Mixers in order, then what makes fewer channels and fewer rows."""
+    """The mixers in order, then the projections to fewer channels and fewer rows."""
 
     mix: tuple[FeatureMixer, ...]
     channel_proj: Linear
     row_proj: Linear
 
 
-def init(key: PRNGKeyArray, config: ModelConfig) -> MixVpr:
-    """Start as the public implementation.
+@AGGREGATORS.register("mixvpr", tiny={"channels": 128})
+@dataclasses.dataclass(frozen=True)
+class MixVprConfig(Aggregator):
+    """MixVPR (Ali-bey et al., WACV 2023)."""
 
-    Mixers have zero biases and normal weights of deviation 0.02 (said to be truncated, at a hundred
-    deviations); the projections start as torch's linear layers do.
-    """
-    mixers, channels, rows = jax.random.split(key, 3)
-    mixvpr, patches = config.mixvpr, config.patches
-    return MixVpr(
-        mix=tuple(_init_mixer(one, patches) for one in jax.random.split(mixers, mixvpr.depth)),
-        channel_proj=init_linear(channels, config.backbone.dim, mixvpr.channels),
-        row_proj=init_linear(rows, patches, mixvpr.rows),
-    )
+    fixed_grid: ClassVar[bool] = True
+    width_field: ClassVar[str] = "channels"
+    channels: int = 1024
+    """Number of channels after the projection."""
+    rows: int = 4
+    """Number of values of each channel after the projection."""
+    depth: int = 4
+    """Number of feature mixers, as wide inside as there are patches."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "channels", "rows", "depth")
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one token for each row."""
+        return TokenShape(0, self.rows, self.channels)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> MixVpr:
+        """Draw parameters as the public implementation does.
+
+        Mixers have zero biases and normal weights of deviation 0.02. (The public code truncates
+        them at 100 deviations, which has no effect.) Projections start as torch's linears.
+        """
+        mixers, channels, rows = jax.random.split(key, 3)
+        patches = math.prod(grid)
+        return MixVpr(
+            mix=tuple(
+                _init_mixer(mixer_key, patches)
+                for mixer_key in jax.random.split(mixers, self.depth)
+            ),
+            channel_proj=init_linear(channels, backbone.dim, self.channels),
+            row_proj=init_linear(rows, patches, self.rows),
+        )
+
+    def apply(
+        self, params: MixVpr, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return a token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
+        maps = features.patches.swapaxes(-2, -1)
+        for mixer in params.mix:
+            maps = feature_mixer(mixer, maps)
+        channels = linear(params.channel_proj, maps.swapaxes(-2, -1)).swapaxes(-2, -1)
+        return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
+
+    def order(self, local: Float[Array, "token dim"]) -> Array:
+        """Return all rows' first channel, then all their second."""
+        return local.T
 
 
 def _init_mixer(key: PRNGKeyArray, patches: int) -> FeatureMixer:
@@ -64,25 +108,9 @@ def _init_mixer(key: PRNGKeyArray, patches: int) -> FeatureMixer:
     return FeatureMixer(init_layer_norm(patches), first, second)
 
 
-def apply(
-    params: MixVpr,
-    features: Features,
-    grid: tuple[int, int],
-    config: ModelConfig,
-    *,
-    key: Keys | None,
-) -> Tokens:
-    """A token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
-    maps = features.patches.swapaxes(-2, -1)
-    for mixer in params.mix:
-        maps = feature_mixer(mixer, maps)
-    channels = linear(params.channel_proj, maps.swapaxes(-2, -1)).swapaxes(-2, -1)
-    return local_alone(widen(linear(params.row_proj, channels)).swapaxes(-2, -1))
-
-
 def feature_mixer(
     params: FeatureMixer, maps: Float[Array, "*batch channel patch"]
 ) -> Float[Array, "*batch channel patch"]:
-    """x + W2 relu(W1 norm(x)) along the patches of each channel, in the type of `maps` (Eq. 2)."""
+    """Compute x + W2 relu(W1 norm(x)) along each channel's patches, in `maps`' type (Eq. 2)."""
     hidden = linear(params.fc1, layer_norm(params.norm, maps, epsilon=NORM_EPSILON))
     return maps + linear(params.fc2, jax.nn.relu(hidden))

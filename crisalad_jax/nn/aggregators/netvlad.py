@@ -1,52 +1,85 @@
 """NetVLAD: sums of residuals under a soft assignment (Arandjelovic et al., CVPR 2016)."""
 
+import dataclasses
 import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import ModelConfig
-from crisalad_jax.errors import InputError
-from crisalad_jax.nn.layers import Keys, Linear, init_linear, l2_normalise, widen
-from crisalad_jax.nn.tokens import Tokens, local_alone
-from crisalad_jax.nn.vit import Features
-from crisalad_jax.pytree import params
+from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 RATIO = 100
-"""Of a patch's largest share to its second largest, at the start (the public implementations')."""
+"""Initial ratio of a patch's largest share to its second largest, as in public implementations."""
 
 
-@params
+@pytree_dataclass
 class NetVlad:
-    """The paper's decoupled parameters: how patches are shared out, and where they are seen from.
+    """The paper's decoupled parameters: the soft assignment of patches, and the centroids.
 
-    The linear layer has no bias: the authors' code starts from the centroids' directions, which are
-    all of one length, and so the paper's bias, -alpha |c|^2, is one for all clusters.
+    The linear layer has no bias. The authors' code starts from unit centroids, so the paper's bias,
+    -alpha |c|^2, is the same for all clusters and cancels in the softmax.
     """
 
     conv: Linear
-    """Scores of a patch, one a cluster."""
+    """Linear layer from a patch to one score for each cluster."""
     centroids: Float[Array, "cluster dim"]
 
 
-def init(key: PRNGKeyArray, config: ModelConfig) -> NetVlad:
-    """Start at random: centroids are unit vectors. `crisalad_jax.vocabulary` starts from images."""
-    conv_key, centroid_key = jax.random.split(key)
-    dim, clusters = config.backbone.dim, config.netvlad.clusters
-    return NetVlad(
-        conv=init_linear(conv_key, dim, clusters, bias=False),
-        centroids=l2_normalise(jax.random.normal(centroid_key, (clusters, dim))),
-    )
+@AGGREGATORS.register("netvlad", tiny={"clusters": 16})
+@dataclasses.dataclass(frozen=True)
+class NetVladConfig(Aggregator):
+    """NetVLAD (Arandjelovic et al., CVPR 2016)."""
+
+    clusters: int = 64
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "clusters")
+        require(
+            self.clusters > 1,
+            f"NetVladConfig.clusters: found {self.clusters}, expected at least 2 to choose from",
+        )
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one sum of residuals for each cluster."""
+        return TokenShape(0, self.clusters, dim)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> NetVlad:
+        """Draw unit vectors as centroids. `training.vocabulary` makes centroids from images."""
+        conv_key, centroid_key = jax.random.split(key)
+        dim = backbone.dim
+        return NetVlad(
+            conv=init_linear(conv_key, dim, self.clusters, bias=False),
+            centroids=l2_normalise(jax.random.normal(centroid_key, (self.clusters, dim))),
+        )
+
+    def from_centroids(
+        self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
+    ) -> NetVlad:
+        """Make parameters as the authors do; see the function `from_centroids`."""
+        return from_centroids(centroids, features)
+
+    def apply(
+        self, params: NetVlad, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return a sum of residuals for each cluster, of length 1; no global token."""
+        return Tokens.of_local(netvlad(params, features.patches))
 
 
 def from_centroids(
     centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
 ) -> NetVlad:
-    """Start as the authors do: scores are alpha times the cosines to the k-means centroids.
+    """Make parameters as the authors do: scores are alpha times cosines to the k-means centroids.
 
-    alpha is such that of these features the largest share is `RATIO` times the second largest, in
-    the mean of the logarithms.
+    alpha is chosen so that a feature's largest share is `RATIO` times its second largest, in the
+    geometric mean over these features.
 
     Args:
         centroids: of the features, two or more.
@@ -59,7 +92,7 @@ def from_centroids(
     cosines = jnp.matmul(features, directions.T, precision="highest")
     best = jax.lax.top_k(cosines, 2)[0]
     gap = float((best[:, 0] - best[:, 1]).mean())
-    # Below this the two are the same but for rounding.
+    # Below this the two differ by rounding alone.
     if not gap > 1e-6:
         raise InputError(
             f"features: found {len(features)} that are as near to two of {len(centroids)} "
@@ -68,34 +101,22 @@ def from_centroids(
     return NetVlad(Linear(math.log(RATIO) / gap * directions.T, None), centroids)
 
 
-def apply(
-    params: NetVlad,
-    features: Features,
-    grid: tuple[int, int],
-    config: ModelConfig,
-    *,
-    key: Keys | None,
-) -> Tokens:
-    """A sum of residuals for each cluster, of length 1; no global token."""
-    return local_alone(netvlad(params, features.patches))
-
-
 def netvlad(
     params: NetVlad, patches: Float[Array, "*batch patch dim"]
 ) -> Float[Array, "*batch cluster dim"]:
-    """The paper's Eq. 4 on unit patches, then intra-normalisation (Arandjelovic, Zisserman 2013).
+    """Aggregate unit patches by Eq. 4, then intra-normalise (Arandjelovic, Zisserman 2013).
 
-    All in float32 at least, and as exact as the hardware is: what rounds scores is multiplied by
-    alpha.
+    It computes in float32 at least, at the highest precision, because alpha multiplies the scores'
+    rounding error.
     """
-    patches = l2_normalise(widen(patches))
+    patches = l2_normalise(at_least_float32(patches))
     return l2_normalise(residual_sums(shares(params, patches), patches, params.centroids))
 
 
 def shares(
     params: NetVlad, patches: Float[Array, "*batch patch dim"]
 ) -> Float[Array, "*batch patch cluster"]:
-    """How each of unit patches is shared out: a softmax over the clusters (the paper's Eq. 3)."""
+    """Assign unit patches softly: compute a softmax over the clusters (the paper's Eq. 3)."""
     scores = jnp.matmul(patches, params.conv.weight, precision="highest")
     return jax.nn.softmax(scores, axis=-1)
 
@@ -105,9 +126,9 @@ def residual_sums(
     patches: Float[Array, "*batch patch dim"],
     centroids: Float[Array, "cluster dim"],
 ) -> Float[Array, "*batch cluster dim"]:
-    """For each cluster the sum of all patches' residuals from it, each times its share.
+    """Sum, for each cluster, all patches' residuals from it, weighted by their shares.
 
-    That is the sum of the patches, less the centroid times the sum of the shares.
+    This is the weighted sum of the patches minus the centroid times the sum of the shares.
     """
     sums = jnp.einsum("...pk,...pd->...kd", shares, patches, precision="highest")
     return sums - shares.sum(axis=-2)[..., None] * centroids

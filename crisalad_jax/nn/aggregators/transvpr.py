@@ -1,79 +1,106 @@
 """TransVPR's multi-level attention (Wang et al., CVPR 2022, section 3.2), on any of our backbones.
 
-Features hold the patches of all levels side by side (`nn.vit.vit_levels`).
+Features hold the patches of all levels side by side (`FeatureRequest.levels`).
 """
+
+import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config import ModelConfig
-from crisalad_jax.nn.layers import Keys, Linear, init_linear, l2_normalise, linear, widen
-from crisalad_jax.nn.tokens import Tokens, global_alone
-from crisalad_jax.nn.vit import Features
-from crisalad_jax.pytree import params
+from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 KEY_THRESHOLD = 0.02
-"""A patch is a key patch above this fused attention, from 0 to 1: the public code's."""
+"""Fused attention, from 0 to 1, above which the public code has key patches."""
 
 
-@params
+@pytree_dataclass
 class TransVpr:
-    """Scores of a patch for every level, and the descriptor's linear layer."""
+    """The layer of a patch's scores for every level, and the descriptor's linear layer."""
 
     attention: Linear
-    """Without bias: softmax over patches would not see one."""
+    """Score layer without bias, which a softmax over patches would cancel."""
     reduction: Linear
 
 
-def init(key: PRNGKeyArray, config: ModelConfig) -> TransVpr:
-    """Start as torch's `nn.Linear` does."""
-    first, second = jax.random.split(key)
-    levels, dim = config.transvpr.levels, config.transvpr.dim
-    wide = levels * config.backbone.dim
-    return TransVpr(init_linear(first, wide, levels, bias=False), init_linear(second, wide, dim))
+@AGGREGATORS.register("transvpr", tiny={"levels": 2, "dim": 128})
+@dataclasses.dataclass(frozen=True)
+class TransVprConfig(Aggregator):
+    """TransVPR: patches of several layers, weighed by attention (Wang et al., CVPR 2022)."""
 
+    width_field: ClassVar[str] = "dim"
+    levels: int = 3
+    """Number of the backbone's layers that are used, evenly spaced, with the last one."""
+    dim: int = 256
+    """Width of the descriptor."""
 
-def apply(
-    params: TransVpr,
-    features: Features,
-    grid: tuple[int, int],
-    config: ModelConfig,
-    *,
-    key: Keys | None,
-) -> Tokens:
-    """The global descriptor, and no local token."""
-    patches = widen(features.patches)
-    weights = attentions(params, features.patches)
-    by_level = patches.reshape(*patches.shape[:-1], config.transvpr.levels, -1)
-    pooled = jnp.einsum("...nl,...nld->...ld", weights, by_level)
-    pooled = l2_normalise(pooled.reshape(*pooled.shape[:-2], -1))
-    descriptor = l2_normalise(linear(params.reduction, pooled))
-    return global_alone(descriptor)
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "levels", "dim")
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the patches after several numbers of blocks."""
+        require(
+            self.levels <= depth,
+            f"TransVprConfig.levels: found {self.levels}, expected at most {depth}, the backbone's "
+            "blocks",
+        )
+        return FeatureRequest(
+            tuple(depth * (level + 1) // self.levels for level in range(self.levels))
+        )
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of a global token."""
+        return TokenShape(self.dim, 0, self.dim)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> TransVpr:
+        """Draw parameters as torch's `nn.Linear` does."""
+        first, second = jax.random.split(key)
+        wide = self.levels * backbone.dim
+        return TransVpr(
+            init_linear(first, wide, self.levels, bias=False), init_linear(second, wide, self.dim)
+        )
+
+    def apply(
+        self, params: TransVpr, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return the global descriptor, and no local token."""
+        patches = at_least_float32(features.patches)
+        weights = attentions(params, features.patches)
+        by_level = patches.reshape(*patches.shape[:-1], self.levels, -1)
+        pooled = jnp.einsum("...nl,...nld->...ld", weights, by_level)
+        pooled = l2_normalise(pooled.reshape(*pooled.shape[:-2], -1))
+        return Tokens.of_global(l2_normalise(linear(params.reduction, pooled)))
 
 
 def attentions(
     params: TransVpr, patches: Float[Array, "*batch patch wide"]
 ) -> Float[Array, "*batch patch level"]:
-    """A softmax over patches for every level, scored from all levels, in float32 at least."""
-    return jax.nn.softmax(widen(linear(params.attention, patches)), axis=-2)
+    """Compute a softmax over patches for every level, from all levels, in float32 at least."""
+    return jax.nn.softmax(at_least_float32(linear(params.attention, patches)), axis=-2)
 
 
 def key_features(
-    params: TransVpr, patches: Float[Array, "*batch patch wide"], config: ModelConfig
+    params: TransVpr, patches: Float[Array, "*batch patch wide"], levels: int
 ) -> Float[Array, "*batch patch dim"]:
-    """Unit patch tokens of the middle level; those of patches that are no key patches are 0.
+    """Return unit patch tokens of the middle level, and 0 for patches that are no key patches.
 
-    Every level's attention is stretched to 0 to 1, and so is their sum; key patches are those
-    above `KEY_THRESHOLD`. As in the public code nothing is learnt for the tokens alone.
+    Every level's attention is rescaled to 0 to 1, and so is their sum. Key patches are those above
+    `KEY_THRESHOLD`. As in the public code, no layer is learnt for the tokens alone.
     """
     fused = _stretch(_stretch(attentions(params, patches)).sum(axis=-1, keepdims=True))
-    levels = config.transvpr.levels
-    middle = jnp.split(widen(patches), levels, axis=-1)[levels // 2]
+    middle = jnp.split(at_least_float32(patches), levels, axis=-1)[levels // 2]
     return jnp.where(fused > KEY_THRESHOLD, l2_normalise(middle), 0)
 
 
 def _stretch(x: Float[Array, "*batch patch level"]) -> Float[Array, "*batch patch level"]:
-    """The patches' numbers from 0 to 1; all 0 where they are the same."""
+    """Rescale the patches' numbers to 0 to 1, or to 0 where they are all the same."""
     low, high = x.min(axis=-2, keepdims=True), x.max(axis=-2, keepdims=True)
     return (x - low) / jnp.maximum(high - low, 1e-12)

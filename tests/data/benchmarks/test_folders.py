@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from crisalad_jax.data.benchmarks import read_folders
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch, touch_all
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from crisalad_jax.data.benchmarks import read_msls, read_msls_subtask
 from crisalad_jax.data.benchmarks.msls import heading_difference
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch
 
 

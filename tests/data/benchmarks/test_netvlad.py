@@ -7,7 +7,7 @@ import pytest
 import scipy.io
 
 from crisalad_jax.data.benchmarks import read_netvlad
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch
 
 GENERATOR = np.random.default_rng(0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import read_salad_lists
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import every_tenth, lists_of, ragged, touch
 
 DATABASE = [f"00{i}/{i:06d}_pitch1_yaw1.jpg" for i in range(5)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import read_utm
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch, touch_all, utm_name, write_utm
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import read_vpr_bench
-from crisalad_jax.errors import InputError
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import (
     every_tenth,
     lists_of,

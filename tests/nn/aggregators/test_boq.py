@@ -1,7 +1,5 @@
 """BoQ against torch's own transformer modules, under the names of the public checkpoints."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,28 +8,24 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from crisalad_jax.config import (
-    AdapterConfig,
-    BoqConfig,
-    CrossImageConfig,
-    ModelConfig,
-    ViTConfig,
-)
-from crisalad_jax.layouts import public_shapes, to_state
-from crisalad_jax.nn.aggregators import aggregate, init_aggregator, join
-from crisalad_jax.nn.aggregators.boq import Boq
-from crisalad_jax.nn.vit import Features
+from crisalad_jax.checkpoints.layouts import public_shapes, to_state
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.boq import Boq, BoqConfig
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from tests.conftest import random_params
 
 CONFIG = ModelConfig(
     image_size=(28, 42),
-    aggregator="boq",
     backbone=ViTConfig(
         dim=12, depth=1, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
     ),
     # Two heads.
-    boq=BoqConfig(channels=128, queries=3, layers=2, rows=5),
-    encoder=CrossImageConfig(layers=0),
+    aggregator=BoqConfig(channels=128, queries=3, layers=2, rows=5),
+    cross_image=CrossImageConfig(layers=0),
 )
 
 
@@ -70,7 +64,7 @@ class Published(nn.Module):
 def test_the_descriptor_is_torchs() -> None:
     params = random_params(CONFIG)
     state = to_state(params, CONFIG, "reference", {})
-    theirs = Published(12, CONFIG.boq)
+    theirs = Published(12, CONFIG.aggregator)
     theirs.load_state_dict(
         {
             name.removeprefix("aggregator."): torch.tensor(array)
@@ -85,8 +79,8 @@ def test_the_descriptor_is_torchs() -> None:
 
     @jax.jit
     def descriptors(params: Boq, features: Features) -> jax.Array:
-        tokens = aggregate(params, features, (2, 3), CONFIG, key=None)
-        return jax.vmap(lambda one: join(one, CONFIG))(tokens)
+        tokens = CONFIG.aggregator.apply(params, features, (2, 3), key=None)
+        return jax.vmap(lambda one: to_descriptor(one, CONFIG.aggregator))(tokens)
 
     assert isinstance(params.aggregator, Boq)
     found = descriptors(params.aggregator, features)
@@ -98,12 +92,12 @@ def test_the_descriptor_is_torchs() -> None:
 def test_the_published_model_has_12288_numbers_and_these_parameters() -> None:
     """The sizes of the public checkpoint on DINOv2 ViT-B/14, whose names and shapes torch tells."""
     config = ModelConfig(
-        image_size=(322, 322), aggregator="boq", encoder=CrossImageConfig(layers=0)
+        image_size=(322, 322), aggregator="boq", cross_image=CrossImageConfig(layers=0)
     )
     assert config.descriptor_dim == 12_288
-    assert config.boq.heads == 6
+    assert config.aggregator.heads == 6
     with torch.device("meta"):
-        theirs = Published(768, config.boq).state_dict()
+        theirs = Published(768, config.aggregator).state_dict()
     found = {
         name.removeprefix("aggregator."): shape
         for name, shape in public_shapes(config, "reference").items()
@@ -115,8 +109,9 @@ def test_the_published_model_has_12288_numbers_and_these_parameters() -> None:
 @pytest.mark.slow
 def test_it_starts_as_torch_does() -> None:
     """Queries normal of deviation 1; attention Glorot-uniform with zero biases."""
-    config = dataclasses.replace(CONFIG, boq=BoqConfig(channels=64, queries=40, layers=1))
-    params = jax.jit(lambda key: init_aggregator(key, config))(jax.random.key(0))
+    config = BoqConfig(channels=64, queries=40, layers=1)
+    init = jax.jit(lambda key: config.init(key, CONFIG.backbone, CONFIG.grid))
+    params = init(jax.random.key(0))
     assert isinstance(params, Boq)
     (block,) = params.boqs
     np.testing.assert_allclose(jnp.std(block.queries), 1, rtol=0.06)  # of 2,560 draws: 1.4 %

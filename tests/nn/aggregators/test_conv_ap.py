@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.config import ConvApConfig, CrossImageConfig, ModelConfig, ViTConfig
-from crisalad_jax.nn.aggregators import aggregate, join
-from crisalad_jax.nn.aggregators.conv_ap import ConvAp, adaptive_means
+from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.conv_ap import ConvAp, ConvApConfig, adaptive_means
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import Linear
-from crisalad_jax.nn.vit import Features
 
 CONFIG = ModelConfig(
-    aggregator="conv-ap",
     backbone=ViTConfig(dim=12, heads=1),
-    conv_ap=ConvApConfig(channels=6),
-    encoder=CrossImageConfig(layers=0),
+    aggregator=ConvApConfig(channels=6),
+    cross_image=CrossImageConfig(layers=0),
 )
 
 
@@ -38,11 +39,11 @@ def test_the_descriptor_is_torchs(grid: tuple[int, int], side: int) -> None:
     pooled = torch.nn.AdaptiveAvgPool2d((side, side))(convolved)
     expected = torch.nn.functional.normalize(pooled.flatten(1), dim=1)
 
-    config = dataclasses.replace(CONFIG, conv_ap=ConvApConfig(channels=6, side=side))
+    config = dataclasses.replace(CONFIG, aggregator=ConvApConfig(channels=6, side=side))
     params = ConvAp(Linear(jnp.asarray(weight.T), jnp.asarray(bias)))
     features = Features(jnp.zeros((2, 12)), jnp.asarray(patches))
-    tokens = aggregate(params, features, grid, config, key=None)
-    found = jax.vmap(lambda one: join(one, config))(tokens)
+    tokens = config.aggregator.apply(params, features, grid, key=None)
+    found = jax.vmap(lambda one: to_descriptor(one, config.aggregator))(tokens)
     assert found.shape == (2, config.descriptor_dim) == (2, 6 * side**2)
     # Sums of 12 products and of at most 35 patches, scaled below 1.
     np.testing.assert_allclose(found, expected, atol=1e-6)

@@ -7,18 +7,13 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from crisalad_jax.config import CosPlaceConfig, CrossImageConfig, ModelConfig, ViTConfig
-from crisalad_jax.nn.aggregators import aggregate, init_aggregator, join
-from crisalad_jax.nn.aggregators.cosplace import CosPlace
+from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.cosplace import CosPlace, CosPlaceConfig
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.layers import Linear
-from crisalad_jax.nn.vit import Features
 
-CONFIG = ModelConfig(
-    aggregator="cosplace",
-    backbone=ViTConfig(dim=12, heads=1),
-    cosplace=CosPlaceConfig(dim=7),
-    encoder=CrossImageConfig(layers=0),
-)
+CONFIG = CosPlaceConfig(dim=7)
 
 
 @pytest.mark.parametrize("p", [3.0, 1.6])
@@ -33,15 +28,15 @@ def test_the_descriptor_is_torchs(p: float) -> None:
 
     params = CosPlace(jnp.asarray(p), Linear(jnp.asarray(weight.T), jnp.asarray(bias)))
     features = Features(jnp.zeros((2, 12)), jnp.asarray(patches))
-    tokens = aggregate(params, features, (2, 3), CONFIG, key=None)
+    tokens = CONFIG.apply(params, features, (2, 3), key=None)
     assert tokens.local.shape == (2, 0, 7)
-    found = jax.vmap(lambda one: join(one, CONFIG))(tokens)
+    found = jax.vmap(lambda one: to_descriptor(one, CONFIG))(tokens)
     # Two powers of a few roundings and 12 products, scaled below 1.
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_it_starts_as_published() -> None:
-    params = init_aggregator(jax.random.key(0), CONFIG)
+    params = CONFIG.init(jax.random.key(0), ViTConfig(dim=12, heads=1), (16, 16))
     assert isinstance(params, CosPlace)
     assert float(params.p) == 3.0
     bound = 12**-0.5  # torch's nn.Linear

@@ -1,17 +1,14 @@
 """The generalised mean by hand, in float64, and at its two ends."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from crisalad_jax.config import CrossImageConfig, ModelConfig
-from crisalad_jax.nn.aggregators import aggregate, init_aggregator, join
-from crisalad_jax.nn.aggregators.gem import Gem, generalised_mean, log_units
-from crisalad_jax.nn.vit import Features
+from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.gem import Gem, GemConfig, generalised_mean, log_units
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.vit import ViTConfig
 
-CONFIG = ModelConfig(aggregator="gem", encoder=CrossImageConfig(layers=0))
 PATCHES = np.random.default_rng(0).normal(size=(2, 9, 20)).astype(np.float32)
 
 
@@ -67,16 +64,14 @@ def test_a_high_exponent_takes_the_largest() -> None:
 
 
 def test_the_descriptor_is_the_mean_of_an_image_at_length_1() -> None:
-    params = init_aggregator(jax.random.key(0), CONFIG)
+    config = GemConfig()
+    params = config.init(jax.random.key(0), ViTConfig(dim=20, heads=1), (16, 16))
     assert isinstance(params, Gem)
     assert (params.p.shape, float(params.p)) == ((), 3.0)  # as published
-    config = dataclasses.replace(
-        CONFIG, backbone=dataclasses.replace(CONFIG.backbone, dim=20, heads=1)
-    )
     features = Features(jnp.zeros((2, 20)), jnp.asarray(PATCHES))
-    tokens = aggregate(params, features, (3, 3), config, key=None)
+    tokens = config.apply(params, features, (3, 3), key=None)
     assert (tokens.global_token.shape, tokens.local.shape) == ((2, 20), (2, 0, 20))
     mean = np.asarray(gem(jnp.asarray(PATCHES), params.p))
     for i in range(2):
-        found = join(jax.tree.map(lambda leaf, i=i: leaf[i], tokens), config)
+        found = to_descriptor(jax.tree.map(lambda leaf, i=i: leaf[i], tokens), config)
         np.testing.assert_allclose(found, mean[i] / np.linalg.norm(mean[i]), atol=1e-6)

@@ -9,26 +9,28 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from crisalad_jax.config import CrossImageConfig, MixVprConfig, ModelConfig, ViTConfig
-from crisalad_jax.nn.aggregators import aggregate, init_aggregator, join
-from crisalad_jax.nn.aggregators.mixvpr import FeatureMixer, MixVpr
+from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.mixvpr import FeatureMixer, MixVpr, MixVprConfig
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import LayerNorm, Linear
-from crisalad_jax.nn.vit import Features
+from crisalad_jax.nn.model import parameter_shapes
 
 CONFIG = ModelConfig(
     image_size=(28, 42),
-    aggregator="mixvpr",
     backbone=ViTConfig(dim=12, heads=1),
-    mixvpr=MixVprConfig(channels=5, rows=3, depth=2),
-    encoder=CrossImageConfig(layers=0),
+    aggregator=MixVprConfig(channels=5, rows=3, depth=2),
+    cross_image=CrossImageConfig(layers=0),
 )
 PATCHES = np.random.default_rng(0).normal(size=(2, 6, 12)).astype(np.float32)
 
 
 def descriptors(params: MixVpr, patches: np.ndarray) -> jax.Array:
     features = Features(jnp.zeros((len(patches), 12)), jnp.asarray(patches))
-    tokens = aggregate(params, features, (2, 3), CONFIG, key=None)
-    return jax.vmap(lambda one: join(one, CONFIG))(tokens)
+    tokens = CONFIG.aggregator.apply(params, features, (2, 3), key=None)
+    return jax.vmap(lambda one: to_descriptor(one, CONFIG.aggregator))(tokens)
 
 
 def linear_of(layer: nn.Module) -> Linear:
@@ -90,12 +92,12 @@ def test_mixers_of_no_effect_leave_chosen_numbers_by_channel() -> None:
 
 
 def test_it_starts_as_published() -> None:
-    config = ModelConfig(aggregator="mixvpr", encoder=CrossImageConfig(layers=0))
+    config = ModelConfig(aggregator="mixvpr", cross_image=CrossImageConfig(layers=0))
     assert config.descriptor_dim == 4096
-    params = jax.eval_shape(lambda key: init_aggregator(key, config), jax.random.key(0))
+    params = parameter_shapes(config).aggregator
     assert len(params.mix) == 4
     config = dataclasses.replace(CONFIG, image_size=(224, 224))
-    params = init_aggregator(jax.random.key(0), config)
+    params = config.aggregator.init(jax.random.key(0), config.backbone, config.grid)
     assert isinstance(params, MixVpr)
     for mixer in params.mix:
         for layer in (mixer.fc1, mixer.fc2):

@@ -1,0 +1,203 @@
+"""Export a model as one StableHLO program, which runs without this package (`jax.export`).
+
+An export is a folder. `describe.jax_export` is the program, and `manifest.json` describes its
+inputs and outputs. `weights.safetensors` lies beside them unless the program holds the weights.
+"""
+
+import dataclasses
+import os
+import pathlib
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax import export
+from jaxtyping import Array, Float, UInt8
+
+from crisalad_jax.checkpoints.weights import model_hash, save_weights
+from crisalad_jax.config.checks import choose
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, describe, self_mask
+from crisalad_jax.utils import compiler
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_folder, check_new_folder, sha256_of, write_json
+from crisalad_jax.utils.pytree import named_leaves
+
+FORMAT = "crisalad-jax export 1"
+PROGRAM, WEIGHTS, MANIFEST = "describe.jax_export", "weights.safetensors", "manifest.json"
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+"""Platforms that `jax.export` knows."""
+GROUPINGS = {
+    "single": "every image is described alone",
+    "batch": "the images of a call look at each other",
+}
+_LARGEST = 2**31
+"""Largest size of a program in bytes: a flatbuffer's offsets have 31 bits."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportConfig:
+    """The inputs and the platforms of an exported program.
+
+    Example:
+        >>> ExportConfig(platforms=("cpu",), batch_size=8).grouping
+        'single'
+    """
+
+    grouping: Literal["single", "batch"] = "single"
+    """Grouping of a call's images in the cross-image encoder: each alone, or the whole batch."""
+    batch_size: int | None = None
+    """Number of images in a call; None takes any number, by a symbolic dimension."""
+    weights_inside: bool = False
+    """Whether the program holds the weights as constants; else it takes them as an argument."""
+    platforms: tuple[str, ...] = ("cpu", "cuda")
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        choose("grouping", self.grouping, GROUPINGS)
+        if self.batch_size is not None and self.batch_size < 1:
+            raise InputError(f"batch size: found {self.batch_size}, expected at least 1")
+        if not self.platforms:
+            raise InputError(f"platforms: found none, expected some of {', '.join(PLATFORMS)}")
+        for name in self.platforms:
+            choose("platform", name, dict.fromkeys(PLATFORMS))
+
+
+def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -> None:
+    """Check that a model can be exported in this way, before the work of tracing it.
+
+    Raises:
+        InputError: weights inside of 2 GiB or more; or transport that must converge.
+    """
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
+    if how.weights_inside and size >= _LARGEST:
+        raise InputError(
+            f"weights inside: found {size / 2**30:.1f} GiB of parameters, expected less than "
+            f"{_LARGEST / 2**30:g} GiB, all that a program can hold; leave them beside it"
+        )
+    sinkhorn = getattr(config.aggregator, "sinkhorn", None)
+    if sinkhorn is not None and sinkhorn.throw:
+        raise InputError(
+            "SinkhornConfig.throw: found True, expected False: an exported program cannot "
+            "stop with an error"
+        )
+
+
+def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> export.Exported:
+    """Export the program of `(weights, images)`, or of `images` where the weights are inside.
+
+    `images` are 8-bit RGB (batch, height, width, 3) of `config.image_size`; the result is their
+    unit descriptors (batch, descriptor). `weights` is a dictionary of the arrays by their dotted
+    names. Nothing in the program depends on the platform that exports it.
+
+    Raises:
+        InputError: as `check_exportable`.
+    """
+    check_exportable(params, config, how)
+    # A dictionary's leaves come in the order of its keys, not in that of the fields.
+    weights, tree = named_leaves(params), jax.tree.structure(params)
+
+    def run(
+        weights: dict[str, Array], images: UInt8[Array, "image height width 3"]
+    ) -> Float[Array, "image descriptor"]:
+        restored = jax.tree.unflatten(tree, [weights[name] for name in named_leaves(params)])
+        mask = self_mask(images.shape[0]) if how.grouping == "single" else None
+        return describe(restored, images, config, mask=mask)
+
+    batch = how.batch_size
+    if batch is None:
+        (batch,) = export.symbolic_shape("batch")
+    images = jax.ShapeDtypeStruct((batch, *config.image_size, 3), jnp.uint8)
+    with compiler.portable():
+        if how.weights_inside:
+            whole = jax.jit(lambda images: run(weights, images))
+            return export.export(whole, platforms=how.platforms)(images)
+        shapes = {n: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for n, leaf in weights.items()}
+        return export.export(jax.jit(run), platforms=how.platforms)(shapes, images)
+
+
+def write_export(
+    out: str | os.PathLike[str],
+    params: Crisalad,
+    config: ModelConfig,
+    how: ExportConfig = ExportConfig(),
+) -> dict[str, Any]:
+    """Write a model as a program for any platform into the new folder `out`, whole or not at all.
+
+    Args:
+        out: the folder.
+        params: the model's parameters.
+        config: the model.
+        how: platforms, batch size and grouping.
+
+    Returns:
+        The manifest, as manifest.json has it.
+
+    Raises:
+        InputError: as `check_exportable`; or `out` is a file, or a folder that holds something.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, init_crisalad
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> how = ExportConfig(batch_size=2)
+        >>> write_export(folder / "export", params, config, how)["descriptors"]["shape"]
+        [2, 576]
+    """
+    check_new_folder(out)
+    exported = export_model(params, config, how)
+    with atomic_folder(out) as folder:
+        (folder / PROGRAM).write_bytes(exported.serialize(vjp_order=0))
+        if not how.weights_inside:
+            save_weights(folder / WEIGHTS, params, config)
+        manifest = _manifest(folder, exported, params, config, how)
+        write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def _manifest(
+    folder: pathlib.Path,
+    exported: export.Exported,
+    params: Crisalad,
+    config: ModelConfig,
+    how: ExportConfig,
+) -> dict[str, Any]:
+    images, (descriptors,) = exported.in_avals[-1], exported.out_avals
+    called = "images" if how.weights_inside else "weights, images"
+    return {
+        "format": FORMAT,
+        "call": f"jax.export.deserialize(program).call({called})",
+        "program": _file(folder / PROGRAM),
+        "weights": None
+        if how.weights_inside
+        else _file(folder / WEIGHTS)
+        | {"argument": "a dictionary of all arrays in the file by their names"},
+        "images": {
+            "shape": _shape(images),
+            "dtype": str(images.dtype),
+            "layout": "RGB, rows from the top, not normalised",
+            "resize": "Pillow's BILINEAR to (height, width), aspect ratio not kept",
+        },
+        "descriptors": {
+            "shape": _shape(descriptors),
+            "dtype": str(descriptors.dtype),
+            "norm": "unit length (L2)",
+        },
+        "grouping": how.grouping,
+        "grouping_means": GROUPINGS[how.grouping],
+        "platforms": list(exported.platforms),
+        "calling_convention_version": exported.calling_convention_version,
+        "jax_version": jax.__version__,
+        "model_sha256": model_hash(params, config),
+        "model": to_plain(config),
+    }
+
+
+def _shape(array: Any) -> list[int | str]:
+    return [size if isinstance(size, int) else str(size) for size in array.shape]
+
+
+def _file(path: pathlib.Path) -> dict[str, Any]:
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256_of(path)}

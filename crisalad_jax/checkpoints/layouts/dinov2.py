@@ -1,0 +1,197 @@
+"""The layout of facebookresearch/dinov2, whose names most checkpoints of this field keep."""
+
+import dataclasses
+
+import numpy as np
+
+from crisalad_jax.checkpoints.layouts.base import Layout, Lines, Reader, State, register_layout
+from crisalad_jax.checkpoints.layouts.forms import (
+    CLASS_TOKEN,
+    CONV,
+    DEPTHWISE,
+    FIRST,
+    LINEAR,
+    PATCHES,
+    POINTWISE,
+    POSITIONS,
+    SAME,
+    Entry,
+    Extra,
+    affine,
+    side,
+)
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.utils.errors import InputError
+
+HEAD_WIDTH = 64
+"""Width of an attention head in every DINOv2; no shape shows the number of heads."""
+
+
+def accepts_bare_backbone(config: ModelConfig) -> str | None:
+    """Accept DINOv2 alone, whose descriptor is its class token."""
+    return accepts_parts(config, "class-token", "none", cross_image=False)
+
+
+def accepts_parts(
+    config: ModelConfig, aggregator: str, adapter: str, *, cross_image: bool
+) -> str | None:
+    """Accept a vision transformer with exactly these parts; else return them in words."""
+    parts = parts_in_words(config)
+    encoder = "an" if cross_image else "no"
+    expected = f"aggregator {aggregator}, adapter {adapter}, {encoder} encoder"
+    return None if parts == expected else expected
+
+
+def parts_in_words(config: ModelConfig) -> str:
+    """Name a model's parts."""
+    backbone = config.backbone
+    encoder = "an" if config.cross_image.layers else "no"
+    words = f"aggregator {config.aggregator.part_name}"
+    if isinstance(backbone, ViTConfig):
+        return f"{words}, adapter {backbone.adapter.kind}, {encoder} encoder"
+    return f"{words}, backbone {backbone.part_name}, {encoder} encoder"
+
+
+def vit_of(config: ModelConfig) -> ViTConfig:
+    """Return the backbone of a model that `accepts_parts` accepted."""
+    assert isinstance(config.backbone, ViTConfig)
+    return config.backbone
+
+
+def vit_lines(config: ViTConfig, prefix: str) -> Lines:
+    """Yield the backbone under facebookresearch/dinov2's names, adapters under CricaVPR's."""
+    yield Entry(("backbone.cls_token",), (f"{prefix}cls_token",), CLASS_TOKEN)
+    yield Entry(
+        ("backbone.pos_embed_cls", "backbone.pos_embed"), (f"{prefix}pos_embed",), POSITIONS
+    )
+    if config.registers:
+        yield Entry(("backbone.register_tokens",), (f"{prefix}register_tokens",), FIRST)
+    yield Extra("backbone.mask_token", f"{prefix}mask_token", (1, config.dim), np.float32)
+    yield from affine("backbone.patch_embed", f"{prefix}patch_embed.proj", PATCHES)
+    for i in range(config.depth):
+        ours, theirs = f"backbone.blocks.{i}", f"{prefix}blocks.{i}"
+        yield from affine(f"{ours}.norm1", f"{theirs}.norm1", SAME)
+        yield from affine(f"{ours}.attn.qkv", f"{theirs}.attn.qkv", LINEAR)
+        yield from affine(f"{ours}.attn.proj", f"{theirs}.attn.proj", LINEAR)
+        yield Entry((f"{ours}.ls1",), (f"{theirs}.ls1.gamma",), SAME)
+        yield from affine(f"{ours}.norm2", f"{theirs}.norm2", SAME)
+        for name in ("w12", "w3") if config.ffn == "swiglu" else ("fc1", "fc2"):
+            yield from affine(f"{ours}.mlp.{name}", f"{theirs}.mlp.{name}", LINEAR)
+        yield Entry((f"{ours}.ls2",), (f"{theirs}.ls2.gamma",), SAME)
+        yield from adapter_lines(config, f"{ours}.adapter", f"{theirs}.adapter")
+    yield from affine("backbone.norm", f"{prefix}norm", SAME)
+
+
+def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:
+    """Yield one block's adapter, under CricaVPR's names, and similar names for other kinds."""
+    kind = config.adapter.kind
+    if kind == "multi-resolution":
+        for branch in ("branch1", "branch2.0", "branch2.1", "branch3.0", "branch3.1"):
+            here, there = f"{ours}.{branch}", f"{theirs}.{branch}"
+            yield from affine(f"{here}.conv", f"{there}.conv", CONV)
+            yield from affine(f"{here}.norm", f"{there}.bn", SAME)
+            for name in ("running_mean", "running_var"):
+                yield Entry((f"{here}.norm.{name}",), (f"{there}.bn.{name}",), SAME)
+            count = "num_batches_tracked"
+            yield Extra(f"{here}.norm.{count}", f"{there}.bn.{count}", (), np.int64)
+    bias = kind != "depthwise"
+    if kind != "none":
+        yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=bias)
+    if kind == "depthwise":
+        yield from affine(f"{ours}.depthwise", f"{theirs}.depthwise", DEPTHWISE)
+        yield from affine(f"{ours}.pointwise", f"{theirs}.pointwise", POINTWISE)
+    if kind != "none":
+        yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR, bias=bias)
+
+
+def vit_config(read: Reader) -> ViTConfig:
+    """Infer a backbone from facebookresearch/dinov2's names."""
+    gated = read.has("blocks.0.mlp.w12.weight")
+    width = read.size("cls_token", 2)
+    if read.has("blocks.0.adapter.branch1.conv.weight"):
+        kind = "multi-resolution"
+    elif read.has("blocks.0.adapter.depthwise.weight"):
+        kind = "depthwise"
+    else:
+        kind = "mlp" if read.has("blocks.0.adapter.D_fc1.weight") else "none"
+    adapter = AdapterConfig(kind=kind)
+    if kind != "none":
+        down = read.size("blocks.0.adapter.D_fc1.weight", 0)
+        adapter = dataclasses.replace(adapter, bottleneck=down / width)
+    if kind == "depthwise":
+        side = read.size("blocks.0.adapter.depthwise.weight", 2)
+        adapter = dataclasses.replace(adapter, kernel_size=side)
+    return backbone_config(
+        dim=width,
+        depth=read.count("blocks."),
+        hidden=read.size("blocks.0.mlp.w3.weight" if gated else "blocks.0.mlp.fc1.weight", gated),
+        gated=gated,
+        registers=read.size("register_tokens", 1) if read.has("register_tokens") else 0,
+        positions=read.size("pos_embed", 1),
+        adapter=adapter,
+    )
+
+
+def backbone_config(
+    *,
+    dim: int,
+    depth: int,
+    hidden: int,
+    gated: bool,
+    registers: int,
+    positions: int,
+    adapter: AdapterConfig,
+) -> ViTConfig:
+    """Make a backbone's configuration from its sizes.
+
+    Raises:
+        InputError: they are the sizes of no backbone.
+    """
+    grid = side(positions - 1)
+    if grid**2 != positions - 1 or not grid:
+        raise InputError(f"found {positions} position embeddings, expected 1 and a square number")
+    if dim % HEAD_WIDTH:
+        raise InputError(
+            f"found a backbone of width {dim}, expected a multiple of {HEAD_WIDTH}: "
+            "DINOv2's heads have that width, and no shape tells another"
+        )
+    # The configuration knows the ratio: of SwiGLU's two thirds, 4 where they are DINOv2's.
+    ratios = (4.0, 1.5 * hidden / dim) if gated else (hidden / dim,)
+    for ratio in ratios:
+        config = ViTConfig(
+            dim=dim,
+            depth=depth,
+            heads=dim // HEAD_WIDTH,
+            mlp_ratio=ratio,
+            ffn="swiglu" if gated else "mlp",
+            registers=registers,
+            position_grid=grid,
+            adapter=adapter,
+        )
+        if config.hidden == hidden:
+            return config
+    raise InputError(f"found a feed-forward width of {hidden}, expected a multiple of 8 for SwiGLU")
+
+
+def _infer(state: State) -> ModelConfig:
+    return ModelConfig(
+        backbone=vit_config(Reader(state)),
+        aggregator=ClassTokenConfig(),
+        cross_image=CrossImageConfig(layers=0),
+    )
+
+
+register_layout(
+    Layout(
+        "dinov2",
+        "DINOv2 .pth",
+        accepts_bare_backbone,
+        lambda config: vit_lines(vit_of(config), ""),
+        lambda state: "cls_token" in state or "pos_embed" in state,
+        _infer,
+    )
+)

@@ -1,0 +1,89 @@
+"""Forms: conversions between a torch module's arrays and ours, and the tables that use them.
+
+Every entry of a table permutes numbers. Gradients can therefore be converted like weights, and a
+round trip gives the same bits.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Form(NamedTuple):
+    """Two functions, inverse to each other, between our arrays and theirs."""
+
+    ours: Callable[..., tuple[np.ndarray, ...]]
+    theirs: Callable[..., tuple[np.ndarray, ...]]
+
+
+class Entry(NamedTuple):
+    """One line of a table: our arrays and theirs that correspond. Blocks are numbered in both."""
+
+    ours: tuple[str, ...]
+    theirs: tuple[str, ...]
+    form: Form
+
+
+class Extra(NamedTuple):
+    """An array of theirs that no model of ours uses, stored so that a round trip is exact."""
+
+    name: str
+    theirs: str
+    shape: tuple[int, ...]
+    dtype: type
+
+
+SAME = Form(lambda x: (x,), lambda x: (x,))
+LINEAR = Form(lambda w: (w.T,), lambda w: (w.T,))
+FIRST = Form(lambda x: (x[0],), lambda x: (x[None],))
+CLASS_TOKEN = Form(lambda x: (x[0, 0],), lambda x: (x[None, None],))
+POINTWISE = Form(lambda w: (w[:, :, 0, 0].T,), lambda w: (w.T[:, :, None, None],))
+CONV = Form(lambda w: (w.transpose(2, 3, 1, 0),), lambda w: (w.transpose(3, 2, 0, 1),))
+DEPTHWISE = Form(
+    lambda w: (w[:, 0].transpose(1, 2, 0),), lambda w: (w.transpose(2, 0, 1)[:, None],)
+)
+
+
+def side(area: int) -> int:
+    """Return the side of a square grid."""
+    return math.isqrt(area)
+
+
+PATCHES = Form(
+    lambda w: (w.transpose(2, 3, 1, 0).reshape(-1, w.shape[0]),),
+    lambda w: (w.reshape(side(len(w) // 3), side(len(w) // 3), 3, -1).transpose(3, 2, 0, 1),),
+)
+POSITIONS = Form(
+    lambda x: (x[0, 0], x[0, 1:].reshape(side(x.shape[1]), side(x.shape[1]), -1)),
+    lambda first, grid: (np.concatenate([first[None], grid.reshape(-1, grid.shape[-1])])[None],),
+)
+QKV = Form(lambda q, k, v: (np.concatenate([q, k, v]).T,), lambda w: tuple(np.split(w.T, 3)))
+QKV_BIAS = Form(lambda q, k, v: (np.concatenate([q, k, v]),), lambda b: tuple(np.split(b, 3)))
+
+
+def affine(ours: str, theirs: str, form: Form, *, bias: bool = True) -> Iterator[Entry]:
+    """Yield the lines of a weight and, if it has one, a bias."""
+    yield Entry((f"{ours}.weight",), (f"{theirs}.weight",), form)
+    if bias:
+        yield Entry((f"{ours}.bias",), (f"{theirs}.bias",), SAME)
+
+
+def transformer_layer(ours: str, theirs: str) -> Iterator[Entry]:
+    """Yield the lines of one layer, under torch.nn.TransformerEncoderLayer's names."""
+    yield from torch_attention(f"{ours}.attn", f"{theirs}.self_attn")
+    for name, form in (
+        ("linear1", LINEAR),
+        ("linear2", LINEAR),
+        ("norm1", SAME),
+        ("norm2", SAME),
+    ):
+        yield from affine(f"{ours}.{name}", f"{theirs}.{name}", form)
+
+
+def torch_attention(ours: str, theirs: str) -> Iterator[Entry]:
+    """Yield the lines of one attention, under torch.nn.MultiheadAttention's names."""
+    for leaf, form in (("weight", LINEAR), ("bias", SAME)):
+        yield Entry((f"{ours}.qkv.{leaf}",), (f"{theirs}.in_proj_{leaf}",), form)
+    yield from affine(f"{ours}.proj", f"{theirs}.out_proj", LINEAR)

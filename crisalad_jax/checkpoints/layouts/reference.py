@@ -1,0 +1,54 @@
+"""The layout of our torch reference in `parity/`, which can hold any model of ours."""
+
+from crisalad_jax.checkpoints.layouts.base import (
+    Layout,
+    Lines,
+    Reader,
+    State,
+    head_lines,
+    register_layout,
+)
+from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines, infer_encoder
+from crisalad_jax.checkpoints.layouts.dino_salad import infer_salad
+from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words, vit_config, vit_lines
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.utils.errors import InputError
+
+_BACKBONE = "backbone."
+
+
+def _accepts(config: ModelConfig) -> str | None:
+    return None if isinstance(config.backbone, ViTConfig) else "a vision transformer"
+
+
+def _lines(config: ModelConfig) -> Lines:
+    if not isinstance(config.backbone, ViTConfig):
+        raise InputError(f"layout reference: found {parts_in_words(config)}, expected a vit")
+    yield from vit_lines(config.backbone, _BACKBONE)
+    yield from head_lines(config)
+    yield from encoder_lines(config.cross_image)
+
+
+def _infer(state: State) -> ModelConfig:
+    """Infer a model with SALAD or a class token; our own files store their configuration."""
+    salad = "aggregator.score.3.weight" in state
+    return ModelConfig(
+        backbone=vit_config(Reader(state, _BACKBONE)),
+        aggregator=infer_salad(state) if salad else ClassTokenConfig(),
+        cross_image=infer_encoder(state),
+    )
+
+
+register_layout(
+    Layout(
+        "reference",
+        "our torch reference",
+        _accepts,
+        _lines,
+        lambda state: f"{_BACKBONE}cls_token" in state or f"{_BACKBONE}pos_embed" in state,
+        _infer,
+        under="state_dict",
+    )
+)

@@ -1,0 +1,227 @@
+"""Tables of layouts, and the conversion of arrays to a layout and back."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from crisalad_jax.checkpoints.layouts.base import LAYOUTS, State
+from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words
+from crisalad_jax.checkpoints.layouts.forms import Entry, Extra
+from crisalad_jax.config.checks import choose
+from crisalad_jax.config.fields import with_free_fields_of
+from crisalad_jax.config.io import differences
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+
+
+def table(config: ModelConfig, layout: str) -> list[Entry | Extra]:
+    """Return a layout's table for a model, in the public order, without the prefix `module.`.
+
+    Raises:
+        InputError: no such layout, or the model has parts that it cannot hold.
+    """
+    chosen = choose("layout", layout, LAYOUTS)
+    expected = chosen.accepts(config)
+    if expected is not None:
+        raise InputError(
+            f"layout {layout}: found a model of {parts_in_words(config)}, expected {expected} "
+            "(layout reference holds any)"
+        )
+    return list(chosen.lines(config))
+
+
+def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
+    """Infer the layout and the configuration of a state, from its names and shapes.
+
+    Settings that no shape shows are the published ones: heads of width 64 in the backbone, 16 heads
+    in the encoder, alpha 0.2, three Sinkhorn iterations, images of 224 x 224 (DINO-SALAD: 322).
+
+    Raises:
+        InputError: naming `source`, if the names are of no layout or the widths of no model.
+    """
+    for layout in LAYOUTS.values():
+        if layout.infer is not None and layout.detects(state):
+            try:
+                return layout.name, layout.infer(state)
+            except InputError as error:
+                raise InputError(f"{source}: {error}") from error
+    names = ", ".join(sorted(state)[:3]) or "none"
+    raise InputError(
+        f"{source}: found no checkpoint that we know (its first names: {names}); expected "
+        f"{', '.join(layout.holds for layout in LAYOUTS.values())}"
+    )
+
+
+def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -> None:
+    """Check that a model can be written in `layout` and read back as the same model.
+
+    Raises:
+        InputError: what `table` raises; a setting that no shape tells and that differs from the
+            published one, which reading would take for it; or extras that the layout has no place
+            for.
+    """
+    lines = [line for line in table(config, layout) if isinstance(line, Extra)]
+    if layout != "reference":
+        shapes = public_shapes(config, layout)
+        blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
+        _, read_back = infer(blank, source=f"layout {layout}")
+        wrong = differences(_told(with_free_fields_of(config, read_back)), _told(config))
+        if wrong:
+            raise InputError(
+                f"layout {layout}: cannot tell these apart from the published ones: "
+                f"{'; '.join(wrong)} (layout reference can)"
+            )
+    for line in lines:
+        array = (extras or {}).get(line.name)
+        if array is None:
+            continue
+        if (array.shape, array.dtype) != (line.shape, np.dtype(line.dtype)):
+            raise InputError(
+                f"extra.{line.name}: found {array.dtype} {array.shape}, expected "
+                f"{np.dtype(line.dtype)} {line.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise InputError(f"extra.{line.name}: holds NaN or infinity")
+
+
+def _told(config: ModelConfig) -> ModelConfig:
+    """Return a configuration with all fields reset that a trained model's arrays do not show."""
+    backbone = config.backbone
+    assert isinstance(backbone, ViTConfig)
+    adapter = backbone.adapter
+    if adapter.kind == "none":
+        adapter = AdapterConfig(kind="none")
+    elif adapter.kind != "depthwise":
+        adapter = dataclasses.replace(adapter, kernel_size=AdapterConfig.kernel_size)
+    if adapter.kind != "none":
+        adapter = dataclasses.replace(adapter, bottleneck=backbone.adapter_dim / backbone.dim)
+    backbone = dataclasses.replace(
+        backbone, mlp_ratio=backbone.hidden / backbone.dim, adapter=adapter
+    )
+    encoder = config.cross_image if config.cross_image.layers else CrossImageConfig(layers=0)
+    return dataclasses.replace(config, backbone=backbone, cross_image=encoder)
+
+
+def public_shapes(config: ModelConfig, layout: str) -> dict[str, tuple[int, ...]]:
+    """Return every name of a layout with its shape, in the public order.
+
+    Raises:
+        InputError: what `table` raises.
+    """
+    wanted = _numbered(named_leaves(parameter_shapes(config)))
+    shapes: dict[str, tuple[int, ...]] = {}
+    for line in table(config, layout):
+        if isinstance(line, Extra):
+            shapes[line.theirs] = line.shape
+        else:
+            # Broadcast arrays have shapes without memory of their own.
+            blanks = (np.broadcast_to(np.float32(0), wanted[name].shape) for name in line.ours)
+            arrays = line.form.theirs(*blanks)
+            shapes |= {name: x.shape for name, x in zip(line.theirs, arrays, strict=True)}
+    return shapes
+
+
+def to_params(
+    state: State, config: ModelConfig, layout: str, *, source: str
+) -> tuple[Crisalad, dict[str, np.ndarray]]:
+    """Convert arrays by public name to (parameters, extras), as numpy arrays of the same types.
+
+    The extras are arrays of public checkpoints that no descriptor needs: DINOv2's mask token, and
+    the batch norms' counts of batches.
+
+    Raises:
+        InputError: naming `source` and every name that is missing, unknown or misshaped.
+    """
+    shapes = public_shapes(config, layout)
+    problems = [f"{name} missing" for name in shapes.keys() - state.keys()]
+    problems += [f"{name} unknown" for name in state.keys() - shapes.keys()]
+    problems += [
+        f"{name} found {state[name].shape}, expected {shape}"
+        for name, shape in shapes.items()
+        if name in state and state[name].shape != shape
+    ]
+    if problems:
+        raise InputError(
+            f"{source}: does not fit the layout {layout} of {_size(config)}: "
+            f"{'; '.join(sorted(problems, key=_natural))}"
+        )
+    ours: dict[str, np.ndarray] = {}
+    extras: dict[str, np.ndarray] = {}
+    for line in table(config, layout):
+        if isinstance(line, Extra):
+            extras[line.name] = state[line.theirs]
+        else:
+            arrays = line.form.ours(*(state[name] for name in line.theirs))
+            ours |= zip(line.ours, arrays, strict=True)
+    return _from_numbered(ours, config), extras
+
+
+def to_state(
+    params: Crisalad, config: ModelConfig, layout: str, extras: State
+) -> dict[str, np.ndarray]:
+    """Undo `to_params`, in the public order; missing extras are 0, their initial value.
+
+    Raises:
+        InputError: the layout has no place for a part of this model.
+    """
+    ours = _numbered(named_leaves(params))
+    state: dict[str, np.ndarray] = {}
+    for line in table(config, layout):
+        if isinstance(line, Extra):
+            state[line.theirs] = extras.get(line.name, np.zeros(line.shape, line.dtype))
+        else:
+            arrays = line.form.theirs(*(np.asarray(ours[name]) for name in line.ours))
+            for name, array in zip(line.theirs, arrays, strict=True):
+                state[name] = np.ascontiguousarray(array).reshape(array.shape)
+    return state
+
+
+_BLOCKS = "backbone.blocks."
+
+
+def _numbered(leaves: Mapping[str, Any]) -> dict[str, Any]:
+    """Split stacks of blocks into single blocks, with numbered names."""
+    cut: dict[str, Any] = {}
+    for name, leaf in leaves.items():
+        if not name.startswith(_BLOCKS):
+            cut[name] = leaf
+            continue
+        for i in range(leaf.shape[0]):
+            if isinstance(leaf, jax.ShapeDtypeStruct):
+                single: Any = jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype)
+            else:
+                single = leaf[i]
+            cut[f"{_BLOCKS}{i}.{name.removeprefix(_BLOCKS)}"] = single
+    return cut
+
+
+def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
+    template = parameter_shapes(config)
+    leaves = []
+    for name, leaf in named_leaves(template).items():
+        if name.startswith(_BLOCKS):
+            inner = name.removeprefix(_BLOCKS)
+            leaves.append(np.stack([ours[f"{_BLOCKS}{i}.{inner}"] for i in range(leaf.shape[0])]))
+        else:
+            # Empty arrays, such as absent registers, have no line in any table.
+            leaves.append(ours[name] if leaf.size else np.zeros(leaf.shape, leaf.dtype))
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+def _size(config: ModelConfig) -> str:
+    backbone = config.backbone
+    return f"width {backbone.dim} and {backbone.depth} blocks"
+
+
+def _natural(text: str) -> list[Any]:
+    """Return a sort key that puts block 10 after block 9."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", text)]

@@ -1,0 +1,379 @@
+"""Read and write public torch checkpoints, and convert them to this package's files and back."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import pickle
+import re
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from crisalad_jax.checkpoints.layouts import LAYOUTS, State, check_holds, infer, to_params, to_state
+from crisalad_jax.checkpoints.weights import (
+    count_layers,
+    is_ours,
+    load_extras,
+    load_weights,
+    save_weights,
+)
+from crisalad_jax.config.checks import choose
+from crisalad_jax.config.fields import with_free_fields_of
+from crisalad_jax.config.io import differences, from_plain, to_plain
+from crisalad_jax.nn.backbones import Backbone
+from crisalad_jax.nn.backbones.vit import ViT, ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path, check_source, check_target, write_safetensors
+
+TORCH_SUFFIXES = (".pth", ".pt", ".ckpt")
+
+
+class Checkpoint(NamedTuple):
+    """A model from any file we can read."""
+
+    params: Crisalad
+    config: ModelConfig
+    extras: dict[str, np.ndarray]
+    layout: str | None
+    """Public layout of the file; None for a file of this package."""
+
+
+class Model(NamedTuple):
+    """A model's parameters and configuration."""
+
+    params: Crisalad
+    config: ModelConfig
+
+
+def load(path: str | os.PathLike[str]) -> Model:
+    """Load a model from a file of this package or a public checkpoint.
+
+    Args:
+        path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
+            DINO-SALAD, CricaVPR or another layout in `docs/methods.md`; torch files need torch.
+
+    Returns:
+        (params, config).
+
+    Raises:
+        InputError: what `read_checkpoint` raises.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import init_crisalad, load, recipe, save_weights
+        >>> config = recipe("tiny").model
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> save_weights(folder / "weights.safetensors", params, config)
+        >>> load(folder / "weights.safetensors").config == config
+        True
+    """
+    checkpoint = read_checkpoint(path)
+    return Model(checkpoint.params, checkpoint.config)
+
+
+def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
+    """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
+
+    Torch files are read by `torch.load(weights_only=True)`, which runs no code of the file.
+
+    Raises:
+        InputError: the file is missing, cut short, none of the layouts, asks to run code, or does
+            not fit its layout (every name that is missing, unknown or misshaped is listed); or
+            torch is needed and not installed.
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a checkpoint")
+    if is_ours(path):
+        params, config = load_weights(path)
+        return Checkpoint(params, config, load_extras(path), None)
+    try:
+        with path.open("rb") as file:
+            start = file.read(9)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
+    if start[8:] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
+        content: Any = _read_safetensors(path)
+    else:
+        content = _read_torch(path)
+    state, config = _unwrap(content, path)
+    layout = "reference"
+    if config is None:
+        layout, config = infer(state, source=str(path))
+    elif count_layers(config) > len(state):
+        # Check before making a table of names: the file may claim any depth.
+        raise InputError(
+            f"{path}: found {len(state)} tensors, expected those of {count_layers(config)} blocks "
+            "and layers, as its configuration says"
+        )
+    state = {name: _float32(name, array, path) for name, array in state.items()}
+    params, extras = to_params(state, config, layout, source=str(path))
+    return Checkpoint(jax.tree.map(jnp.asarray, params), config, extras, layout)
+
+
+def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
+    try:
+        return safetensors.numpy.load_file(path)
+    except AttributeError as error:  # safetensors' error for a type that numpy lacks
+        raise InputError(f"{path}: found a type that numpy does not know: {error}") from error
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path}: not a whole safetensors file: {error}") from error
+
+
+def _read_torch(path: pathlib.Path) -> Any:
+    torch = _torch(f"read {path}")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about deprecated formats, which are refused below
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        # Torch's message is a page of advice on how to run the code anyway: shorten it.
+        refused = re.search(r"GLOBAL ([\w.]+)", str(error)) or re.search(
+            r"Unsupported \w+ ([a-zA-Z_][\w.]*)", str(error)
+        )
+        what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
+        raise InputError(
+            f"{path}: refused: it {what}, expected nothing but tensors (loading anything else "
+            "could run code)"
+        ) from error
+    except Exception as error:  # a damaged pickle may raise any exception
+        reason = str(error).split("\n")[0][:200] or type(error).__name__
+        raise InputError(f"{path}: not a whole torch checkpoint: {reason}") from error
+
+    def arrays(value: Any, name: object) -> Any:
+        if isinstance(value, Mapping):
+            return {key: arrays(item, key) for key, item in value.items()}
+        if not isinstance(value, torch.Tensor):
+            return value
+        half = value.dtype in (torch.float16, torch.bfloat16)
+        try:
+            return (value.float() if half else value).detach().numpy()
+        except (TypeError, RuntimeError) as error:  # sparse, quantised, 8-bit or meta tensors
+            raise InputError(f"{path}: {name} is no plain tensor: {error}") from error
+
+    return arrays(content, "its content")
+
+
+def _torch(purpose: str) -> Any:
+    try:
+        import torch
+    except ImportError as error:
+        raise InputError(
+            f"to {purpose} torch is needed and not installed: pip install torch"
+        ) from error
+    return torch
+
+
+def _unwrap(content: Any, path: pathlib.Path) -> tuple[State, ModelConfig | None]:
+    """Return the state in a file's dictionary, and the configuration if our reference wrote one."""
+    config = None
+    for key in ("state_dict", "model_state_dict", "model"):
+        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+            if isinstance(content.get("config"), str):
+                config = from_plain(
+                    ModelConfig, _json(content["config"], path), source=f"{path} (config)"
+                )
+            content = content[key]
+            break
+    if not isinstance(content, Mapping) or not content:
+        kind = "nothing" if isinstance(content, Mapping) else type(content).__name__
+        raise InputError(f"{path}: found {kind}, expected a dictionary of tensors by name")
+    strange = [
+        str(name)
+        for name, value in content.items()
+        if not isinstance(name, str) or not isinstance(value, np.ndarray)
+    ]
+    if strange:
+        raise InputError(
+            f"{path}: found {', '.join(sorted(strange))}, expected nothing but tensors by name"
+        )
+    if all(name.startswith("module.") for name in content):
+        content = {name.removeprefix("module."): value for name, value in content.items()}
+    return content, config
+
+
+def _json(text: str, path: pathlib.Path) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: found no configuration under 'config': {error}") from error
+
+
+def _float32(name: str, array: np.ndarray, path: pathlib.Path) -> np.ndarray:
+    if name.endswith("num_batches_tracked"):
+        if array.dtype != np.int64:
+            raise InputError(f"{path}: {name} found {array.dtype}, expected int64")
+        return array
+    if array.dtype.name in ("float16", "bfloat16"):
+        array = array.astype(np.float32)
+    if array.dtype != np.float32:
+        raise InputError(
+            f"{path}: {name} found {array.dtype}, expected float32, float16 or bfloat16"
+        )
+    if not np.isfinite(array).all():
+        raise InputError(f"{path}: {name} holds NaN or infinity")
+    return array
+
+
+def layout_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
+    """Choose the public layout that holds the whole model; Hugging Face's for a .safetensors."""
+    if pathlib.Path(target).suffix == ".safetensors":
+        return "huggingface"
+    for layout in ("dinov2", "dino-salad", "cricavpr"):
+        try:
+            check_holds(config, layout)
+        except InputError:
+            continue
+        return layout
+    return "reference"
+
+
+def write_checkpoint(
+    path: str | os.PathLike[str],
+    params: Crisalad,
+    config: ModelConfig,
+    layout: str,
+    extras: State,
+) -> None:
+    """Write a model under public names, as published: nested, prefixed, in the public order.
+
+    Raises:
+        InputError: the layout cannot hold this model, the file cannot be made, or torch is needed
+            and not installed.
+    """
+    path = pathlib.Path(path)
+    names = choose("layout", layout, LAYOUTS)
+    check_holds(config, layout, extras)
+    state = to_state(params, config, layout, extras)
+    if layout == "huggingface":
+        write_safetensors(path, state, {"format": "pt"})
+        return
+    torch = _torch(f"write {path}")
+    content: Any = {
+        f"{names.module}{name}": torch.from_numpy(np.array(array)) for name, array in state.items()
+    }
+    if names.under is not None:
+        content = {names.under: content}
+    if layout == "reference":
+        content["config"] = json.dumps(to_plain(config))
+    # Pass an open file, because torch writes the name of a path into the archive.
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)
+
+
+class Conversion(NamedTuple):
+    """A finished conversion: its source and target layouts, None for this package's own."""
+
+    source: str | None
+    target: str | None
+    config: ModelConfig
+
+
+def convert(
+    source: str | os.PathLike[str], target: str | os.PathLike[str], layout: str | None = None
+) -> Conversion:
+    """Convert a public checkpoint to a file of this package, or such a file to a public one.
+
+    Args:
+        source: what `read_checkpoint` reads.
+        target: for a public source, a .safetensors file. For one of ours, the public checkpoint.
+        layout: one of `LAYOUTS`, for a source of ours; by default the one its parts came from.
+
+    Returns:
+        What was read and written.
+
+    Raises:
+        InputError: what `read_checkpoint` and `write_checkpoint` raise, or a target or layout that
+            does not go with the source. Nothing is written then.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, init_crisalad, load, save_weights
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> save_weights(folder / "ours.safetensors", params, config)
+        >>> done = convert(folder / "ours.safetensors", folder / "public.pth", "reference")
+        >>> load(folder / "public.pth").config == config
+        True
+    """
+    if layout is not None:
+        choose("layout", layout, LAYOUTS)
+    check_target(target)
+    checkpoint = read_checkpoint(source)
+    if pathlib.Path(target).exists() and os.path.samefile(source, target):
+        raise InputError(f"{target}: found the source itself, expected another file")
+    suffix = pathlib.Path(target).suffix
+    if checkpoint.layout is None:
+        layout = layout or layout_for(checkpoint.config, target)
+        wanted = (".safetensors",) if layout == "huggingface" else TORCH_SUFFIXES
+        if suffix not in wanted:
+            raise InputError(
+                f"{target}: found suffix {suffix!r}, expected {' or '.join(wanted)} for {layout}"
+            )
+        try:
+            check_holds(checkpoint.config, layout, checkpoint.extras)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from error
+        write_checkpoint(target, checkpoint.params, checkpoint.config, layout, checkpoint.extras)
+        return Conversion(None, layout, checkpoint.config)
+    if layout is not None:
+        raise InputError(
+            f"{source}: found a public checkpoint ({checkpoint.layout}) beside --layout {layout}, "
+            "expected a file of this package; convert it to one first"
+        )
+    if suffix != ".safetensors":
+        raise InputError(f"{target}: found suffix {suffix!r}, expected .safetensors")
+    save_weights(target, checkpoint.params, checkpoint.config, extras=checkpoint.extras)
+    return Conversion(checkpoint.layout, None, checkpoint.config)
+
+
+def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) -> Any:
+    """Read the backbone of any checkpoint, for a model of `config`.
+
+    Adapters are read if the file has the same kind and sizes; otherwise they are those of `fresh`.
+
+    Args:
+        path: what `load` reads.
+        config: the backbone of the model.
+        fresh: parameters of such a backbone, whose adapters are taken where the file has none.
+
+    Returns:
+        The backbone's parameters.
+
+    Raises:
+        InputError: what `read_checkpoint` raises, or the backbone is of another size (all fields
+            that differ are listed).
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, init_crisalad, save_weights
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> save_weights(folder / "model.safetensors", params, config)
+        >>> fresh = config.backbone.init(jax.random.key(1))
+        >>> backbone = read_backbone(folder / "model.safetensors", config.backbone, fresh)
+        >>> bool((backbone.cls_token == params.backbone.cls_token).all())
+        True
+    """
+    checkpoint = read_checkpoint(path)
+    theirs = checkpoint.config.backbone
+    if isinstance(theirs, ViTConfig) and isinstance(config, ViTConfig):
+        theirs = dataclasses.replace(theirs, adapter=config.adapter)
+    # Ignore free fields, such as the initialisation: weights do not depend on them.
+    wrong = differences(with_free_fields_of(config, theirs), config)
+    if wrong:
+        raise InputError(f"{path}: this backbone is of another size: {'; '.join(wrong)}")
+    if checkpoint.config.backbone == theirs or not isinstance(checkpoint.params.backbone, ViT):
+        return checkpoint.params.backbone
+    stack: Any = checkpoint.params.backbone.blocks  # one stack: only training cuts it
+    blocks = dataclasses.replace(stack, adapter=fresh.blocks.adapter)
+    return dataclasses.replace(checkpoint.params.backbone, blocks=blocks)

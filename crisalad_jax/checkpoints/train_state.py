@@ -1,0 +1,206 @@
+"""Save and load the states that a run resumes from.
+
+orbax writes the states. A test flipped 40 single bits in a stored state: orbax and tensorstore
+detected none, and 39 changed the loaded numbers. The SHA-256 of every file is therefore stored too.
+"""
+
+import contextlib
+import json
+import os
+import pathlib
+import shutil
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+from jaxtyping import PyTree
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import sha256_of, write_json
+from crisalad_jax.utils.pytree import named_leaves
+
+_DROPPED = "dropped"
+_SEAL = "sha256.json"
+
+
+class SavedState(NamedTuple):
+    """A restored state of a run."""
+
+    step: int
+    state: Any
+    record: dict[str, Any]
+
+
+class StateStore:
+    """The resumable states of a run (orbax): each step is written whole or not at all."""
+
+    def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
+        """Open or make the folder; the last `keep` states stay.
+
+        Raises:
+            InputError: the folder cannot be made or read.
+        """
+        folder = pathlib.Path(folder).absolute()
+        self._folder, self._dropped = folder, folder / _DROPPED
+        # Only the primary process has a store: without this orbax would wait for the others.
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=jax.process_index(), active_processes={jax.process_index()}
+        )
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep,
+            create=False,
+            todelete_subdir=_DROPPED,
+            enable_async_checkpointing=True,
+            async_options=ocp.AsyncOptions(post_finalization_callback=self._seal),
+            cleanup_tmp_directories=True,
+            multiprocessing_options=alone,
+        )
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._manager = ocp.CheckpointManager(
+                folder,
+                options=options,
+                item_handlers={
+                    "state": ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+                    "record": ocp.JsonCheckpointHandler(multiprocessing_options=alone),
+                },
+            )
+        except OSError as error:
+            raise InputError(f"{folder}: cannot keep states here: {error.strerror}") from error
+        self._clear()
+
+    def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:
+        """Write the arrays of `state` and the JSON values of `record`, replacing this step's.
+
+        It copies the arrays before it returns, and writes the copies in the background.
+
+        Raises:
+            InputError: this one, or one before, cannot be written.
+        """
+        with self._written():
+            self._manager.wait_until_finished()
+            self._clear()
+            if step in self._manager.all_steps():
+                self._manager.delete(step)
+            # Copy, because the next training step donates the buffers of this state.
+            arrays = ocp.args.StandardSave(jax.tree.map(np.array, _stored(state)))
+            self._manager.save(
+                step, args=ocp.args.Composite(state=arrays, record=ocp.args.JsonSave(record))
+            )
+
+    def load(self, template: PyTree) -> SavedState | None:
+        """Restore the last state.
+
+        Args:
+            template: a state of the same structure and shapes.
+
+        Returns:
+            The state; None if there is none.
+
+        Raises:
+            InputError: the stored arrays are damaged or do not fit the template.
+        """
+        self.wait()
+        step = self._manager.latest_step()
+        if step is None:
+            return None
+        arrays = jax.tree.map(ocp.utils.to_shape_dtype_struct, _stored(template))
+        try:
+            # Check before orbax reads any array: it reads all at once, and raises for a misfit in
+            # another thread.
+            self._check_seal(step)
+            stored = self._manager.item_metadata(step)["state"].tree
+            arrays = {_name_among(stored, name): shape for name, shape in arrays.items()}
+            _check_arrays(arrays, stored)
+        except (OSError, ValueError) as error:
+            older = [other for other in self._manager.all_steps() if other != step]
+            advice = f"; delete it to go on from step {max(older)}" if older else ""
+            raise InputError(
+                f"{self._folder / str(step)}: this state is damaged or not of this run{advice} "
+                f"({error})"
+            ) from error
+        saved = self._manager.restore(
+            step,
+            args=ocp.args.Composite(
+                state=ocp.args.StandardRestore(arrays), record=ocp.args.JsonRestore()
+            ),
+        )
+        # Convert by numpy: arrays that orbax commits to a device would recompile the step.
+        leaves = [
+            jnp.asarray(np.asarray(saved["state"].get(_name_among(stored, name), leaf)))
+            for name, leaf in named_leaves(template).items()
+        ]
+        state = jax.tree.unflatten(jax.tree.structure(template), leaves)
+        return SavedState(step, state, saved["record"])
+
+    def _seal(self) -> None:
+        """Write the digests of a state's files, before orbax renames it to its final name."""
+        (temporary,) = ocp.utils.tmp_checkpoints(self._folder)
+        folder = pathlib.Path(temporary.get())
+        write_json(folder / _SEAL, _hashes(folder))
+
+    def _check_seal(self, step: int) -> None:
+        folder = self._folder / str(step)
+        hashes = _hashes(folder)
+        for name, sha256 in json.loads((folder / _SEAL).read_text()).items():
+            if hashes.get(name) != sha256:
+                what = "other bytes than were saved" if name in hashes else "no file"
+                raise ValueError(f"{name}: found {what}")
+
+    def wait(self) -> None:
+        """Wait until all saved states are on the disk; raise as `save`."""
+        with self._written():
+            self._manager.wait_until_finished()
+
+    def close(self) -> None:
+        """Wait for pending writes and close the store; raise as `save`."""
+        with self._written():
+            self._manager.close()
+        self._clear()
+
+    @contextlib.contextmanager
+    def _written(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:  # ValueError comes from tensorstore
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(f"{self._folder}: cannot write this state: {reason}") from error
+
+    def _clear(self) -> None:
+        # Dropped states are renamed before removal, so that a kill leaves no partial state.
+        shutil.rmtree(self._dropped, ignore_errors=True)
+
+
+def _hashes(folder: pathlib.Path) -> dict[str, str]:
+    """Compute the SHA-256 of all files of a state's arrays and record."""
+    files = (path for path in folder.glob("*/**/*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
+
+
+def _stored(state: PyTree) -> dict[str, Any]:
+    """Return the leaves by name, without empty ones (absent registers), which orbax refuses."""
+    return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}
+
+
+def _name_among(stored: Mapping[str, Any], name: str) -> str:
+    """Return an array's stored name; version 0.1 named the encoder otherwise."""
+    old = name.replace(".cross_image.layers.", ".encoder.layers.")
+    return old if old in stored else name
+
+
+def _check_arrays(expected: dict[str, jax.ShapeDtypeStruct], stored: dict[str, Any]) -> None:
+    """Check names and shapes of the stored arrays; raise ValueError."""
+    differing = sorted(
+        name
+        for name in expected.keys() | stored.keys()
+        if name not in expected or name not in stored or expected[name].shape != stored[name].shape
+    )
+    if differing:
+        first = differing[0]
+        shapes = [tree[first].shape if first in tree else "none" for tree in (stored, expected)]
+        raise ValueError(
+            f"{len(differing)} arrays differ, as {first}: found {shapes[0]}, expected {shapes[1]}"
+        )

@@ -1,0 +1,286 @@
+"""Read and write files of weights: safetensors with the configuration and its parts' sources."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+
+from crisalad_jax.config.fields import essence, with_free_fields_of
+from crisalad_jax.config.io import differences, from_plain, to_plain
+from crisalad_jax.config.source import changed_sources, sources_of
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source, write_safetensors
+from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.version import VERSION
+
+FORMAT = "crisalad-jax 2"
+"""Only key of a weight file's metadata, because several have no fixed order. Its value is JSON: the
+configuration, the version of this package, and the name and source's digest of every part."""
+FORMAT_1 = "crisalad-jax 1"
+"""Metadata key of version 0.1, whose value was the configuration alone."""
+_MARK = "aggregator.backbone"
+"""Array in files of version 0.1: a checksum of the backbone of AnyLoc's vocabulary; 0 before one is
+built."""
+EXTRA = "extra."
+"""Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
+
+
+def save_weights(
+    path: str | os.PathLike[str],
+    params: Crisalad,
+    config: ModelConfig,
+    *,
+    extras: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Write parameters under their dotted names, and the configuration in the file's metadata.
+
+    Args:
+        path: the file, a .safetensors.
+        params: all parameters of the model.
+        config: the model.
+        extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
+
+    Raises:
+        InputError: the folder cannot be made, or the file not be written; or AnyLoc's vocabulary is
+            of another backbone.
+
+    Example:
+        >>> import jax, tempfile
+        >>> from crisalad_jax import PRESETS, init_crisalad, load
+        >>> params = init_crisalad(jax.random.key(0), PRESETS["tiny"])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_weights(f"{folder}/w.safetensors", params, PRESETS["tiny"])
+        ...     loaded, config = load(f"{folder}/w.safetensors")
+        >>> config == PRESETS["tiny"]
+        True
+    """
+    config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
+    arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
+    metadata = {
+        "config": to_plain(config),
+        "version": VERSION,
+        "parts": sources_of(config),
+        "aggregator": config.aggregator.metadata(params.aggregator),
+    }
+    write_safetensors(path, arrays, {FORMAT: json.dumps(metadata)})
+
+
+def is_ours(path: str | os.PathLike[str]) -> bool:
+    """Return whether this is a whole safetensors file that `save_weights` wrote."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            return not {FORMAT, FORMAT_1}.isdisjoint(file.metadata() or {})
+    except (safetensors.SafetensorError, OSError):
+        return False
+
+
+def load_extras(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """Return the `extras` that `save_weights` wrote."""
+    with safetensors.safe_open(path, framework="numpy") as file:
+        names = [name for name in file.keys() if name.startswith(EXTRA)]  # noqa: SIM118
+        return {name.removeprefix(EXTRA): file.get_tensor(name) for name in names}
+
+
+def load_weights(
+    path: str | os.PathLike[str], expected: ModelConfig | None = None
+) -> tuple[Crisalad, ModelConfig]:
+    """Read the parameters and configuration that `save_weights` wrote.
+
+    Files of version 0.1 load too. A note tells if a part's source has changed since the weights
+    were written.
+
+    Args:
+        path: the file.
+        expected: if given, the configuration that the file must have, except for what parameters
+            do not depend on: image size (but MixVPR's do), dropout, compute type, remat.
+
+    Returns:
+        (params, config).
+
+    Raises:
+        InputError: the file is missing, cut short or no such file; it needs a part that is not
+            registered; its parameters do not fit its configuration or are not finite (all that are
+            missing, unknown or wrong are listed); its configuration is not `expected` (all fields
+            that differ are listed); or AnyLoc's vocabulary is of another backbone.
+
+    Example:
+        >>> load_weights("none.safetensors")
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
+    """
+    path = pathlib.Path(path)
+    arrays, metadata = _read(path)
+    config = from_plain(ModelConfig, metadata["config"], source=f"{path} (metadata)")
+    if expected is not None:
+        wrong = differences(_as_free_as(expected, config), expected)
+        if wrong:
+            raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
+    params = _fill(config, arrays, path)
+    own = config.aggregator.with_metadata(params.aggregator, metadata.get("aggregator", {}))
+    mark = metadata.get(_MARK)
+    if mark:
+        _check_mark(mark, params.backbone, str(path))
+        own = config.aggregator.bind(own, params.backbone)
+    params = dataclasses.replace(params, aggregator=own)
+    config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
+    same_version = metadata.get("version") == VERSION
+    changed = changed_sources(config, metadata.get("parts", {}), same_version)
+    if changed:
+        tell(
+            f"{path}: found another source of {', '.join(changed)} than these weights were written "
+            "with; descriptors may differ"
+        )
+    return params, config
+
+
+def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read the arrays by name, and the metadata in today's format."""
+    check_source(path, "a .safetensors file of weights")
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            key = next((key for key in (FORMAT, FORMAT_1) if key in metadata), None)
+            if key is None:
+                raise InputError(
+                    f"{path}: found metadata {sorted(metadata)}, expected {FORMAT!r}, as this "
+                    "package writes it; `crisalad convert` reads public checkpoints"
+                )
+            names = [name for name in file.keys() if not name.startswith(EXTRA)]  # noqa: SIM118
+            arrays = {name: file.get_tensor(name) for name in names}
+    except (safetensors.SafetensorError, OSError) as error:
+        raise InputError(
+            f"{path}: not a whole safetensors file: {error}; `crisalad convert` reads torch files"
+        ) from error
+    try:
+        plain = json.loads(metadata[key])
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: found no configuration in its metadata: {error}") from error
+    if key == FORMAT_1:
+        mark = arrays.pop(_MARK, np.zeros(()))
+        return dict(_renamed(arrays)), {"config": plain, _MARK: float(mark.max(initial=0))}
+    if not isinstance(plain, dict) or "config" not in plain:
+        raise InputError(f"{path}: found no configuration in its metadata, expected 'config'")
+    for name in ("parts", "aggregator"):
+        value = plain.setdefault(name, {})
+        if not isinstance(value, dict):
+            raise InputError(
+                f"{path} (metadata): found {name} of {type(value).__name__}, expected an object"
+            )
+    pairs = {field: pair for field, pair in plain["parts"].items() if _is_pair(pair)}
+    return arrays, plain | {"parts": pairs}
+
+
+def _is_pair(value: Any) -> bool:
+    """Return whether this is a part's name and its source's digest."""
+    return isinstance(value, list) and len(value) == 2
+
+
+def _renamed(arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield arrays of version 0.1 under today's names."""
+    for name, array in arrays.items():
+        inside = name.startswith("encoder.")
+        yield (f"cross_image.{name.removeprefix('encoder.')}" if inside else name), array
+
+
+def _check_mark(mark: float, backbone: Any, source: str) -> None:
+    """Raise InputError where a vocabulary of version 0.1 is of another backbone."""
+    value = 0
+    for name, leaf in named_leaves(backbone).items():
+        value = zlib.crc32(np.ascontiguousarray(leaf).data, zlib.crc32(name.encode(), value))
+    if mark != 1 + value % (2**24 - 1):  # whole numbers that float32 holds
+        raise InputError(
+            f"{source}: found a vocabulary of another backbone, expected one of these weights' "
+            "(`crisalad vocabulary` builds it)"
+        )
+
+
+def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
+    free = with_free_fields_of(expected, config)
+    if config.aggregator.fixed_grid:
+        free = dataclasses.replace(free, image_size=config.image_size)
+    return free
+
+
+def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:
+    # Check before making a template: the file may claim any sizes. Small misfits are listed below.
+    largest = max(number for _, number in _whole_numbers(to_plain(config)))
+    layers = count_layers(config) - config.backbone.depth
+    if largest > max(2**20, sum(array.size for array in arrays.values())) or (
+        layers > max(64, len(arrays))
+    ):
+        raise InputError(
+            f"{path}: found {len(arrays)} arrays, far from the sizes that its configuration says, "
+            f"of up to {largest}"
+        )
+    template = parameter_shapes(config)
+    wanted = named_leaves(template)
+    problems = [f"{name} missing" for name in wanted.keys() - arrays.keys()]
+    problems += [f"{name} unknown" for name in arrays.keys() - wanted.keys()]
+    for name, leaf in wanted.items():
+        if name not in arrays:
+            continue
+        array = arrays[name]
+        if (array.dtype, array.shape) != (leaf.dtype, leaf.shape):
+            problems.append(
+                f"{name} found {array.dtype} {array.shape}, expected {leaf.dtype} {leaf.shape}"
+            )
+        elif not np.isfinite(array).all():
+            problems.append(f"{name} holds NaN or infinity")
+    if problems:
+        raise InputError(f"{path}: weights do not fit: {'; '.join(sorted(problems))}")
+    leaves = [jnp.asarray(arrays[name]) for name in wanted]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+def count_layers(config: ModelConfig) -> int:
+    """Count the layers with parameters that a configuration asks for."""
+    numbers = _whole_numbers(to_plain(config))
+    return sum(number for name, number in numbers if name.endswith((".layers", ".depth")))
+
+
+def _whole_numbers(plain: Any, name: str = "") -> Iterator[tuple[str, int]]:
+    """Yield all whole numbers of a configuration by their dotted names."""
+    if isinstance(plain, Mapping):
+        for key, value in plain.items():
+            yield from _whole_numbers(value, f"{name}.{key}")
+    elif type(plain) is int:
+        yield name, plain
+
+
+def model_hash(params: Crisalad, config: ModelConfig) -> str:
+    """Compute a digest of all that determines descriptors, besides image size and rounding.
+
+    The digest covers the parameters' names, types, shapes and values. It also covers the
+    configuration's fields that outputs depend on, if they differ from their defaults. It is the
+    same for a copy in another layout, and for a version of this package with more fields.
+
+    Args:
+        params: all parameters of the model.
+        config: the model.
+
+    Returns:
+        SHA-256 in hexadecimal digits.
+    """
+    plain = essence(config)
+    if config.aggregator.fixed_grid:
+        plain["image_size"] = list(config.image_size)
+    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name, leaf in sorted(named_leaves(params).items()):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()

@@ -1,0 +1,146 @@
+"""Flags for every field of a configuration, and for those of its parts.
+
+`--model.aggregator gem` puts a registered part in place; `--model.aggregator.FIELD` sets its
+fields.
+"""
+
+import ast
+import dataclasses
+import functools
+import inspect
+import itertools
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, get_type_hints
+
+import tyro
+
+from crisalad_jax.config.parts import Part, Registry
+
+_NAME = "part_name"
+
+
+@dataclasses.dataclass
+class Flags:
+    """A configuration while its flags are parsed, before any of it is checked."""
+
+    kind: type
+    """Class of the configuration."""
+    values: dict[str, Any]
+    """Values of the fields, by name; nested configurations are `Flags` themselves."""
+    registry: Registry[Any] | None = None
+    """Registry of a part's kind; None for a configuration that is no part."""
+
+
+def flags_of(config: Any) -> Flags:
+    """Turn a configuration into flags, with its values as defaults."""
+    values = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        values[field.name] = flags_of(value) if dataclasses.is_dataclass(value) else value
+    return Flags(type(config), values, config.registry if isinstance(config, Part) else None)
+
+
+def choose_parts(flags: Flags, arguments: Sequence[str], preset: str, prefix: str = "") -> Flags:
+    """Replace parts by those that arguments name, so that there are flags for their fields.
+
+    Args:
+        flags: the configuration's.
+        arguments: the command line's.
+        preset: the size of the model, which parts come in.
+        prefix: beginning of the names of this configuration's flags.
+
+    Raises:
+        InputError: no such part.
+    """
+    values = dict(flags.values)
+    for name, value in values.items():
+        if not isinstance(value, Flags):
+            continue
+        path = f"{prefix}{name}"
+        chosen = None if value.registry is None else find_flag(arguments, f"--{path}")
+        if chosen is not None and value.registry is not None:
+            kind = value.registry.find(chosen)
+            if kind is not value.kind:
+                value = flags_of(value.registry.make(chosen, preset))
+        values[name] = choose_parts(value, arguments, preset, f"{path}.")
+    return dataclasses.replace(flags, values=values)
+
+
+def find_flag(arguments: Sequence[str], name: str) -> str | None:
+    """Return the value after the last occurrence of a flag; None where it is not given."""
+    last = None
+    for position, argument in enumerate(arguments):
+        flag, equals, value = argument.partition("=")
+        if not _same_flag(flag, name):
+            continue
+        if equals:
+            last = value
+        elif position + 1 < len(arguments):
+            last = arguments[position + 1]
+    return last
+
+
+def _same_flag(given: str, name: str) -> bool:
+    return given.replace("_", "-") == name.replace("_", "-")
+
+
+def type_of(flags: Flags) -> tuple[type, Any]:
+    """Make a dataclass with a flag for every field, and an instance with the defaults."""
+    fields: list[tuple[str, Any, Any]] = []
+    if flags.registry is not None:
+        names = tuple(flags.registry.names())
+        words = f"Which {flags.registry.kind}; its own settings follow."
+        here = tyro.conf.arg(name="", help=words)
+        fields.append((_NAME, Annotated[Literal[names], here], flags.kind.part_name))  # pyright: ignore
+    hints, docs = get_type_hints(flags.kind), field_docs(flags.kind)
+    for name, value in flags.values.items():
+        if isinstance(value, Flags):
+            kind, default = type_of(value)
+        else:
+            kind, default = Annotated[hints[name], tyro.conf.arg(help=docs.get(name))], value
+        fields.append((name, kind, dataclasses.field(default=default)))
+    made = dataclasses.make_dataclass(flags.kind.__name__, fields, frozen=True)
+    made.__doc__ = flags.kind.__doc__
+    return made, made()
+
+
+def config_of(flags: Flags, parsed: Any) -> Any:
+    """Make the configuration from a parsed instance of `type_of`'s class.
+
+    Raises:
+        InputError: what the configuration's own checks raise.
+    """
+    values = {}
+    for name, value in flags.values.items():
+        given = getattr(parsed, name)
+        values[name] = config_of(value, given) if isinstance(value, Flags) else given
+    return flags.kind(**values)
+
+
+@functools.cache
+def field_docs(kind: type) -> Mapping[str, str]:
+    """Read the texts below the fields of a dataclass and of its base classes."""
+    docs: dict[str, str] = {}
+    for each in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(each):
+            continue
+        try:
+            source = textwrap.dedent(inspect.getsource(each))
+        except (OSError, TypeError):  # made in a console
+            continue
+        (node,) = ast.parse(source).body
+        body = node.body if isinstance(node, ast.ClassDef) else []
+        for line, below in itertools.pairwise(body):
+            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
+                text = _text(below)
+                if text is not None:
+                    docs[line.target.id] = text
+    return docs
+
+
+def _text(node: ast.stmt) -> str | None:
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        value = node.value.value
+        return inspect.cleandoc(value) if isinstance(value, str) else None
+    return None

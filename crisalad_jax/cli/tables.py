@@ -1,0 +1,87 @@
+"""Tables that the commands print."""
+
+from collections.abc import Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
+from crisalad_jax.retrieval.maps.query import Answers
+from crisalad_jax.training.summary import ModelSummary
+
+
+def grouping_table(results: Sequence[GroupingResult]) -> Table:
+    """Make a table of results for the terminal, in percent, about 97 columns wide.
+
+    Each recall stands above its interval, and a mean over shuffles before their spread.
+    """
+    table = Table(show_lines=True)
+    table.add_column("queries/\ndatabase", no_wrap=True)
+    recall_names = [f"R@{k}\n95 %" for k in results[0].recalls]
+    for name in ("same place\nq / db", *recall_names, "AP", "R at\n100 % P"):
+        table.add_column(name, justify="right", overflow="fold")
+    for result in results:
+        spread = result.spread or _NO_SPREAD
+        recall_cells = (
+            f"{_or_dash(value)}{_spread(spread.recalls.get(k))}\n"
+            f"{_or_dash(result.intervals[k].low)}-{_or_dash(result.intervals[k].high)}"
+            for k, value in result.recalls.items()
+        )
+        cells = (
+            result.grouping + (f"\n+ {result.rerank}" if result.rerank else ""),
+            f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}",
+            *recall_cells,
+            f"{_or_dash(result.average_precision)}\n{_spread(spread.average_precision)}",
+            f"{_or_dash(result.recall_at_full_precision)}\n"
+            f"{_spread(spread.recall_at_full_precision)}",
+        )
+        table.add_row(*map(Text, cells))
+    return table
+
+
+_NO_SPREAD = Scores({}, None, None)
+
+
+def _or_dash(fraction: float | None) -> str:
+    return "-" if fraction is None else percent(fraction)
+
+
+def _spread(fraction: float | None) -> str:
+    return "" if fraction is None else f" ±{percent(fraction)}"
+
+
+def summary_table(summary: ModelSummary, name: str) -> Table:
+    """Make a table of a model's parts for the terminal; `name` is the model's."""
+    height, width = summary.image_size
+    table = Table("part", title=f"{name} at {height} x {width}")
+    table.add_column("parameters", justify="right")
+    table.add_column("multiply-accumulates an image", justify="right")
+    for cost in summary.parts:
+        table.add_row(cost.part, f"{cost.parameters:,}", f"{cost.macs:,}")
+    table.add_section()
+    parameters = sum(cost.parameters for cost in summary.parts)
+    table.add_row("all", f"{parameters:,}", f"{sum(cost.macs for cost in summary.parts):,}")
+    return table
+
+
+def answers_table(answers: Answers, title: str = "") -> Table:
+    """Make a table of answers for the terminal."""
+    table = Table(title=title, title_justify="left")
+    table.add_column("query", overflow="fold")
+    table.add_column("rank", justify="right")
+    table.add_column("name", overflow="fold")
+    table.add_column("similarity", justify="right", no_wrap=True)
+    table.add_column(", ".join(answers.axes or ("position",)), justify="right", overflow="fold")
+    for path, ranked in answers.rows():
+        for answer in ranked:
+            position = answers.position(answer.image)
+            cells = (
+                path.as_posix() if answer.rank == 1 else "",
+                str(answer.rank),
+                answer.image.name,
+                f"{answer.similarity:.3f}",
+                "-" if position is None else ", ".join(f"{v:.9g}" for v in position.values()),
+            )
+            # `Text` keeps square brackets in a name from being markup.
+            table.add_row(*map(Text, cells), end_section=answer.rank == len(ranked))
+    return table

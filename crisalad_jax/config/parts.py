@@ -1,0 +1,242 @@
+"""Swappable parts: frozen dataclasses registered by name, both built-in and of plug-ins.
+
+A part's fields are its settings, and its methods are its behaviour. Each kind of part has a base
+class, which defines the methods, and a registry, which maps names to classes.
+"""
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
+
+from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_of
+from crisalad_jax.utils.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """Base class of everything that can be swapped without changing this package."""
+
+    registry: ClassVar["Registry[Any]"]
+    part_name: ClassVar[str]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle by name, so that another process finds a part of a plug-in file."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        plugin = plugin_of(type(self).__module__)
+        return _restore, (self.registry.kind, self.part_name, fields, plugin)
+
+
+P = TypeVar("P", bound=Part)
+
+if TYPE_CHECKING:
+    OrName = Annotated[P, "or its name"]
+else:
+
+    class OrName:
+        """The type of a field for a part; a name given for it is replaced by the part."""
+
+        def __class_getitem__(cls, kind: type[Part]) -> Any:
+            """Return the type of the values that the field accepts."""
+            return kind | str
+
+
+_C = TypeVar("_C", bound=Callable[..., Any])
+REGISTRIES: dict[str, "Registry[Any]"] = {}
+"""All registries by kind."""
+
+
+def _restore(kind: str, name: str, fields: Mapping[str, Any], plugin: str | None) -> Part:
+    registry = REGISTRIES[kind]
+    if plugin is not None and name not in registry.names():
+        load_plugin(plugin)
+    return registry.find(name)(**fields)
+
+
+class Registry(Generic[P]):
+    """The parts of one kind by name."""
+
+    def __init__(
+        self,
+        kind: str,
+        base: type[P],
+        *,
+        of_function: Callable[[Callable[..., Any]], Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Make the registry of a kind, and set `base.registry` to it.
+
+        Args:
+            kind: what messages call a part of this kind, such as "aggregator".
+            base: the class that all parts of this kind inherit from.
+            of_function: for kinds whose parts may be plain functions, returns the methods of the
+                part that wraps a function.
+        """
+        self.kind, self.base, self._of_function = kind, base, of_function
+        self._parts: dict[str, type[P]] = {}
+        self._presets: dict[str, Mapping[str, Mapping[str, Any]]] = {}
+        base.registry = self
+        REGISTRIES[kind] = self
+
+    def register(self, name: str, **presets: Mapping[str, Any]) -> Callable[[_C], _C]:
+        """Return a decorator that registers a class, or a plain function, under `name`.
+
+        Args:
+            name: what configurations, files and flags call the part.
+            presets: by the name of a preset of model sizes, the fields that differ there from the
+                part's defaults.
+
+        Raises:
+            InputError: when it decorates: the name is taken, or the part is no frozen dataclass of
+                this kind.
+        """
+
+        def decorate(part: _C) -> _C:
+            self._add(name, self._class_of(name, part), presets)
+            return part
+
+        return decorate
+
+    def _class_of(self, name: str, part: Callable[..., Any]) -> type[P]:
+        where = f"register_{self.kind} {name!r}"
+        if not inspect.isclass(part):
+            if self._of_function is None or not callable(part):
+                raise InputError(
+                    f"{where}: found {type(part).__name__}, expected a frozen dataclass that "
+                    f"inherits from {self.base.__name__}"
+                )
+            return self._made_of(part)
+        parameters = part.__dict__.get("__dataclass_params__")
+        if parameters is None or not parameters.frozen:
+            raise InputError(
+                f"{where}: found {part.__qualname__}, which is no frozen dataclass, expected "
+                "@dataclasses.dataclass(frozen=True) below the registration"
+            )
+        if not issubclass(part, self.base):
+            raise InputError(
+                f"{where}: found {part.__qualname__}, expected a subclass of {self.base.__name__}"
+            )
+        if "name" in {field.name for field in dataclasses.fields(part)}:
+            raise InputError(f"{where}: found a field 'name', which files keep the part's own in")
+        missing = sorted(getattr(part, "__abstractmethods__", ()))
+        if missing:
+            raise InputError(f"{where}: found no method {', '.join(missing)}, expected it")
+        try:
+            hash(part())
+        except TypeError as error:
+            raise InputError(
+                f"{where}: {error}; expected a default for every field, and values that can be "
+                "hashed, such as tuples for lists"
+            ) from error
+        return part
+
+    def _made_of(self, function: Callable[..., Any]) -> type[P]:
+        """Wrap a plain function in a part without settings."""
+        assert self._of_function is not None
+        members = {
+            "__doc__": function.__doc__ or f"The {self.kind} {function.__name__}.",
+            "__module__": function.__module__,
+            "__qualname__": function.__qualname__,
+            **self._of_function(function),
+        }
+        made = type(function.__name__, (self.base,), members)
+        return cast(type[P], dataclasses.dataclass(frozen=True)(made))
+
+    def _add(self, name: str, part: type[P], presets: Mapping[str, Mapping[str, Any]]) -> None:
+        there = self._parts.get(name)
+        # A notebook's cell or a plug-in's file that runs again registers the same part.
+        if there is not None and _home(there) != _home(part):
+            raise InputError(
+                f"register_{self.kind}: found the name {name!r} taken by {there.__module__}."
+                f"{there.__qualname__}, expected another name for {part.__qualname__}"
+            )
+        earlier = vars(part).get("part_name", name)
+        if earlier != name:
+            raise InputError(
+                f"register_{self.kind} {name!r}: found {part.__qualname__} registered as "
+                f"{earlier!r}, expected one name for a class"
+            )
+        part.part_name = name
+        self._parts[name] = part
+        self._presets[name] = presets
+
+    def names(self) -> list[str]:
+        """Return the names of all parts, in order."""
+        return sorted(self._parts)
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over `names`."""
+        return iter(self.names())
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether a part has this name."""
+        return name in self._parts
+
+    def find(self, name: str) -> type[P]:
+        """Return the class of the part with this name; if needed, load installed plug-ins first.
+
+        Raises:
+            InputError: there is none; the message lists those there are.
+        """
+        # A file may have any value in the place of a name, even an unhashable one.
+        if name not in self.names():
+            load_entry_points()
+        if name not in self.names():
+            raise InputError(
+                f"{self.kind}: found {name!r}, expected one of {', '.join(self.names())} (is a "
+                "plug-in missing? --plugin FILE.py or MODULE, or load_plugin)"
+            )
+        return self._parts[name]
+
+    def make(self, name: str, preset: str | None = None, **fields: Any) -> P:
+        """Make the part with this name, with the settings of the preset of model sizes.
+
+        Raises:
+            InputError: what `find` raises, or a field is out of range.
+        """
+        part = self.find(name)
+        return part(**{**self._presets[name].get(preset or "", {}), **fields})
+
+
+def part_field(registry: Registry[P], default: str | type[P]) -> P:
+    """Return a dataclass field for a part, by default the one with this name, or of this class."""
+    make: Any = functools.partial(registry.make, default) if isinstance(default, str) else default
+    return dataclasses.field(default_factory=make, metadata={"registry": registry})
+
+
+def resolve_names(config: Any) -> None:
+    """Replace names by parts in a configuration that is being constructed.
+
+    Raises:
+        InputError: a name that is not registered, or a value that is no part of the kind.
+    """
+    for field in dataclasses.fields(config):
+        registry = field.metadata.get("registry")
+        if registry is None:
+            continue
+        value = getattr(config, field.name)
+        where = f"{type(config).__name__}.{field.name}"
+        if isinstance(value, str):
+            try:
+                value = registry.make(value)
+            except InputError as error:
+                raise InputError(f"{where}: {error}") from error
+            object.__setattr__(config, field.name, value)
+        elif not isinstance(value, registry.base):
+            raise InputError(f"{where}: found {value!r}, expected a {registry.kind} or its name")
+
+
+def _home(part: type[Part]) -> tuple[str, str]:
+    return part.__module__, part.__qualname__
+
+
+def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
+    """Return all parts in a configuration by the dotted names of their fields."""
+    parts: dict[str, Part] = {}
+    if isinstance(config, Part):
+        parts[prefix] = config
+    if dataclasses.is_dataclass(config):
+        for field in dataclasses.fields(config):
+            name = f"{prefix}.{field.name}" if prefix else field.name
+            parts |= parts_of(getattr(config, field.name), name)
+    return parts

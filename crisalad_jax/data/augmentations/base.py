@@ -1,0 +1,73 @@
+"""Augmentations: random changes of training images, and the interface of a new one."""
+
+import abc
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from crisalad_jax.config.parts import Part, Registry
+
+Image = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Augmentation(Part, abc.ABC):
+    """A random change of training images: a frozen dataclass whose fields are its strengths.
+
+    A plain function of (image, generator) is an augmentation without settings.
+
+    Example:
+        >>> from crisalad_jax import TrainConfig, register_augmentation
+        >>> @register_augmentation("mirrored")
+        ... def mirrored(image, generator):
+        ...     return image[:, ::-1] if generator.random() < 0.5 else image
+        >>> TrainConfig(augmentation="mirrored").augmentation.part_name
+        'mirrored'
+    """
+
+    @abc.abstractmethod
+    def apply(
+        self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
+    ) -> Image:
+        """Return the changed image, of the same size.
+
+        Args:
+            image: 8-bit RGB, of the model's size. Do not write to it; it may be returned.
+            generator: draws for this image alone.
+            of_place: draws the same for all images of one place in a batch.
+        """
+
+
+def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the methods of an augmentation that is a plain function."""
+    count = len(inspect.signature(function).parameters)
+
+    def apply(
+        self: Augmentation,
+        image: Image,
+        generator: np.random.Generator,
+        *,
+        of_place: np.random.Generator,
+    ) -> Image:
+        return function(*(image, generator)[:count])
+
+    return {"apply": apply}
+
+
+AUGMENTATIONS = Registry("augmentation", Augmentation, of_function=_of_function)
+
+
+@AUGMENTATIONS.register("none")
+@dataclasses.dataclass(frozen=True)
+class NoAugmentation(Augmentation):
+    """Leave images as they are."""
+
+    def apply(
+        self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
+    ) -> Image:
+        """Return the image itself."""
+        return image

@@ -1,0 +1,103 @@
+"""A light augmentation, for training from scratch on fixed cameras."""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+
+from crisalad_jax.config.checks import require, require_fraction
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
+
+# ITU-R BT.601 luma.
+_LUMA = np.array([0.299, 0.587, 0.114])
+
+
+@AUGMENTATIONS.register("light")
+@dataclasses.dataclass(frozen=True)
+class LightAugmentConfig(Augmentation):
+    """One small warp and mild changes of light, for training from scratch on fixed cameras."""
+
+    crop: float = 0.1
+    """Largest share of the side that a crop removes."""
+    shift: float = 0.05
+    """Largest shift, as a share of the side."""
+    rotation: float = 2.0
+    """Largest rotation in degrees."""
+    flip: float = 0.0
+    """Probability of a mirror image. All images of one place in a batch are mirrored alike."""
+    blur: float = 1.0
+    """Largest standard deviation of a Gaussian blur, in pixels."""
+    colour: float = 0.2
+    """Largest relative change of brightness, of contrast and of saturation."""
+    grey: float = 0.2
+    """Probability of dropping the colour."""
+    gamma: float = 0.0
+    """Largest change of the logarithm of an exponent on intensities."""
+    illumination: float = 0.0
+    """Largest change of log brightness in a smooth field over the image: uneven light."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_fraction(self, "crop", "shift", "colour")
+        for name in ("rotation", "blur", "gamma", "illumination"):
+            value = getattr(self, name)
+            require(value >= 0, f"LightAugmentConfig.{name}: found {value}, expected at least 0")
+        for name in ("flip", "grey"):
+            value = getattr(self, name)
+            require(
+                0 <= value <= 1,
+                f"LightAugmentConfig.{name}: found {value}, expected a probability from 0 to 1",
+            )
+
+    def apply(
+        self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
+    ) -> Image:
+        """Mirror all images of a place alike, then change this one."""
+        if self.flip > 0 and of_place.random() < self.flip:
+            image = cv2.flip(image, 1)
+        return light_augment(image, self, generator)
+
+
+def light_augment(
+    image: Image, config: LightAugmentConfig, generator: np.random.Generator
+) -> Image:
+    """Warp and blur an image a little, and change its light, contrast and colour.
+
+    The caller handles `config.flip`, because all images of a place are mirrored alike. Every call
+    draws the same number of random values, whatever the config.
+    """
+    height, width = image.shape[:2]
+    scale = generator.uniform(1 - config.crop, 1)
+    shift = generator.uniform(-config.shift, config.shift, size=2) * (width, height)
+    angle = math.radians(generator.uniform(-config.rotation, config.rotation))
+    sigma = generator.uniform(0, config.blur)
+    brightness, contrast, saturation = generator.uniform(1 - config.colour, 1 + config.colour, 3)
+    if generator.random() < config.grey:
+        saturation = 0.0
+    exponent = math.exp(generator.uniform(-config.gamma, config.gamma))
+    light = generator.uniform(-config.illumination, config.illumination, (3, 3))
+
+    turn = scale * np.array(
+        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    )
+    centre = np.array([width - 1, height - 1]) / 2
+    matrix = np.column_stack([turn, centre + shift - turn @ centre])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    image = cv2.warpAffine(
+        image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT
+    )
+    if sigma > 0:
+        image = cv2.GaussianBlur(image, (0, 0), sigma)
+    if exponent != 1:
+        levels = np.arange(256) / 255
+        image = cv2.LUT(image, np.round(255 * levels**exponent).astype(np.uint8))
+    if light.any():
+        field = cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)
+        image = np.clip(np.exp(field)[..., None] * image, 0, 255).round().astype(np.uint8)
+    # The three factors are one affine map of the colours: brightness scales, contrast stretches
+    # about the mean luma, saturation stretches about each pixel's luma.
+    colour = saturation * np.eye(3) + (1 - saturation) * _LUMA
+    offset = (1 - contrast) * brightness * (_LUMA @ cv2.mean(image)[:3])
+    matrix = np.column_stack([brightness * contrast * colour, np.full(3, offset)])
+    return cv2.transform(image, matrix)

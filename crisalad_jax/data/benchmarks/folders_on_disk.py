@@ -1,0 +1,141 @@
+"""Folders, splits and images on disk, which several readers look for."""
+
+import os
+import pathlib
+from collections.abc import Iterable, Sequence
+
+from crisalad_jax.data.images import list_images
+from crisalad_jax.utils.errors import InputError
+
+SPLITS = ("test", "val", "train")
+
+
+def is_pair(root: pathlib.Path, *parts: str) -> bool:
+    """Return whether all `parts` are folders in `root`."""
+    return all((root / part).is_dir() for part in parts)
+
+
+def find_database(folder: pathlib.Path) -> pathlib.Path:
+    """Return the folder `database/`, or `gallery/` (SVOX) where there is none."""
+    gallery = folder / "gallery"
+    database = folder / "database"
+    return gallery if gallery.is_dir() and not database.is_dir() else database
+
+
+def has_sides(folder: pathlib.Path) -> bool:
+    """Return whether a folder itself holds a database and queries."""
+    return find_database(folder).is_dir() and (folder / "queries").is_dir()
+
+
+def list_part(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
+    """List the images under a folder, in sorted order.
+
+    Raises:
+        InputError: there is no such folder (the message lists its siblings), or no image in it.
+    """
+    if not folder.is_dir():
+        parent = folder.parent
+        raise InputError(f"{parent}: found {listing(parent)}, expected a folder {folder.name}")
+    return tuple(list_images(folder))
+
+
+def listing(folder: pathlib.Path) -> str:
+    """Describe in a message what a folder holds."""
+    if not folder.is_dir():
+        return "no such folder"
+    return shown(path.name + "/" * path.is_dir() for path in folder.iterdir())
+
+
+def shown(names: Iterable[str]) -> str:
+    """Join the first few of many names for a message."""
+    ordered = sorted(names)
+    some = ", ".join(ordered[:8]) or "nothing"
+    return f"{some} and {len(ordered) - 8} more" if len(ordered) > 8 else some
+
+
+def has_split(root: pathlib.Path) -> bool:
+    """Return whether any of `images/{test,val,train}` is there."""
+    return any((root / "images" / split).is_dir() for split in SPLITS)
+
+
+def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str]:
+    """Find the folder that holds database/ and queries/, and its name.
+
+    The folder is `root` itself or one of `images/{test,val,train}`. Without `split` it is the first
+    of test and val that is there.
+
+    Raises:
+        InputError: there is none.
+    """
+    # resolve: a root of "." still has a name to print
+    resolved = root.resolve()
+    if split is None and has_sides(root):
+        if resolved.parent.name == "images":
+            return root, f"{resolved.parent.parent.name}/{resolved.name}"
+        return root, resolved.name
+    splits = [name for name in SPLITS if (root / "images" / name).is_dir()]
+    if split is None:
+        split = next((name for name in splits if name != "train"), None)
+    if split is None or not (root / "images" / split).is_dir():
+        raise InputError(
+            f"{root}: found {listing(root)} and splits {', '.join(splits) or 'none'}, expected "
+            f"images/{split or 'test'} with database/ and queries/"
+        )
+    return root / "images" / split, f"{resolved.name}/{split}"
+
+
+def find_image_root(
+    named_by: pathlib.Path,
+    images: str | os.PathLike[str] | None,
+    first: str,
+    folders: Sequence[str] = (".",),
+) -> pathlib.Path:
+    """Find the folder that a file's image names are relative to, by the image `first`.
+
+    Args:
+        named_by: the file that names images, or the folder of it.
+        images: where they are; None looks beside that file, and one folder further up.
+        first: the name of one of them.
+        folders: folders there that may hold them.
+
+    Raises:
+        InputError: there is no such image.
+    """
+    if images is None:
+        beside = named_by if named_by.is_dir() else named_by.parent
+        roots = (beside, beside.absolute().parent)
+    else:
+        roots = (pathlib.Path(images),)
+    candidates = [root / folder for root in roots for folder in folders]
+    for candidate in candidates:
+        if (candidate / first).is_file():
+            return candidate
+    raise InputError(
+        f"{named_by}: found no image {first} in {', '.join(map(str, candidates))}; expected its "
+        "folder as images (--images)"
+    )
+
+
+def find_images(
+    named_by: pathlib.Path, root: pathlib.Path, names: Iterable[str]
+) -> tuple[pathlib.Path, ...]:
+    """Return the paths of all images that a file names relative to `root`.
+
+    Raises:
+        InputError: some are missing; how many, and which is the first.
+    """
+    paths = tuple(root / name for name in names)
+    # List each folder once: to stat thousands of files one by one is slow over a network.
+    there: dict[pathlib.Path, frozenset[str]] = {}
+    for folder in dict.fromkeys(path.parent for path in paths):
+        try:
+            there[folder] = frozenset(os.listdir(folder))
+        except OSError:
+            there[folder] = frozenset()
+    missing = [path for path in paths if path.name not in there[path.parent]]
+    if missing:
+        raise InputError(
+            f"{named_by}: found {len(missing)} of {len(paths)} images missing, expected all; the "
+            f"first is {missing[0]}"
+        )
+    return paths

@@ -1,0 +1,136 @@
+"""Find the layout of an evaluation set, and read it with the layout's options."""
+
+import os
+import pathlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.data.benchmarks import folders, vpr_bench
+from crisalad_jax.data.benchmarks.benchmark import Benchmark
+from crisalad_jax.data.benchmarks.folders_on_disk import (
+    find_split,
+    has_sides,
+    has_split,
+    is_pair,
+    listing,
+)
+from crisalad_jax.data.benchmarks.msls import is_msls, read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks.netvlad import read_netvlad
+from crisalad_jax.data.benchmarks.salad_lists import has_lists, is_list, read_salad_lists
+from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
+from crisalad_jax.utils.errors import InputError
+
+
+class Layout(NamedTuple):
+    """A layout of evaluation sets on disk."""
+
+    words: str
+    read: Callable[..., Benchmark]
+    options: tuple[str, ...] = ()
+    """Names of the options that the reader takes beside the path."""
+
+
+LAYOUTS = {
+    "utm": Layout("a folder of @UTM names", read_utm, ("split", "radius", "queries")),
+    "vpr-bench": Layout("a VPR-Bench folder", vpr_bench.read_vpr_bench),
+    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images")),
+    "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images")),
+    "msls": Layout("raw MSLS", read_msls, ("split", "radius", "max_heading_difference")),
+    "msls-subtask": Layout(
+        "raw MSLS, subtask all", read_msls_subtask, ("split", "radius", "max_heading_difference")
+    ),
+    "folders": Layout("two plain folders", folders.read_folders, ("split", "frames")),
+}
+"""Layouts by the name that `open_benchmark` takes."""
+
+
+def open_benchmark(
+    root: str | os.PathLike[str],
+    split: str | None = None,
+    radius: float | None = None,
+    *,
+    images: str | os.PathLike[str] | None = None,
+    max_heading_difference: float | None = None,
+    frames: int | None = None,
+    queries: str | None = None,
+    layout: str | None = None,
+) -> Benchmark:
+    """Read an evaluation set of the given `layout`, or of the layout that its files show.
+
+    An option that is None takes the default of the layout's reader: `read_utm`,
+    `read_vpr_bench`, `read_netvlad`, `read_salad_lists`, `read_msls`, `read_msls_subtask`,
+    `read_folders`.
+
+    Args:
+        root: a folder, or a file of NetVLAD's or SALAD's.
+        split: test, val or train.
+        radius: largest distance of a positive in metres.
+        images: the folder of the images that a file names.
+        max_heading_difference: largest difference of headings of a positive in degrees.
+        frames: largest number of frames between a query and a positive.
+        queries: the folder of the queries, where there are several.
+        layout: one of `LAYOUTS`; `msls-subtask` is never found from the files.
+
+    Returns:
+        The set: queries, database, positions and ground truth.
+
+    Raises:
+        InputError: no known layout, an option that the layout does not have, or what its reader
+            raises.
+
+    Example:
+        >>> import shutil
+        >>> for side in ("queries", "database"):
+        ...     _ = shutil.copytree(pictures, folder / "set" / side)
+        >>> len(open_benchmark(folder / "set", layout="folders").queries)
+        4
+    """
+    root = pathlib.Path(root)
+    chosen = choose(
+        "layout", _find_layout(root, split, queries) if layout is None else layout, LAYOUTS
+    )
+    options = {
+        "split": split,
+        "radius": radius,
+        "images": images,
+        "max_heading_difference": max_heading_difference,
+        "frames": frames,
+        "queries": queries,
+    }
+    given = {name: value for name, value in options.items() if value is not None}
+    for name, value in given.items():
+        if name not in chosen.options:
+            known = ", ".join(chosen.options).replace("_", " ") or "no option"
+            raise InputError(
+                f"{name.replace('_', ' ')}: found {str(value)!r}, but {root} is {chosen.words}, "
+                f"which takes {known}"
+            )
+    return chosen.read(root, **given)
+
+
+def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> str:
+    if root.is_file():
+        if root.suffix == ".mat":
+            return "netvlad"
+        if is_list(root):
+            return "salad"
+        raise InputError(
+            f"{root}: found a file, expected a folder, a .mat file of NetVLAD or a list of SALAD "
+            "that ends in dbImages.npy"
+        )
+    if is_msls(root):
+        return "msls"
+    if has_split(root) or has_sides(root):
+        folder, _ = find_split(root, split)
+        plain = (folder / folders.TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
+        return "folders" if plain else "utm"
+    if is_pair(root, "ref", "query") and ((root / vpr_bench.TRUTH).exists() or not has_lists(root)):
+        return "vpr-bench"
+    if has_lists(root):
+        return "salad"
+    raise InputError(
+        f"{root}: found {listing(root)}; expected images/{{test,val,train}}/, or database/ and "
+        "queries/, or ref/, query/ and ground_truth_new.npy, or train_val/ (MSLS), or "
+        "..._dbImages.npy; or name a .mat file (NetVLAD)"
+    )

@@ -1,0 +1,240 @@
+"""Evaluation of a model on a benchmark, under each protocol of grouping images."""
+
+import contextlib
+import functools
+import pathlib
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
+from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
+from crisalad_jax.retrieval.grouping import (
+    DEFAULT_GROUPINGS,
+    Grouping,
+    batches_of,
+    check_grouping,
+    parse_groupings,
+)
+from crisalad_jax.retrieval.pca import Pca
+from crisalad_jax.retrieval.reranking import Reranker, Reranking
+from crisalad_jax.retrieval.search import Neighbours, search
+from crisalad_jax.utils.errors import InputError
+
+KS = (1, 5, 10, 20)
+
+
+Observe = Callable[
+    [str, Float[np.ndarray, "image descriptor"], Float[np.ndarray, "image descriptor"]], None
+]
+"""Takes the name of a grouping, the database's descriptors, and the queries' descriptors."""
+
+
+def evaluate(
+    params: Crisalad,
+    config: ModelConfig,
+    benchmark: Benchmark,
+    *,
+    groupings: Sequence[str] = DEFAULT_GROUPINGS,
+    batch_size: int = 16,
+    seed: int = 0,
+    seeds: int = 3,
+    pca: Pca | None = None,
+    cache: ImageCache | None = None,
+    observe: Observe | None = None,
+    rerank: Reranking | None = None,
+    quiet: bool = False,
+) -> list[GroupingResult]:
+    r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
+
+    Two images of one side show the same place if the benchmark's positions say so. A benchmark
+    without positions uses its ground truth (`evaluation.leakage`).
+
+    A model without a cross-image encoder has one grouping, `any`: no descriptor depends on a batch.
+    Memory holds the tokens of all images, and the descriptors of one grouping and seed at a time.
+
+    Args:
+        params: of the model.
+        config: of the model, static.
+        benchmark: what to evaluate on.
+        groupings: each as `Grouping.parse` reads it.
+        batch_size: images that look at each other.
+        seed: draws the first shuffle: the database's, and with the next seed the queries'.
+        seeds: shuffles, each from the second seed after the one before.
+        pca: shortens the descriptors, fitted to images of other places.
+        cache: of decoded images.
+        observe: is given the descriptors of each grouping, of its first seed, while they are there.
+        rerank: a second stage; each grouping has a result without and then one with it.
+        quiet: no progress bars.
+
+    Returns:
+        A result for each grouping, and with `rerank` a second one.
+
+    Raises:
+        InputError: no ground truth, an image cannot be read, components that are not for this model
+            or make no unit vectors, or what `parse_groupings`, `check_grouping`, `Reranking.check`
+            and `Reranker` raise.
+
+    Example:
+        >>> import jax, shutil
+        >>> from crisalad_jax import PRESETS, init_crisalad, open_benchmark
+        >>> for side in ("queries", "database"):
+        ...     _ = shutil.copytree(pictures, folder / "set" / side)
+        >>> lines = ["query,database", *(f"{number}.png,{number}.png" for number in range(4))]
+        >>> _ = (folder / "set" / "ground_truth.csv").write_text("\n".join(lines))
+        >>> benchmark = open_benchmark(folder / "set", layout="folders")
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> result, *_ = evaluate(params, config, benchmark, groupings=["single"], quiet=True)
+        >>> result.recalls[1]
+        1.0
+    """
+    parsed = parse_groupings(groupings)
+    check_grouping((), batch_size, seed, seeds)
+    if pca is not None:
+        pca.check(config.descriptor_dim, "model")
+        if not pca.config.renormalise:
+            raise InputError(
+                "pca: found components that leave lengths as they are, expected some that make "
+                "unit vectors, which are ranked by cosine"
+            )
+    if rerank is not None:
+        rerank.check(config, len(benchmark.database))
+    positives = benchmark.ground_truth()
+
+    def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
+        tokens = read_tokens(
+            params, config, paths, batch_size=batch_size, label=name, cache=cache, quiet=quiet
+        )
+        return _Side(name, tokens, same, offset)
+
+    same_queries, same_database = _same_place(benchmark, positives)
+    database = side("database", benchmark.database, same_database, 0)
+    queries = side("queries", benchmark.queries, same_queries, 1)
+
+    def describe(*side: Any, **options: Any) -> Float[np.ndarray, "image descriptor"]:
+        full = group(params, config, *side, batch_size=batch_size, quiet=quiet, **options)
+        return full if pca is None else pca.apply(full)
+
+    stages: dict[str | None, Callable[[Neighbours], Neighbours]] = {None: lambda ranked: ranked}
+    with contextlib.ExitStack() as stack:
+        if rerank is not None:
+            stages[rerank.label] = stack.enter_context(
+                Reranker(
+                    rerank.over(params, config),
+                    benchmark.database,
+                    benchmark.queries,
+                    batch_size=batch_size,
+                    cache=cache,
+                    quiet=quiet,
+                )
+            )
+        k = min(max(*KS, rerank.top if rerank else 0), len(benchmark.database))
+        results = []
+        for grouping in parsed if params.cross_image else [Grouping("single", "single")]:
+            is_random = "shuffled" in (grouping.queries, grouping.database)
+            drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
+            name = str(grouping) if params.cross_image else ANY
+            sides = (database, grouping.database), (queries, grouping.queries)
+            database_share, query_share = (
+                _mean_share(side, kind, drawn, batch_size) for side, kind in sides
+            )
+            observer = observe and functools.partial(observe, name)
+            rankings = _rank(describe, sides, drawn, k, observer)
+            for label, stage in stages.items():
+                ranked = {seed: _first(stage(each), max(KS)) for seed, each in rankings.items()}
+                results.append(
+                    summarise(
+                        name,
+                        ranked,
+                        positives,
+                        KS,
+                        query_share=query_share,
+                        database_share=database_share,
+                        is_random=is_random,
+                        rerank=label,
+                    )
+                )
+    return results
+
+
+def _first(neighbours: Neighbours, count: int) -> Neighbours:
+    """Return the best `count` neighbours of each query."""
+    return Neighbours(*(part[:, :count] for part in neighbours))
+
+
+class _Side(NamedTuple):
+    """One side, database or queries: its tokens and its test of same-place images."""
+
+    name: str
+    tokens: FolderTokens
+    same: SamePlace
+    offset: int
+    """Added to the seed of a shuffle, so that the two sides are never shuffled alike."""
+
+
+def same_place_rule(benchmark: Benchmark) -> str:
+    """Tell in words how `evaluate` decides that two images of a side show the same place."""
+    if benchmark.query_positions is None or benchmark.database_positions is None:
+        return "a common positive"
+    return f"a distance of at most {benchmark.radius:g} m"
+
+
+def _same_place(
+    benchmark: Benchmark, positives: Sequence[Int64[np.ndarray, " _"]]
+) -> tuple[SamePlace, SamePlace]:
+    """Make both sides' tests of same-place images, by positions or else by ground truth."""
+    if benchmark.query_positions is None or benchmark.database_positions is None:
+        return by_truth(positives, len(benchmark.database))
+    radius = benchmark.radius
+    return near(benchmark.query_positions, radius), near(benchmark.database_positions, radius)
+
+
+def _mean_share(side: _Side, kind: str, seeds: Sequence[int], batch_size: int) -> float | None:
+    """Average the share of same-place images over seeds; see `GroupingResult`."""
+    count = len(side.tokens.readable)
+    shares = [
+        same_place_share(batches_of(count, kind, batch_size, seed + side.offset), side.same)
+        for seed in (seeds if kind == "shuffled" else seeds[:1])
+    ]
+    known = [share for share in shares if share is not None]
+    return statistics.fmean(known) if known else None
+
+
+def _rank(
+    describe: Callable[..., Float[np.ndarray, "image descriptor"]],
+    sides: Sequence[tuple[_Side, str]],
+    seeds: Sequence[int],
+    k: int,
+    observe: Callable[..., None] | None,
+) -> dict[int, Neighbours]:
+    """Rank the k nearest neighbours for each seed; only shuffled sides are described anew.
+
+    `observe` is given the descriptors of the first seed.
+    """
+
+    def descriptors(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
+        return describe(side.tokens, kind, seed=seed + side.offset, label=side.name)
+
+    fixed = {
+        side.name: descriptors(side, kind, seeds[0]) for side, kind in sides if kind != "shuffled"
+    }
+
+    def ranking(seed: int) -> Neighbours:
+        database, queries = (
+            fixed[side.name] if side.name in fixed else descriptors(side, kind, seed)
+            for side, kind in sides
+        )
+        if observe is not None and seed == seeds[0]:
+            observe(database, queries)
+        return search(database, queries, k=k)
+
+    return {seed: ranking(seed) for seed in seeds}

@@ -1,0 +1,108 @@
+"""Leakage of a grouping: the share of images in sight of an image that show its own place."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from crisalad_jax.retrieval.grouping import Batches
+
+SamePlace = Callable[
+    [Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]], Bool[np.ndarray, " pair"]
+]
+"""Tests pair by pair whether two images of one side, by number, show the same place."""
+
+# Numbers in an array of pairs: tens of megabytes, whatever the number of images.
+_CHUNK = 2**21
+
+
+def near(positions: Float64[np.ndarray, "image 2"], radius: float) -> SamePlace:
+    """Make the test that two images were taken at most `radius` metres apart."""
+
+    def same(a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]) -> np.ndarray:
+        return np.square(positions[a] - positions[b]).sum(axis=1) <= radius * radius
+
+    return same
+
+
+def by_truth(
+    positives: Sequence[Int64[np.ndarray, " _"]], database: int
+) -> tuple[SamePlace, SamePlace]:
+    """Make the tests of the queries and of the `database` images from the ground truth alone.
+
+    Two queries show the same place if some database image is right for both, and two database
+    images if both are right for some query. An image without any positive shares its place with
+    no other image, whatever it shows.
+    """
+    right = np.concatenate(positives) if positives else np.empty(0, np.int64)
+    asking = np.repeat(np.arange(len(positives)), [len(each) for each in positives])
+    queries = _Sharing(asking, right, len(positives), database)
+    return queries, _Sharing(right, asking, database, len(positives))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Sharing:
+    """Tests whether two owners have a thing in common; memory is linear in entries and pairs."""
+
+    owners: Int64[np.ndarray, " entry"]
+    things: Int64[np.ndarray, " entry"]
+    owner_count: int
+    thing_count: int
+
+    @functools.cached_property
+    def _codes(self) -> Int64[np.ndarray, " code"]:
+        """Each entry as one number, in ascending order: an owner's entries stand together."""
+        return np.unique(self.owners * self.thing_count + self.things)
+
+    @functools.cached_property
+    def _bounds(self) -> Int64[np.ndarray, " bound"]:
+        """Index where each owner's codes begin, and the number of all codes."""
+        return np.searchsorted(self._codes, np.arange(self.owner_count + 1) * self.thing_count)
+
+    def __call__(
+        self, a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]
+    ) -> Bool[np.ndarray, " pair"]:
+        most = int(np.diff(self._bounds).max(initial=1))
+        step = max(1, _CHUNK // most)
+        parts = [self._part(a[i : i + step], b[i : i + step]) for i in range(0, len(a), step)]
+        return np.concatenate([np.zeros(0, bool), *parts])
+
+    def _part(
+        self, a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]
+    ) -> Bool[np.ndarray, " pair"]:
+        """Look up every thing of the first owners among those of the second."""
+        counts = np.diff(self._bounds)[a]
+        pair = np.repeat(np.arange(len(a)), counts)
+        place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
+        things = self._codes[self._bounds[a][pair] + place] % max(self.thing_count, 1)
+        wanted = b[pair] * self.thing_count + things
+        first = np.searchsorted(self._codes, wanted, side="left")
+        hit = np.searchsorted(self._codes, wanted, side="right") > first
+        return np.bincount(pair[hit], minlength=len(a)) > 0
+
+
+def same_place_share(batches: Batches, same: SamePlace) -> float | None:
+    """Measure which share of the other images in a batch show an image's own place, 0 to 1.
+
+    The share is averaged over all images that looked at another one; None where none did.
+    """
+    if not batches.mutual:
+        return None
+    count = int(batches.kept.sum())
+    share, looking = 0.0, 0
+    readable = np.ones(count, bool)
+    step = max(1, _CHUNK // batches.images.shape[1] ** 2)
+    for start in range(0, len(batches.images), step):
+        part = batches.part(start, start + step)
+        others = part.looks(readable) & part.kept[:, :, None]
+        others &= ~np.eye(others.shape[1], dtype=bool)
+        batch, i, j = np.nonzero(others)
+        image, other = part.images[batch, i], part.images[batch, j]
+        place = np.ravel_multi_index((batch, i), part.images.shape)
+        right = np.bincount(place[same(image, other)], minlength=part.images.size)
+        seen = np.bincount(place, minlength=part.images.size)
+        share += float((right[seen > 0] / seen[seen > 0]).sum())
+        looking += int((seen > 0).sum())
+    return share / looking if looking else None

@@ -1,0 +1,175 @@
+"""Recall@K with confidence intervals, and precision-recall.
+
+The protocol is the public one of visual place recognition: a recall counts every query.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int
+
+from crisalad_jax.utils.errors import InputError
+
+
+def right_retrievals(
+    indices: Int[np.ndarray, "q k"], positives: Sequence[Int[np.ndarray, " _"]]
+) -> Bool[np.ndarray, "q k"]:
+    """Mark the retrieved database images that are right for their query.
+
+    Args:
+        indices: database indices of each query's neighbours, best first.
+        positives: the database indices that are right for each query, possibly none.
+
+    Raises:
+        InputError: no queries; positives for another number of queries; a negative positive (some
+            ground truths write -1 for "no match": leave it out).
+    """
+    if len(indices) == 0:
+        raise InputError("indices: found no queries, expected at least one")
+    if len(positives) != len(indices):
+        raise InputError(
+            f"positives: found {len(positives)} lists, expected {len(indices)}, one for each query"
+        )
+    right = np.zeros(indices.shape, bool)
+    for query, wanted in enumerate(positives):
+        if np.size(wanted) and np.min(wanted) < 0:
+            raise InputError(
+                f"positives: query {query} has {np.min(wanted)}, expected database indices"
+            )
+        right[query] = np.isin(indices[query], wanted)
+    return right
+
+
+def recalls(
+    indices: Int[np.ndarray, "q k"],
+    positives: Sequence[Int[np.ndarray, " _"]],
+    ks: Sequence[int] = (1, 5, 10, 20),
+) -> dict[int, float]:
+    """Compute Recall@K: the share of **all** queries with a positive among their top K.
+
+    A query without positives is a miss. A K beyond the columns counts all of them: `search` for
+    max(ks) returns fewer only where the database is smaller.
+
+    Args:
+        indices: database indices of each query's neighbours, best first.
+        positives: the database indices that are right for each query, possibly none.
+        ks: the values of K.
+
+    Returns:
+        K -> fraction of the queries, 0 to 1.
+
+    Raises:
+        InputError: what `right_retrievals` raises; a K below 1.
+    """
+    right = right_retrievals(indices, positives)
+    if min(ks, default=1) < 1:
+        raise InputError(f"ks: found {min(ks)}, expected at least 1")
+    return {k: float(right[:, :k].any(axis=1).mean()) for k in ks}
+
+
+class Interval(NamedTuple):
+    """A confidence interval, both ends included."""
+
+    low: float
+    high: float
+
+
+def bootstrap_interval(
+    hits: Int[np.ndarray, " q"], trials: int = 1, confidence: float = 0.95
+) -> Interval:
+    """Compute the percentile bootstrap's interval (Efron 1979) of the mean of hits / trials.
+
+    For whole numbers the limit of infinitely many resamples is known exactly, without drawing any.
+    A resample sums q independent draws from the queries' hits. That sum is distributed as the
+    q-fold convolution of the hits' frequencies, computed by a Fourier transform; for one trial it
+    is the binomial distribution.
+
+    The queries are assumed to be independent. Frames of one camera are not, so that their interval
+    is too narrow. An interval of width 0, at 0 or 1, says that all of these queries agree, not that
+    other queries would.
+
+    Args:
+        hits: in how many of the trials each query was a hit.
+        trials: for instance the seeds of a shuffle; the interval does not hold their spread.
+        confidence: of the interval, 0 to 1.
+
+    Raises:
+        InputError: no queries, hits outside 0 to `trials`, or no such confidence.
+    """
+    if not len(hits) or hits.min() < 0 or hits.max() > trials:
+        raise InputError(
+            f"hits: found {np.unique(hits).tolist()}, expected numbers from 0 to {trials}"
+        )
+    if not 0 < confidence < 1:
+        raise InputError(f"confidence: found {confidence}, expected a fraction between 0 and 1")
+    queries = len(hits)
+    size = queries * trials + 1
+    frequencies = np.bincount(hits, minlength=trials + 1) / queries
+    # The transform is fastest at powers of two; there is no mass beyond `size`.
+    length = 1 << size.bit_length()
+    sums = np.fft.irfft(np.fft.rfft(frequencies, length) ** queries, length)[:size]
+    cumulative = np.cumsum(np.maximum(sums, 0))
+    tail = (1 - confidence) / 2
+    low, high = np.searchsorted(cumulative, [tail, 1 - tail])
+    return Interval(float(low) / (size - 1), float(high) / (size - 1))
+
+
+class PrecisionRecall(NamedTuple):
+    """Precision and recall of accepting first retrievals by similarity, strictest threshold first.
+
+    They matter for loop closure, where one wrong retrieval that is accepted can spoil a map.
+    """
+
+    thresholds: Float[np.ndarray, " threshold"]
+    """The similarities of first retrievals; one is accepted at or above the threshold."""
+    precision: Float64[np.ndarray, " threshold"]
+    """Share of the accepted queries whose first retrieval is right."""
+    recall: Float64[np.ndarray, " threshold"]
+    """Share of the queries with a positive that are accepted and right."""
+    average_precision: float
+    """Area under the curve as steps: each gain of recall times the precision there."""
+    recall_at_full_precision: float
+    """The largest recall without a wrong retrieval; 0 where the most similar one is wrong."""
+
+
+def precision_recall(
+    indices: Int[np.ndarray, "q k"],
+    similarities: Float[np.ndarray, "q k"],
+    positives: Sequence[Int[np.ndarray, " _"]],
+) -> PrecisionRecall | None:
+    """Compute precision and recall over thresholds on the first retrievals' similarity.
+
+    This is the single-best-match evaluation of Schubert et al. 2024, "Visual Place Recognition: A
+    Tutorial", at every possible threshold. Queries of equal similarity are accepted together. A
+    query without positives can only be accepted wrongly, and does not count in recall. Where there
+    are such queries, Recall@1, over all queries, is lower than the last recall here.
+
+    Args:
+        indices: database indices of each query's neighbours, best first; only the first counts.
+        similarities: those of `indices`.
+        positives: the database indices that are right for each query, possibly none.
+
+    Returns:
+        The curve, or None if no query has a positive, for then recall is undefined.
+
+    Raises:
+        InputError: what `right_retrievals` raises.
+    """
+    right = right_retrievals(indices[:, :1], positives)[:, 0]
+    answerable = sum(np.size(wanted) > 0 for wanted in positives)
+    if not answerable:
+        return None
+    order = np.argsort(-similarities[:, 0], kind="stable")
+    ordered = similarities[order, 0]
+    last = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
+    accepted_right = np.cumsum(right[order])[last]
+    precision = accepted_right / (last + 1)
+    recall = accepted_right / answerable
+    return PrecisionRecall(
+        thresholds=ordered[last],
+        precision=precision,
+        recall=recall,
+        average_precision=float(np.diff(recall, prepend=0) @ precision),
+        recall_at_full_precision=float(recall[precision == 1].max(initial=0)),
+    )

@@ -1,0 +1,121 @@
+"""The settings of an evaluation in JSON and in words: without them its recalls mean nothing."""
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.evaluate import same_place_rule
+from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.grouping import Grouping, grouping_words
+from crisalad_jax.utils.files import write_json
+
+StrPath = str | os.PathLike[str]
+_RECALLS = (
+    "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
+    "AP: area under precision and recall of the first retrievals, by similarity. R at 100 % P: of "
+    "the queries with a positive, the share retrieved rightly, above every wrong first retrieval."
+)
+
+
+def evaluation_settings(
+    benchmark: Benchmark,
+    config: ModelConfig,
+    *,
+    weights: StrPath | None = None,
+    batch_size: int = 16,
+    seed: int = 0,
+    seeds: int = 3,
+    pca: StrPath | None = None,
+    rerank: str | None = None,
+    rerank_weights: StrPath | None = None,
+) -> dict[str, Any]:
+    """Put all settings that decide an evaluation's result into JSON values.
+
+    Args:
+        benchmark: what is evaluated on.
+        config: the model.
+        weights: the file of its parameters; None is an untrained model.
+        batch_size: number of images that look at each other.
+        seed: draws the first shuffled order.
+        seeds: number of shuffled orders.
+        pca: the file of the components that shorten descriptors.
+        rerank: what puts the first retrievals in a new order, as `parse_reranking` reads it.
+        rerank_weights: the file of the model that does so; None is the first stage's.
+
+    Returns:
+        The values by name.
+    """
+    files = {"weights": weights, "pca": pca, "rerank_weights": rerank_weights}
+    words = {name: None if file is None else str(file) for name, file in files.items()}
+    return {
+        "weights": words["weights"],
+        "benchmark": benchmark.name,
+        "rule": benchmark.rule,
+        "same_place": same_place_rule(benchmark),
+        "batch_size": batch_size,
+        "seed": seed,
+        "seeds": seeds,
+        "pca": words["pca"],
+        "rerank": rerank,
+        "rerank_weights": words["rerank_weights"],
+        "model": to_plain(config),
+    }
+
+
+def write_results(
+    path: StrPath,
+    results: Sequence[GroupingResult],
+    settings: dict[str, Any],
+    *,
+    model_name: str,
+) -> None:
+    """Write what an evaluation found as JSON, with its settings.
+
+    Args:
+        path: the file.
+        results: what `evaluate` returned.
+        settings: what `evaluation_settings` returned.
+        model_name: which weights, for each row.
+
+    Raises:
+        InputError: the file cannot be made.
+    """
+    names = {"benchmark": settings["benchmark"], "model": model_name}
+    write_json(path, settings | {"results": [names | to_json(result) for result in results]})
+
+
+def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> list[str]:
+    """Explain a table of results in words, a paragraph for each thing that it shows.
+
+    Args:
+        results: what `evaluate` returned.
+        settings: what `evaluation_settings` returned.
+
+    Returns:
+        The paragraphs.
+    """
+    notes = [_RECALLS]
+    parsed = [Grouping.parse(each.grouping) for each in results if each.grouping != ANY]
+    kinds = dict.fromkeys(kind for each in parsed for kind in (each.queries, each.database))
+    if kinds:
+        notes.append(
+            "A descriptor of this model depends on the images in its batch of "
+            f"{settings['batch_size']}: {grouping_words(kinds)}. Same place: of the others in "
+            f"sight, those that show the image's own place, told by {settings['same_place']}."
+        )
+    else:
+        notes.append("No cross-image encoder: no descriptor depends on its batch.")
+    if "shuffled" in kinds and settings["seeds"] > 1:
+        notes.append(
+            f"Shuffled: mean of {settings['seeds']} seeds ± their standard deviation; the interval "
+            "is of the mean."
+        )
+    for label in dict.fromkeys(each.rerank for each in results if each.rerank is not None):
+        notes.append(
+            f"+ {label}: the first {label.partition(':')[2]} retrievals by its scores, which stand "
+            "for similarities in AP and R at 100 % P."
+        )
+    return notes

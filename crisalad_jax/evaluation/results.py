@@ -1,0 +1,173 @@
+"""Results of an evaluation under each grouping, and their form in JSON."""
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from crisalad_jax.evaluation.metrics import (
+    Interval,
+    PrecisionRecall,
+    bootstrap_interval,
+    precision_recall,
+    recalls,
+    right_retrievals,
+)
+from crisalad_jax.retrieval.grouping import Grouping
+from crisalad_jax.retrieval.search import Neighbours
+
+ANY = "any"
+"""The grouping of a model whose descriptors depend on no batch."""
+
+
+class Scores(NamedTuple):
+    """Scores of a ranking, or their spread over several rankings."""
+
+    recalls: Mapping[int, float]
+    """Recall@K as a fraction, by K."""
+    average_precision: float | None
+    """See `PrecisionRecall`; None where no query has a positive."""
+    recall_at_full_precision: float | None
+    """See `PrecisionRecall`; None where no query has a positive."""
+
+
+class GroupingResult(NamedTuple):
+    """The result of a benchmark under one grouping."""
+
+    grouping: str
+    """Text that `Grouping.parse` reads; `any` if the model's descriptors depend on no batch."""
+    recalls: Mapping[int, float]
+    """Recall@K as a fraction, by K: the mean over the seeds."""
+    neighbours: Neighbours
+    """The nearest database images of every query, best first: those of the first seed."""
+    intervals: Mapping[int, Interval] = MappingProxyType({})
+    """95 % intervals of Recall@K over the queries, by K: see `metrics.bootstrap_interval`."""
+    query_share: float | None = None
+    """Share of same-place images among the others that a query looked at: the mean over queries and
+    seeds; None where no query looked at another."""
+    database_share: float | None = None
+    """The same share for the database images."""
+    precision_recall: PrecisionRecall | None = None
+    """The curve of the first seed; None where no query has a positive."""
+    average_precision: float | None = None
+    """Mean over the seeds; None where no query has a positive."""
+    recall_at_full_precision: float | None = None
+    """Mean over the seeds; None where no query has a positive."""
+    spread: Scores | None = None
+    """Sample standard deviation over the seeds; None with fewer than two."""
+    by_seed: Mapping[int, Scores] = MappingProxyType({})
+    """Scores of each shuffle, by the seed that repeats it alone; empty if nothing is random."""
+    rerank: str | None = None
+    """The second stage, as `reranking.parse_reranking` reads it; its scores replace the
+    similarities of the retrievals that it re-ranked. None is the first stage alone."""
+
+    @property
+    def label(self) -> str:
+        """Name that no other result of an evaluation has."""
+        return self.grouping if self.rerank is None else f"{self.grouping} + {self.rerank}"
+
+
+def summarise(
+    grouping: str,
+    rankings: Mapping[int, Neighbours],
+    positives: Sequence[Int[np.ndarray, " _"]],
+    ks: Sequence[int],
+    *,
+    query_share: float | None,
+    database_share: float | None,
+    is_random: bool,
+    rerank: str | None = None,
+) -> GroupingResult:
+    """Summarise the rankings of one grouping as its result.
+
+    Args:
+        grouping: its name.
+        rankings: seed -> neighbours; one ranking where nothing is random.
+        positives: the database indices that are right for each query.
+        ks: the values of K.
+        query_share: as in `GroupingResult`.
+        database_share: likewise.
+        is_random: whether the rankings differ by their seeds.
+        rerank: as in `GroupingResult`.
+
+    Raises:
+        InputError: what `recalls` raises.
+    """
+    first = next(iter(rankings.values()))
+    rights = [right_retrievals(each.indices, positives) for each in rankings.values()]
+    hits = {k: np.sum([right[:, :k].any(axis=1) for right in rights], axis=0) for k in ks}
+    curves = [precision_recall(*each, positives) for each in rankings.values()]
+    scores = [
+        Scores(
+            recalls(each.indices, positives, ks),
+            None if curve is None else curve.average_precision,
+            None if curve is None else curve.recall_at_full_precision,
+        )
+        for each, curve in zip(rankings.values(), curves, strict=True)
+    ]
+    mean = _over(scores, statistics.mean)
+    return GroupingResult(
+        grouping,
+        mean.recalls,
+        first,
+        intervals={k: bootstrap_interval(hits[k], trials=len(rights)) for k in ks},
+        query_share=query_share,
+        database_share=database_share,
+        precision_recall=curves[0],
+        average_precision=mean.average_precision,
+        recall_at_full_precision=mean.recall_at_full_precision,
+        spread=_over(scores, statistics.stdev) if len(scores) > 1 else None,
+        by_seed=dict(zip(rankings, scores, strict=True)) if is_random else {},
+        rerank=rerank,
+    )
+
+
+def _over(scores: Sequence[Scores], combine: Callable[[Sequence[float]], float]) -> Scores:
+    """Apply a statistic over rankings to each of the scores."""
+    numbers = [(each.average_precision, each.recall_at_full_precision) for each in scores]
+    return Scores(
+        {k: combine([each.recalls[k] for each in scores]) for k in scores[0].recalls},
+        *(
+            None if None in column else combine([x for x in column if x is not None])
+            for column in zip(*numbers, strict=True)
+        ),
+    )
+
+
+def percent(fraction: float) -> str:
+    """Format a fraction in percent, with one decimal."""
+    return f"{100 * fraction:.1f}"
+
+
+def to_json(result: GroupingResult) -> dict[str, Any]:
+    """Put a result without its neighbours into JSON values; recalls and shares are fractions."""
+    sides = (ANY, ANY)
+    if result.grouping != ANY:
+        grouping = Grouping.parse(result.grouping)
+        sides = grouping.queries, grouping.database
+    curve = result.precision_recall
+    return {
+        "grouping": result.grouping,
+        "rerank": result.rerank,
+        "queries": sides[0],
+        "database": sides[1],
+        "same_place": {"queries": result.query_share, "database": result.database_share},
+        **_scores_json(
+            Scores(result.recalls, result.average_precision, result.recall_at_full_precision)
+        ),
+        "intervals": {f"R@{k}": list(ends) for k, ends in result.intervals.items()},
+        "spread": None if result.spread is None else _scores_json(result.spread),
+        "by_seed": {str(seed): _scores_json(each) for seed, each in result.by_seed.items()},
+        "precision_recall": None
+        if curve is None
+        else {
+            name: getattr(curve, name).tolist() for name in ("thresholds", "precision", "recall")
+        },
+    }
+
+
+def _scores_json(scores: Scores) -> dict[str, Any]:
+    return scores._asdict() | {"recalls": {f"R@{k}": v for k, v in scores.recalls.items()}}

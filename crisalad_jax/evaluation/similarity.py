@@ -1,0 +1,68 @@
+"""The similarities of all queries and a whole database, reduced to the size of a picture."""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+
+from crisalad_jax.retrieval.chunks import WIDE, Block, aligned, as_sides, blocks
+
+# Queries and database rows compared at a time: their similarities are 32 MiB.
+_QUERY_CHUNK, _DATABASE_CHUNK = 1024, 8192
+
+
+def similarity_map(
+    database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d"], *, most: int = 400
+) -> Float32[np.ndarray, "rows columns"]:
+    """Compute a picture of all similarities of queries (rows) and database (columns).
+
+    A side of more than `most` images shares its cells (`cells_of`): a cell is the largest of its
+    similarities. Memory depends on the blocks that are compared at a time, not on the sets.
+
+    Raises:
+        InputError: what `retrieval.search` raises.
+    """
+    database, queries = as_sides(database, queries)
+    rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
+    picture = np.full((rows[-1] + 1, columns[-1] + 1), -np.inf, np.float32)
+    sizes = min(_DATABASE_CHUNK, len(database)), min(_QUERY_CHUNK, len(queries))
+    there, asked = (itertools.repeat(aligned((size, database.shape[1]), WIDE)) for size in sizes)
+    for block in blocks(database, "database", there):
+        for part in blocks(queries, "queries", asked):
+            products = part.rows[: part.valid] @ block.rows[: block.valid].T
+            row, tops = _cells(rows, part)
+            column, lefts = _cells(columns, block)
+            products = np.maximum.reduceat(products, tops, axis=0)
+            products = np.maximum.reduceat(products, lefts, axis=1)
+            cells = np.ix_(row, column)
+            picture[cells] = np.maximum(picture[cells], products)
+    return picture
+
+
+def cells_of(count: int, most: int) -> Int64[np.ndarray, " count"]:
+    """Assign each of `count` images in a row to one of at most `most` cells, evenly."""
+    return np.arange(count) * min(count, most) // count
+
+
+def _cells(
+    cells: Int64[np.ndarray, " count"], block: Block
+) -> tuple[Int64[np.ndarray, " cell"], Int64[np.ndarray, " cell"]]:
+    """Find the cells that a block's images fall into, and the first image of each."""
+    return np.unique(cells[block.start : block.start + block.valid], return_index=True)
+
+
+class FirstSimilarities:
+    """Observer for `evaluate` that keeps the picture of the first grouping's similarities."""
+
+    map: Float32[np.ndarray, "rows columns"] | None = None
+    """The picture by `similarity_map`; None before the first grouping is described."""
+
+    def __call__(
+        self,
+        grouping: str,
+        database: Float[np.ndarray, "image descriptor"],
+        queries: Float[np.ndarray, "image descriptor"],
+    ) -> None:
+        """Compute the map of the first grouping's descriptors; ignore later groupings."""
+        if self.map is None:
+            self.map = similarity_map(database, queries)

@@ -1,0 +1,1 @@
+"""Whole experiments: the demo and its city, comparisons of methods, reports."""

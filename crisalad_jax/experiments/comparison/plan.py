@@ -1,0 +1,360 @@
+"""The configuration of a comparison; its parts are made and checked before any work starts."""
+
+import dataclasses
+import pathlib
+import re
+from collections.abc import Iterator, Mapping
+from typing import Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.places import Places, read_places
+from crisalad_jax.experiments.comparison.ablation import (
+    ABLATIONS,
+    ROW_HEADERS,
+    adapter_kind,
+    find_row,
+    row_labels,
+    row_training,
+)
+from crisalad_jax.experiments.comparison.methods import method_of, method_training
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
+from crisalad_jax.retrieval.reranking import parse_reranking
+from crisalad_jax.training.batches import groups_of, steps_per_epoch
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.trainable import count_trainable
+from crisalad_jax.utils.errors import InputError
+
+EPOCHS = 6
+"""Number of epochs from random weights: all methods on two small sets, three seeds each, take less
+than an hour on two cores."""
+_WARMUP_SHARE = 5
+"""Divisor of a short run's steps: it warms up for a fifth of them at most."""
+_VIEWS = 4
+"""Largest number of images of a place in a batch, as in all recipes of the paper."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ComparisonConfig:
+    """Everything that decides a comparison's results; `config.json` in its folder."""
+
+    kind: Literal["compare", "ablate"]
+    names: tuple[str, ...]
+    """Names that `method_of` or `row_training` looks up."""
+    test: tuple[str, ...]
+    """Evaluation sets, of any layout that `open_benchmark` knows."""
+    train: str | None = None
+    """Folder in the layout of GSV-Cities."""
+    weights: tuple[str, ...] = ()
+    """Weights of methods that are not trained here, as NAME=FILE."""
+    backbone: str | None = None
+    """Backbone that training starts from; None trains from nothing, by the recipe `scratch`."""
+    preset: str = "b14"
+    epochs: int | None = None
+    """Number of epochs; None is the recipe's, or `EPOCHS` from nothing."""
+    image_size: tuple[int, int] | None = None
+    batch_size: int = 16
+    """Number of images described together."""
+    grouping: str = "single"
+    """Groupings between commas; a method without a cross-image encoder needs only one."""
+    rerank: int = 20
+    """Number of first retrievals that methods with a second stage re-rank."""
+    seeds: int = 3
+    """Number of runs of each method, with seeds from 0."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges and the names."""
+        check_grouping((), self.batch_size, 0, self.seeds)
+        parse_groupings(self.grouping.split(","))
+        what = "--methods" if self.kind == "compare" else "--rows"
+        for name in self.names:
+            if self.kind == "compare":
+                method_of(name, self.preset)
+            elif name not in ABLATIONS:
+                find_row(name, self.preset)
+        folders = [file_name(name) for name in self.names]
+        for flag, values, files in ((what, self.names, folders), ("--test", self.test, self.test)):
+            if not values or len(set(files)) < len(values):
+                raise InputError(
+                    f"{flag}: found {', '.join(values) or 'none'}, expected at least one, each once"
+                )
+        # A single retrieval cannot be re-ranked.
+        for flag, value, least in (("--epochs", self.epochs, 1), ("--rerank", self.rerank, 2)):
+            if value is not None and value < least:
+                raise InputError(f"{flag}: found {value}, expected at least {least}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One line of the table, with all that its runs need."""
+
+    name: str
+    labels: tuple[str, ...]
+    """Cells before its numbers."""
+    run: str
+    """Name of the run that makes its model, which other variants may share."""
+    training: TrainConfig
+    """Configuration of its training with seed 0."""
+    learns: bool
+    rerank: str | None
+    """Second stage, as `--rerank` of `evaluate` reads it."""
+    weights: pathlib.Path | None
+    """File of the model, if it comes from one."""
+    model: ModelConfig
+    """Configuration of the model in `weights`, or of the one that `training` makes."""
+    places: Places | None = None
+    """Training set, if it is trained here; it includes small places if its loss regroups the
+    images."""
+
+    @property
+    def trains(self) -> bool:
+        """Whether the variant is trained here, and not loaded from a file."""
+        return self.learns and self.weights is None
+
+    def seeds(self, seeds: int) -> range:
+        """Return the seeds of the variant's runs: one for a model from a file."""
+        return range(1 if self.weights is not None else seeds)
+
+
+class Prepared(NamedTuple):
+    """A comparison whose parts fit each other."""
+
+    config: ComparisonConfig
+    variants: list[Variant]
+    places: Places | None
+    benchmarks: list[Benchmark]
+
+    @property
+    def units(self) -> list[tuple[Variant, int]]:
+        """Runs of the comparison, each a variant and a seed."""
+        return [(v, seed) for v in self.variants for seed in v.seeds(self.config.seeds)]
+
+
+def prepare(config: ComparisonConfig) -> Prepared:
+    """Read the sets and make and check all configurations, weights from files included.
+
+    Raises:
+        InputError: a file cannot be read or holds another method's weights; something has to be
+            trained or clustered without a training set; a method does not fit the images or its
+            parts each other; more images would be ranked anew than a set has.
+    """
+    weights = _weights(config)
+    benchmarks = [open_benchmark(path) for path in config.test]
+    for benchmark in benchmarks:
+        benchmark.ground_truth()
+    drafts = list(_drafts(config))
+    # A vocabulary needs training images too, although nothing trains.
+    need = [draft.run for draft in drafts if draft.run not in weights]
+    if need and config.train is None:
+        raise InputError(
+            f"--train: found none, expected a training set for {', '.join(dict.fromkeys(need))}, "
+            "or --weights of each"
+        )
+    places, views = _places(config) if need else (None, _VIEWS)
+    variants = []
+    for draft in drafts:
+        training = draft.training
+        if places is not None and draft.run not in weights:
+            training = _fitted(training, config, len(places.place_id), views)
+            own = _own_training_set(draft, training, config, places)
+        else:
+            own = None
+        file = weights.get(draft.run)
+        model = training.model if file is None else _checked(draft, file, config)
+        variants.append(
+            dataclasses.replace(draft, training=training, weights=file, model=model, places=own)
+        )
+    for variant in variants:
+        _check(variant, config, benchmarks)
+    _check_backbone(config, variants)
+    return Prepared(config, variants, places, benchmarks)
+
+
+def _own_training_set(
+    draft: Variant, training: TrainConfig, config: ComparisonConfig, places: Places
+) -> Places:
+    """Choose a variant's training set, and check that its epochs have batches."""
+    assert config.train is not None
+    if training.min_images_of_place < training.min_images:
+        places = read_places(config.train, min_images=training.min_images_of_place)
+    try:
+        steps_per_epoch(training, groups_of(training, places))
+    except InputError as error:
+        raise InputError(f"{draft.name}: {error}") from error
+    return places
+
+
+def _drafts(config: ComparisonConfig) -> Iterator[Variant]:
+    """Yield the variants as their recipes define them."""
+    from_nothing = config.backbone is None
+    for name in config.names:
+        rerank = None
+        if config.kind == "compare":
+            method = method_of(name, config.preset)
+            training = method_training(method.recipe, config.preset, from_nothing=from_nothing)
+            labels, run = (method.title,), method.recipe
+            if method.rerank is not None:
+                rerank = f"{method.rerank}:{config.rerank}"
+        else:
+            training = row_training(name, config.preset, from_nothing=from_nothing)
+            labels, run = (name, *row_labels(training)), name
+        if config.image_size is not None:
+            model = dataclasses.replace(training.model, image_size=config.image_size)
+            training = dataclasses.replace(training, model=model)
+        learns = training.model.aggregator.learns
+        yield Variant(name, labels, run, training, learns, rerank, None, training.model)
+
+
+def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
+    """Map the names of runs to the files of weights that replace them."""
+    files: dict[str, pathlib.Path] = {}
+    for text in config.weights:
+        name, separator, file = text.partition("=")
+        if not separator or not file:
+            raise InputError(f"--weights: found {text!r}, expected NAME=FILE")
+        if name not in config.names:
+            raise InputError(
+                f"--weights: found {name!r}, expected one of those compared, "
+                f"{', '.join(config.names)}"
+            )
+        run = method_of(name, config.preset).recipe if config.kind == "compare" else name
+        path = pathlib.Path(file)
+        if files.setdefault(run, path) != path:
+            raise InputError(
+                f"--weights: found {files[run]} and {path} for {run}, expected one file: methods "
+                "of one recipe share their model"
+            )
+    return files
+
+
+def _checked(draft: Variant, path: pathlib.Path, config: ComparisonConfig) -> ModelConfig:
+    """Read the configuration of a file's model, and check that it is the variant's method."""
+    _, model = load_weights(path)
+    wanted = draft.training.model
+    parts = {
+        "backbone": (model.backbone.part_name, wanted.backbone.part_name),
+        "aggregator": (model.aggregator.part_name, wanted.aggregator.part_name),
+        "adapter": (adapter_kind(model), adapter_kind(wanted)),
+        "cross-image encoder": (bool(model.cross_image.layers), bool(wanted.cross_image.layers)),
+    }
+    wrong = [f"{name} {a}, expected {b}" for name, (a, b) in parts.items() if a != b]
+    if wrong:
+        raise InputError(
+            f"{path}: weights of another method than {draft.name}: found {'; '.join(wrong)}"
+        )
+    return model.resized(config.image_size)
+
+
+def _places(config: ComparisonConfig) -> tuple[Places, int]:
+    """Read the training set, and choose the number of images of a place in a batch."""
+    assert config.train is not None
+    places = read_places(config.train, min_images=2)
+    views = int(np.clip(np.median(places.image_counts), 2, _VIEWS))
+    if views > 2:
+        places = read_places(config.train, min_images=views)
+    return places, views
+
+
+def _fitted(
+    training: TrainConfig, config: ComparisonConfig, places: int, views: int
+) -> TrainConfig:
+    """Fit a recipe to a training set of so many places, so that it can fill its batches.
+
+    From random weights all methods have the same number of images in a batch, and of steps.
+    """
+    if config.epochs is not None:
+        training = dataclasses.replace(training, epochs=config.epochs)
+    training = dataclasses.replace(training, patience=None)
+    if config.backbone is not None:
+        training = dataclasses.replace(
+            training, places_per_batch=min(training.places_per_batch, places), micro_batch=None
+        )
+        grouping = training.loss.kind.grouping
+        if grouping is None:
+            return _of_views(training, min(training.images_per_place, views), views)
+        if grouping.kind == "places":
+            return _of_views(training, training.images_per_place, views)
+        return training
+    size = min(training.places_per_batch * training.images_per_place // views, places)
+    epochs = config.epochs or EPOCHS
+    optimiser = training.optimiser
+    warmup = min(optimiser.warmup_steps, places // size * epochs // _WARMUP_SHARE)
+    return dataclasses.replace(
+        training,
+        loss=_own_places(training.loss),
+        optimiser=dataclasses.replace(optimiser, warmup_steps=warmup),
+        places_per_batch=size,
+        images_per_place=views,
+        min_images=views,
+        epochs=epochs,
+    )
+
+
+def _of_views(training: TrainConfig, images: int, views: int) -> TrainConfig:
+    """Set the images of a place in a batch, for places of so many views."""
+    least = min(training.min_images, views)
+    return dataclasses.replace(training, images_per_place=images, min_images=least)
+
+
+def _own_places(loss: LossConfig) -> LossConfig:
+    """Make a classification loss take a small set's places as classes, all in one group."""
+    if not isinstance(loss.kind, LargeMarginCosineConfig):
+        return loss
+    classes = dataclasses.replace(loss.kind.classes, kind="places", groups=1, steps=None)
+    return dataclasses.replace(loss, kind=dataclasses.replace(loss.kind, classes=classes))
+
+
+def _check(variant: Variant, config: ComparisonConfig, benchmarks: list[Benchmark]) -> None:
+    """Check that a variant's parts fit each other and the sets, without computing anything."""
+    if variant.trains:
+        count_trainable(variant.model, variant.training.trainable)  # raises where nothing could
+    for benchmark in benchmarks:
+        if variant.rerank is not None and config.rerank > len(benchmark.database):
+            raise InputError(
+                f"--rerank: found {config.rerank} for {variant.name}, expected at most the "
+                f"{len(benchmark.database)} database images of {benchmark.root}"
+            )
+    if variant.rerank is not None:
+        parse_reranking(variant.rerank).check(variant.model)
+
+
+def _check_backbone(config: ComparisonConfig, variants: list[Variant]) -> None:
+    """Check that each kind of backbone can start from the given checkpoint."""
+    if config.backbone is None:
+        return
+    for backbone in dict.fromkeys(v.model.backbone for v in variants if v.weights is None):
+        read_backbone(config.backbone, backbone, backbone.init(jax.random.key(0)))
+
+
+def file_name(name: str) -> str:
+    """Make a folder's name of a method's: the colon of KIND:NAME is not allowed everywhere.
+
+    Example:
+        >>> file_name("step:newton")
+        'step-newton'
+    """
+    return re.sub(r"[^\w.+-]+", "-", name)
+
+
+def labels_of(kind: str) -> tuple[str, ...]:
+    """Return the headers above `Variant.labels`."""
+    if kind == "compare":
+        return ("method",)
+    return ROW_HEADERS
+
+
+def short_names(benchmarks: list[Benchmark]) -> list[str]:
+    """Make a short name for each set, no two alike."""
+    names: Mapping[str, int] = {}
+    short = [benchmark.name.partition(" (")[0].partition("/")[0] for benchmark in benchmarks]
+    names = {name: short.count(name) for name in short}
+    return [
+        name if names[name] == 1 else f"{name} {number + 1}" for number, name in enumerate(short)
+    ]

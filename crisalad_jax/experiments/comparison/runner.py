@@ -1,0 +1,332 @@
+"""The work of a comparison: runs, evaluations and timing, each done once, results in its folder.
+
+OUT/config.json                       what is compared
+OUT/NAME/seed-S/run/                  a training run, which can be resumed
+OUT/NAME/seed-S/start.safetensors     what it starts from, where a vocabulary was built
+OUT/NAME/seed-S/training.json         the time that training took
+OUT/NAME/seed-S/test-N.json           an evaluation, on the N-th set
+OUT/speed.json                        the timing of all models
+"""
+
+import dataclasses
+import functools
+import json
+import pathlib
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.config.io import differences, read_config, to_plain
+from crisalad_jax.config.parts import parts_of
+from crisalad_jax.config.source import source_digest
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.metrics import right_retrievals
+from crisalad_jax.evaluation.results import GroupingResult
+from crisalad_jax.experiments.comparison.plan import (
+    ComparisonConfig,
+    Prepared,
+    Variant,
+    file_name,
+)
+from crisalad_jax.experiments.comparison.timing import Race, describing, is_absolute, machine, race
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.retrieval.reranking import parse_reranking
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.run_files import checksum_of_benchmark, checksum_of_places
+from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_target, holds_other_files, sha256_of, write_json
+
+_ROUNDS = 5
+
+Say = Callable[[str], None]
+
+
+def claim(out: pathlib.Path, prepared: Prepared) -> None:
+    """Make `out` the folder of this comparison, or check that it is.
+
+    Raises:
+        InputError: it holds another comparison, or files but none; or the content behind a name has
+            changed since the comparison began: weights, a backbone, a set, a plug-in's part.
+    """
+    config, path = prepared.config, out / "config.json"
+    check_target(path)
+    if path.exists():
+        existing = read_config(ComparisonConfig, path)
+        wrong = differences(config, existing)
+        if wrong:
+            raise InputError(
+                f"{out}: holds another comparison: {'; '.join(wrong)}; give the same to go on with "
+                "it, or another folder"
+            )
+    elif out.exists() and holds_other_files(out):
+        raise InputError(
+            f"{out}: found files but no comparison, expected one or a new or empty folder"
+        )
+    else:
+        write_json(path, to_plain(config))
+    behind, path = _behind(prepared), out / "behind.json"
+    if path.exists():
+        changed = [name for name, digest in read_json(path).items() if behind.get(name) != digest]
+        if changed:
+            raise InputError(
+                f"{out}: {', '.join(changed)}: found changed since this comparison began, expected "
+                "the same, or another folder"
+            )
+    else:
+        write_json(path, behind)
+
+
+def _behind(prepared: Prepared) -> dict[str, str]:
+    """Compute digests of what the configuration only names: files, sets' image names, plug-ins."""
+    files = {str(v.weights) for v in prepared.variants if v.weights is not None}
+    if prepared.config.backbone is not None:
+        files.add(prepared.config.backbone)
+    digests = {name: sha256_of(name) for name in sorted(files)}
+    if prepared.places is not None:
+        digests[str(prepared.config.train)] = str(checksum_of_places(prepared.places))
+    for name, benchmark in zip(prepared.config.test, prepared.benchmarks, strict=True):
+        digests[name] = str(checksum_of_benchmark(benchmark))
+    for variant in prepared.variants:
+        for part in map(type, parts_of(variant.training).values()):
+            digest = source_digest(part)
+            if digest is not None and not part.__module__.startswith("crisalad_jax."):
+                digests[f"{part.registry.kind} {part.part_name}"] = digest
+    return digests
+
+
+def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = False) -> None:
+    """Do what is left of a comparison, and write its results into `out`.
+
+    Results of earlier calls are reused, also of one that was killed.
+
+    Args:
+        prepared: the comparison.
+        out: the folder, of this comparison or new.
+        say: is given a line at the start, and before each run: which of how many, and how long the
+            rest may take.
+        quiet: no progress bars.
+
+    Raises:
+        InputError: what `claim`, `fit` and `evaluate` raise; a result that is not whole, or of
+            another set than is given now.
+        Stopped: what `fit` raises; the same call resumes.
+    """
+    claim(out, prepared)
+    say(_start_words(prepared.config))
+    left = [unit for unit in prepared.units if not _is_done(prepared, out, *unit)]
+    total, started = len(prepared.units), time.monotonic()
+    for number, (variant, seed) in enumerate(left):
+        line = (
+            f"{variant.name}, seed {seed}: method {_place(prepared, variant)} of "
+            f"{len(prepared.variants)}, {total - len(left) + number} of {total} runs done"
+        )
+        if number:
+            rest = (time.monotonic() - started) / number * (len(left) - number)
+            line += f", about {_words(rest)} left"
+        say(line)
+        _one(prepared, out, variant, seed, quiet)
+    if not (out / "speed.json").exists():
+        say("images described a second, all models in turns")
+        write_json(out / "speed.json", _race(prepared, out))
+
+
+def _start_words(config: ComparisonConfig) -> str:
+    start = "from nothing" if config.backbone is None else f"from {config.backbone}"
+    return f"{len(config.names)} to compare, {config.preset}, what is trained starts {start}"
+
+
+def _place(prepared: Prepared, variant: Variant) -> int:
+    return prepared.variants.index(variant) + 1
+
+
+def _words(seconds: float) -> str:
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
+
+
+def folder_of(out: pathlib.Path, name: str, seed: int) -> pathlib.Path:
+    """Return the folder of a run's or a variant's files."""
+    return out / file_name(name) / f"seed-{seed}"
+
+
+def result_path(out: pathlib.Path, variant: Variant, seed: int, number: int) -> pathlib.Path:
+    """Return the file of a variant's evaluation on the set of this number, from 0."""
+    return folder_of(out, variant.name, seed) / f"test-{number}.json"
+
+
+def _is_done(prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int) -> bool:
+    results = [result_path(out, variant, seed, n) for n in range(len(prepared.benchmarks))]
+    trained = folder_of(out, variant.run, seed) / "training.json"
+    return all(path.exists() for path in results) and (not variant.trains or trained.exists())
+
+
+def _one(prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int, quiet: bool) -> None:
+    """Train a variant for one seed and evaluate it, as far as results are missing."""
+    params = _model(prepared, out, variant, seed, quiet)
+    for number, benchmark in enumerate(prepared.benchmarks):
+        path = result_path(out, variant, seed, number)
+        if not path.exists():
+            write_json(path, _evaluated(prepared.config, variant, params, benchmark, seed))
+
+
+def _evaluated(
+    config: ComparisonConfig, variant: Variant, params: Crisalad, benchmark: Benchmark, seed: int
+) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    if variant.rerank is not None:
+        options["rerank"] = parse_reranking(variant.rerank)
+    started = time.monotonic()
+    results = evaluate(
+        params,
+        variant.model,
+        benchmark,
+        groupings=config.grouping.split(","),
+        batch_size=config.batch_size,
+        seed=seed,
+        seeds=1,
+        quiet=True,
+        **options,
+    )
+    return {
+        "benchmark": benchmark.name,
+        "queries": len(benchmark.queries),
+        "database": len(benchmark.database),
+        "seconds": round(time.monotonic() - started, 2),
+        "groupings": {
+            result.grouping: _ranks(result, benchmark)
+            for result in results
+            if (result.rerank is None) == (variant.rerank is None)
+        },
+    }
+
+
+def _ranks(result: GroupingResult, benchmark: Benchmark) -> list[int]:
+    """Find the rank of each query's first right retrieval, from 1; 0 where none is right."""
+    right = right_retrievals(result.neighbours.indices, benchmark.ground_truth())
+    return np.where(right.any(axis=1), right.argmax(axis=1) + 1, 0).tolist()
+
+
+def _model(
+    prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int, quiet: bool
+) -> Crisalad:
+    """Load a variant's parameters from a file, or make or train them."""
+    if variant.weights is not None:
+        return load_weights(variant.weights)[0]
+    folder = folder_of(out, variant.run, seed)
+    trained, last = folder / "training.json", folder / "run" / "last.safetensors"
+    if variant.learns and trained.exists():
+        return load_weights(last, expected=variant.model)[0]
+    start = _start(prepared, folder, variant, seed, quiet)
+    if not variant.learns:
+        return start
+    training = dataclasses.replace(variant.training, seed=seed)
+    assert variant.places is not None
+    _count_sitting(folder)
+    result = fit(training, variant.places, folder / "run", initial=start, quiet=quiet)
+    write_json(trained, _training_record(folder, training, result.steps))
+    return result.params
+
+
+def _start(
+    prepared: Prepared, folder: pathlib.Path, variant: Variant, seed: int, quiet: bool
+) -> Crisalad:
+    """Make the parameters that a run starts from, always the same for its seed."""
+    path = folder / "start.safetensors"
+    if path.exists():
+        return load_weights(path, expected=variant.model)[0]
+    # The same split of the seed's key as in `fit`, so that both draw the same parameters.
+    key, _ = jax.random.split(jax.random.key(seed))
+    params = init_crisalad(key, variant.model)
+    if prepared.config.backbone is not None:
+        backbone = read_backbone(prepared.config.backbone, variant.model.backbone, params.backbone)
+        params = dataclasses.replace(params, backbone=backbone)
+    if needs_vocabulary(variant.model):
+        params = _with_vocabulary(prepared, params, variant.model, seed, quiet)
+        save_weights(path, params, variant.model)
+    return params
+
+
+def _with_vocabulary(
+    prepared: Prepared, params: Crisalad, model: ModelConfig, seed: int, quiet: bool
+) -> Crisalad:
+    assert prepared.places is not None
+    places = prepared.places
+    paths = [places.path(image) for image in range(len(places.files))]
+    return with_vocabulary(params, model, paths, seed=seed, quiet=quiet)
+
+
+def _count_sitting(folder: pathlib.Path) -> None:
+    """Count a call that begins training, or resumes it after steps it had taken."""
+    path, began = folder / "sittings.json", folder / "run" / "metrics.jsonl"
+    if not path.exists():
+        write_json(path, 1)
+    elif began.exists() and began.stat().st_size:
+        write_json(path, read_json(path) + 1)
+
+
+def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) -> dict[str, Any]:
+    """Record steps and times of a training; repeated steps of a resumed run count once."""
+    images = training.places_per_batch * training.images_per_place
+    records = read_metrics(folder / "run" / "metrics.jsonl")
+    seconds = [images / r["images_per_second"] for r in records if "images_per_second" in r]
+    return {
+        "steps": steps,
+        "images": images,
+        "step_seconds": statistics.median(seconds),
+        "seconds_of_steps": sum(seconds),
+        "sittings": read_json(folder / "sittings.json"),
+        "device": machine(),
+    }
+
+
+def _race(prepared: Prepared, out: pathlib.Path) -> dict[str, Any]:
+    """Time a batch of every model in turns; variants of one model run once."""
+    size = prepared.config.batch_size
+    models = {variant.run: variant for variant in prepared.variants}
+    calls = {
+        name: functools.partial(_describing, prepared, out, variant)
+        for name, variant in models.items()
+    }
+    return {
+        "device": machine(),
+        "absolute": is_absolute(),
+        "batch_size": size,
+        "rounds": race(calls, _ROUNDS).rounds,
+    }
+
+
+def _describing(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Callable[[], Any]:
+    params = _model(prepared, out, variant, variant.seeds(1)[0], quiet=True)
+    return describing(params, variant.model, prepared.config.batch_size)
+
+
+def read_race(out: pathlib.Path) -> tuple[Race, dict[str, Any]]:
+    """Read the times that `carry_out` measured, and the rest of their record."""
+    record = read_json(out / "speed.json")
+    return Race(record["rounds"]), record
+
+
+def read_json(path: pathlib.Path) -> Any:
+    """Read a file of results.
+
+    Raises:
+        InputError: it cannot be read, or is no JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot read this result: {error}; delete it, and the same command makes it "
+            "anew"
+        ) from error

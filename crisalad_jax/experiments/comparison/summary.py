@@ -1,0 +1,266 @@
+"""The results of a comparison: a row for each method, its recalls over seeds, its costs."""
+
+import pathlib
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
+from crisalad_jax.evaluation.results import ANY
+from crisalad_jax.experiments.comparison.ablation import NOTES, AdapterCost
+from crisalad_jax.experiments.comparison.plan import Prepared, Variant, labels_of, short_names
+from crisalad_jax.experiments.comparison.runner import folder_of, read_json, read_race, result_path
+from crisalad_jax.experiments.comparison.timing import Race
+from crisalad_jax.nn.costs import part_costs
+from crisalad_jax.training.trainable import count_trainable
+from crisalad_jax.utils.errors import InputError
+
+KS = (1, 5, 10)
+"""Values of K in the paper's tables."""
+
+
+class Recall(NamedTuple):
+    """Recall@K of a method on a set, as fractions."""
+
+    mean: float
+    """Mean over the seeds."""
+    spread: float | None
+    """Sample standard deviation over the seeds; None with a single one."""
+    interval: Interval
+    """95 % interval of the mean over the queries: see `metrics.bootstrap_interval`."""
+    by_seed: tuple[float, ...]
+
+
+class Row(NamedTuple):
+    """A line of the table: a method under one grouping."""
+
+    name: str
+    labels: tuple[str, ...]
+    grouping: str
+    dimension: int
+    recalls: Mapping[str, Mapping[int, Recall]]
+    """Recalls by set, then by K."""
+    speed: float
+    """Number of images described in the time that the reference takes for one."""
+    images_per_second: float | None
+    """Speed in images a second; None on a CPU, where it depends on other load."""
+    parameters: int
+    trained: int | None
+    """Number of parameters that were trained; None for a model from a file."""
+    training: float | None
+    """Training time over the reference's; None where one of the two was not trained."""
+    training_seconds: float | None
+    """Mean over the seeds of the steps times a step's median seconds."""
+    sittings: int
+    """Largest number of calls that a run took; more than one if it was resumed."""
+
+
+class Summary(NamedTuple):
+    """Contents of the tables and the page."""
+
+    kind: str
+    headers: tuple[str, ...]
+    """Headers above the rows' labels."""
+    reference: str
+    """Name of the row that speeds and training times are relative to."""
+    sets: Mapping[str, Benchmark]
+    rows: list[Row]
+    notes: list[str]
+    adapters: list[AdapterCost]
+    settings: Mapping[str, Any]
+
+
+def summarise(
+    prepared: Prepared, out: pathlib.Path, adapters: Sequence[AdapterCost] = ()
+) -> Summary:
+    """Read the results that `carry_out` left, and summarise them by row.
+
+    Raises:
+        InputError: a result is missing, not whole, or of another set.
+    """
+    sets = dict(zip(short_names(prepared.benchmarks), prepared.benchmarks, strict=True))
+    raced, measured = read_race(out)
+    names = [variant.name for variant in prepared.variants]
+    reference = prepared.variants["crisalad" in names and names.index("crisalad")]
+    records = {v.name: _training_records(prepared, out, v) for v in prepared.variants}
+    seconds = {name: _seconds(trainings) for name, trainings in records.items()}
+    rows = []
+    for variant in prepared.variants:
+        parameters, trained = _parameters(variant)
+        batch = statistics.median(raced.rounds[variant.run])
+        took, theirs = seconds[variant.name], seconds[reference.name]
+        for grouping, recalls in _recalls(prepared, out, variant, sets).items():
+            rows.append(
+                Row(
+                    variant.name,
+                    variant.labels,
+                    grouping,
+                    variant.model.descriptor_dim,
+                    recalls,
+                    _speed(raced, variant.run, reference.run),
+                    measured["batch_size"] / batch if measured["absolute"] else None,
+                    parameters,
+                    trained,
+                    None if took is None or theirs is None else took / theirs,
+                    took,
+                    max((record["sittings"] for record in records[variant.name]), default=0),
+                )
+            )
+    return Summary(
+        prepared.config.kind,
+        labels_of(prepared.config.kind),
+        reference.name,
+        sets,
+        rows,
+        _notes(prepared, rows, reference, measured) + (list(NOTES) if adapters else []),
+        list(adapters),
+        to_plain(prepared.config),
+    )
+
+
+def _speed(raced: Race, name: str, reference: str) -> float:
+    return 1 / raced.slower(name, reference)[0]
+
+
+def _training_records(
+    prepared: Prepared, out: pathlib.Path, variant: Variant
+) -> list[dict[str, Any]]:
+    if not variant.trains:
+        return []
+    return [
+        read_json(folder_of(out, variant.run, seed) / "training.json")
+        for seed in variant.seeds(prepared.config.seeds)
+    ]
+
+
+def _seconds(records: list[dict[str, Any]]) -> float | None:
+    if not records:
+        return None
+    return statistics.fmean(record["steps"] * record["step_seconds"] for record in records)
+
+
+def _parameters(variant: Variant) -> tuple[int, int | None]:
+    """Count all parameters, and those that were trained."""
+    total = sum(cost.parameters for cost in part_costs(variant.model))
+    if variant.weights is not None:
+        return total, None
+    if not variant.learns:
+        return total, 0
+    return total, count_trainable(variant.model, variant.training.trainable)
+
+
+def _recalls(
+    prepared: Prepared, out: pathlib.Path, variant: Variant, sets: Mapping[str, Benchmark]
+) -> dict[str, dict[str, dict[int, Recall]]]:
+    """Read a variant's recalls by grouping, set and K."""
+    by_grouping: dict[str, dict[str, dict[int, Recall]]] = {}
+    for number, (name, benchmark) in enumerate(sets.items()):
+        paths = [
+            result_path(out, variant, seed, number) for seed in variant.seeds(prepared.config.seeds)
+        ]
+        results = [_checked(path, benchmark) for path in paths]
+        for grouping in results[0]:
+            ranks = np.array([result[grouping] for result in results])
+            recalls = {k: recall_of(ranks, k) for k in KS}
+            by_grouping.setdefault(grouping, {})[name] = recalls
+    return by_grouping
+
+
+def _checked(path: pathlib.Path, benchmark: Benchmark) -> dict[str, list[int]]:
+    result = read_json(path)
+    expected = (benchmark.name, len(benchmark.queries), len(benchmark.database))
+    if (result["benchmark"], result["queries"], result["database"]) != expected:
+        raise InputError(
+            f"{path}: found a result of {result['benchmark']} with {result['queries']} queries and "
+            f"{result['database']} database images, expected {expected[0]} with {expected[1]} and "
+            f"{expected[2]}; delete it, and the same command makes it anew"
+        )
+    return result["groupings"]
+
+
+def recall_of(ranks: np.ndarray, k: int) -> Recall:
+    """Compute Recall@K of (seed, query) ranks of the first right retrieval, from 1; 0 is none."""
+    hits = (ranks > 0) & (ranks <= k)
+    by_seed = tuple(hits.mean(axis=1).tolist())
+    return Recall(
+        statistics.fmean(by_seed),
+        statistics.stdev(by_seed) if len(by_seed) > 1 else None,
+        bootstrap_interval(hits.sum(axis=0), trials=len(hits)),
+        by_seed,
+    )
+
+
+def _notes(
+    prepared: Prepared, rows: list[Row], reference: Variant, measured: Mapping[str, Any]
+) -> list[str]:
+    config = prepared.config
+    title = reference.labels[0]
+    notes = [
+        "Recalls in percent of all queries: the mean over the seeds ± their standard deviation, "
+        "and 95 % by bootstrap over the queries, as if they were independent. "
+        f"Seeds of all but models from files: {config.seeds}. Weights after the last step, nothing "
+        "selected on a test set.",
+        f"Images/s: describing batches of {measured['batch_size']} alone, all models in turns, on "
+        f"{measured['device']}"
+        + ("." if measured["absolute"] else f", over {title}'s.")
+        + (" Ranking anew comes on top." if any(v.rerank for v in prepared.variants) else ""),
+    ]
+    if any(v.trains for v in prepared.variants):
+        notes.append(
+            "Training time: steps x the median time of a step"
+            + ("" if measured["absolute"] else f", over {title}'s")
+            + ", without compiling; runs are not interleaved."
+        )
+        notes.append(_training_note(prepared))
+    resumed = sorted({row.labels[0] for row in rows if row.sittings > 1})
+    if resumed:
+        notes.append(
+            f"Resumed, so that its steps' times are of several calls: {', '.join(resumed)}."
+        )
+    if any(row.grouping not in (ANY, "single") for row in rows):
+        notes.append(
+            "A grouping other than single lets images look at others of their batch, of "
+            f"{config.batch_size}."
+        )
+    if config.kind == "compare":
+        notes += _method_notes(prepared)
+    elif config.backbone is None:
+        notes.append(
+            "From nothing the learning rates are the recipe scratch's in the paper's proportion, "
+            "6e-5 to 1e-4, and the step schedule is the paper's, after the warm-up: halved every "
+            "three epochs."
+        )
+    return notes
+
+
+def _training_note(prepared: Prepared) -> str:
+    """Describe the start and the set of training, and its length if that is the same for all."""
+    config = prepared.config
+    trained = [v.training for v in prepared.variants if v.trains]
+    start = "a given backbone" if config.backbone else "nothing, by the recipe scratch"
+    words = f"Trained from {start} on {pathlib.Path(config.train or '').name}: "
+    sizes = {(t.epochs, t.places_per_batch, t.images_per_place) for t in trained}
+    if len(sizes) > 1:
+        return words + "epochs and batches of each method's recipe."
+    ((epochs, places, images),) = sizes
+    return words + f"epochs: {epochs}, batches of {places} places x {images} images."
+
+
+def _method_notes(prepared: Prepared) -> list[str]:
+    shared = [v.labels[0] for v in prepared.variants if v.rerank is not None]
+    notes = []
+    if shared:
+        notes.append(
+            f"Ranked anew, the first {prepared.config.rerank} retrievals: {', '.join(shared)}."
+        )
+    unlearnt = [v.labels[0] for v in prepared.variants if not v.learns]
+    if unlearnt:
+        start = "" if prepared.config.backbone else ", here of random features"
+        notes.append(
+            f"Never trained, a vocabulary of features alone{start}: {', '.join(unlearnt)}."
+        )
+    return notes

@@ -1,0 +1,151 @@
+"""The demo: render a synthetic city, train on it and evaluate, without data of one's own."""
+
+import dataclasses
+import functools
+import pathlib
+import time
+from typing import NamedTuple
+
+import jax
+
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.data.augmentations.light import LightAugmentConfig
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.places import read_places
+from crisalad_jax.evaluation.evaluate import KS, evaluate
+from crisalad_jax.evaluation.metrics import recalls
+from crisalad_jax.evaluation.results import GroupingResult
+from crisalad_jax.experiments.baselines import hog_descriptors
+from crisalad_jax.experiments.report import (
+    RecallRow,
+    prediction_gallery,
+    recall_curves,
+    recall_markdown,
+    training_curves,
+)
+from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
+from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.retrieval.search import search
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path, write_json
+from crisalad_jax.utils.progress import progress_bar
+
+GROUPINGS = ("single", "shuffled", "sequential")
+"""The groupings; without window, because rendered places have no order in time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DemoConfig:
+    """A run of about two minutes on two cores."""
+
+    seed: int = 0
+    train_places: int = 240
+    test_places: int = 150
+    epochs: int = 18
+
+
+class DemoSummary(NamedTuple):
+    """Results and files of the demo."""
+
+    rows: list[RecallRow]
+    pictures: list[pathlib.Path]
+    seconds: float
+    training_seconds: float
+
+
+def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> DemoSummary:
+    """Render, evaluate untrained, train, evaluate again; write tables and pictures into `out`.
+
+    The training run under `out/run` resumes if it was interrupted.
+
+    Raises:
+        InputError: `out` holds other files, or a demo of another configuration.
+    """
+    started = time.monotonic()
+    if out.exists() and not (out / "city").exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(
+            f"{out}: found files but no demo, expected a demo or a new or empty folder"
+        )
+    city = SyntheticCityConfig(
+        train_places=config.train_places, test_places=config.test_places, seed=config.seed
+    )
+    images = city.train_places * city.images_per_place
+    images += city.test_places * (city.database_per_place + city.queries_per_place)
+    with progress_bar("rendering the city", images, "images", quiet=quiet) as bar:
+        write_synthetic_city(out / "city", city, progress=lambda done, total: bar.advance(1))
+    benchmark = open_benchmark(out / "city" / "test")
+    places = read_places(out / "city" / "train")
+
+    settings = demo_recipe(config)
+    untrained = init_crisalad(jax.random.key(config.seed), settings.model)
+    measure = functools.partial(
+        evaluate, benchmark=benchmark, groupings=GROUPINGS, seed=config.seed, seeds=1, quiet=quiet
+    )
+    before = measure(untrained, settings.model)
+    training_started = time.monotonic()
+    fit(settings, places, out / "run", quiet=quiet)
+    training_seconds = time.monotonic() - training_started
+    trained, model = load_weights(out / "run" / "last.safetensors")
+    after = measure(trained, model)
+
+    rows = [RecallRow(benchmark.name, "HOG, no learning", "any", _hog_recalls(benchmark))]
+    rows += _rows(benchmark, "untrained", before)
+    rows += _rows(benchmark, "trained", after)
+    pictures = [out / name for name in ("recall.png", "training.png", "gallery.png")]
+    recall_curves(
+        pictures[0],
+        {f"{row.model}, {row.grouping}": row.recalls for row in rows if row.grouping != "shuffled"},
+        "Recall@K on places never seen in training",
+    )
+    training_curves(pictures[1], read_metrics(out / "run" / "metrics.jsonl"))
+    prediction_gallery(
+        pictures[2],
+        benchmark.queries,
+        benchmark.database,
+        *after[0].neighbours,
+        benchmark.ground_truth(),
+        title="Queries and what the trained model finds, every image described alone",
+    )
+    with atomic_path(out / "recalls.md") as temporary:
+        temporary.write_text(recall_markdown(rows), encoding="utf-8")
+    seconds = time.monotonic() - started
+    write_json(
+        out / "summary.json",
+        {
+            "config": dataclasses.asdict(config),
+            "seconds": round(seconds, 1),
+            "training_seconds": round(training_seconds, 1),
+            "results": [row._asdict() for row in rows],
+        },
+    )
+    return DemoSummary(rows, pictures, seconds, training_seconds)
+
+
+def demo_recipe(config: DemoConfig) -> TrainConfig:
+    """Make the recipe of `tiny` for four images a place, whose light varies enough by itself."""
+    return dataclasses.replace(
+        recipe("tiny"),
+        augmentation=LightAugmentConfig(),
+        places_per_batch=24,
+        images_per_place=4,
+        min_images=4,
+        epochs=config.epochs,
+        seed=config.seed,
+    )
+
+
+def _rows(benchmark: Benchmark, model: str, results: list[GroupingResult]) -> list[RecallRow]:
+    return [RecallRow(benchmark.name, model, r.grouping, r.recalls) for r in results]
+
+
+def _hog_recalls(benchmark: Benchmark) -> dict[int, float]:
+    sides = [
+        hog_descriptors([read_image(path) for path in paths])
+        for paths in (benchmark.database, benchmark.queries)
+    ]
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)

@@ -1,0 +1,294 @@
+"""One place: a street with buildings, trees and lamps, all drawn from one seed."""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from crisalad_jax.experiments.synthetic.buildings import DEPTH, Habit, building
+from crisalad_jax.experiments.synthetic.materials import GLASS, ROOFS, WALLS, Kind, pick, scaled
+from crisalad_jax.experiments.synthetic.mesh import (
+    GROUND_LAYER,
+    TO_CAMERA,
+    UP,
+    Front,
+    Mesh,
+    Scene,
+    Vector,
+    block,
+    discs,
+    flat,
+    polygons,
+    rectangles,
+    street_front,
+)
+
+
+class Body(NamedTuple):
+    """The ground plan and height of a building in metres, for its shadow."""
+
+    x0: float
+    x1: float
+    z0: float
+    z1: float
+    height: float
+
+
+class Place(NamedTuple):
+    """The scene of one place, and the orientation of its street."""
+
+    scene: Scene
+    lamps: Float[np.ndarray, "lamp 3"]
+    bodies: tuple[Body, ...]
+    bearing: float
+    """Direction of the street in degrees clockwise from north."""
+    heading: float
+    """Direction of the default view in degrees clockwise from the street."""
+    lanes: tuple[float, float, float, float]
+    """x of the left fronts, the left kerb, the right kerb and the right fronts."""
+    hills: Float[np.ndarray, " bearing"]
+    """Height of the hills over the horizon, as a tangent, at equal steps around the compass."""
+
+
+@functools.lru_cache(maxsize=32)
+def build_place(seed: int) -> Place:
+    """Build the place of a seed; the latest places are cached."""
+    rng = np.random.default_rng((seed, 0))
+    mesh = Mesh()
+    walls = tuple(WALLS[i] for i in rng.choice(len(WALLS), 5, replace=False))
+    floors, storey = int(rng.integers(2, 6)), rng.uniform(2.9, 3.7)
+    habit = Habit(walls, floors, storey, rng.uniform(2.0, 3.8))
+    left, right = -rng.uniform(6.5, 12.0), rng.uniform(6.5, 12.0)
+    length = rng.uniform(28.0, 62.0)
+    kerbs = (left + rng.uniform(2.0, 3.5), right - rng.uniform(2.0, 3.5))
+
+    _ground(mesh, rng, kerbs, length)
+    _skyline(mesh, rng, length)
+    bodies = _far_row(mesh, rng, length, habit)
+    park = rng.choice(3, p=(0.7, 0.15, 0.15))
+    for number, x in ((1, left), (2, right)):
+        if park == number:
+            _park(mesh, rng, x, length)
+        else:
+            bodies += _row(mesh, rng, x, length, habit)
+    lamps: list[Vector] = []
+    for x in (kerbs[0] - 0.6, kerbs[1] + 0.6):
+        if rng.random() < 0.55:
+            for z in np.arange(rng.uniform(7.0, 16.0), length - 2, rng.uniform(7.0, 14.0)):
+                if rng.random() < 0.8:
+                    _tree(mesh, rng, x + rng.uniform(-0.3, 0.3), z + rng.uniform(-1, 1))
+        if rng.random() < 0.6 or (x > 0 and not lamps):
+            height = rng.uniform(5.0, 8.0)
+            stations = np.arange(rng.uniform(6.0, 16.0), length + 4, rng.uniform(14.0, 24.0))
+            lamps += [_lamp(mesh, x, float(z), height) for z in stations]
+    if rng.random() < 0.4:
+        _wires(mesh, rng, float(rng.choice(kerbs)), length)
+    if rng.random() < 0.25:
+        _monument(mesh, rng, sum(kerbs) / 2, rng.uniform(0.45, 0.9) * length)
+
+    ridge = rng.uniform(0.0, 1.0, 24) ** 2 * rng.uniform(0.02, 0.2)
+    hills = np.interp(np.arange(96), np.arange(24) * 4.0, ridge, period=96)
+    bearing, heading = float(rng.uniform(0, 360)), float(rng.uniform(-20, 20))
+    lanes = (left, *kerbs, right)
+    return Place(mesh.scene(), np.array(lamps), tuple(bodies), bearing, heading, lanes, hills)
+
+
+def _ground(
+    mesh: Mesh, rng: np.random.Generator, kerbs: tuple[float, float], length: float
+) -> None:
+    """Add pavements, the street, the crossing at its far end, and their lines."""
+    paving = pick(rng, ((0.56, 0.54, 0.51), (0.62, 0.58, 0.52), (0.50, 0.50, 0.50)))
+    asphalt = pick(rng, ((0.30, 0.30, 0.31), (0.36, 0.35, 0.34), (0.42, 0.38, 0.35)))
+    left, right = kerbs
+    mesh.layer = GROUND_LAYER + 9
+    mesh.add(flat(-900, -20, 900, 2500), (0.44, 0.46, 0.40), UP, Kind.GRASS)
+    mesh.layer = GROUND_LAYER + 8
+    mesh.add(flat(-200, -20, 200, length + 25), paving, UP, Kind.PAVEMENT)
+    mesh.layer = GROUND_LAYER + 7
+    street, crossing = flat(left, -20, right, length + 1), flat(-120, length + 1, 120, length + 8)
+    mesh.add(np.concatenate((street, crossing)), asphalt, UP, Kind.ROAD)
+    mesh.layer = GROUND_LAYER + 6
+    edge = np.array(kerbs)
+    kerb = flat(edge - 0.12, -5, edge + 0.12, length + 1)
+    mesh.add(kerb, scaled(paving, 1.25), UP, Kind.PAVEMENT)
+    white, middle = (0.78, 0.78, 0.74), (left + right) / 2
+    if rng.random() < 0.7:
+        dash = rng.uniform(1.5, 3.5)
+        z = np.arange(1, length, dash * 2)
+        mesh.add(flat(middle - 0.08, z, middle + 0.08, z + dash), white, UP, Kind.ROAD)
+    if rng.random() < 0.45:
+        z, x = rng.uniform(6.0, length - 6), np.arange(left + 0.4, right - 0.6, 1.0)
+        mesh.add(flat(x, z, x + 0.5, z + 3), white, UP, Kind.ROAD)
+    if rng.random() < 0.35:
+        x = np.array((left + 2.2, right - 2.2))
+        mesh.add(flat(x - 0.06, -5, x + 0.06, length), white, UP, Kind.ROAD)
+    if rng.random() < 0.2:
+        x = middle + np.array((-2.2, -0.8, 0.8, 2.2))
+        mesh.add(flat(x - 0.07, -5, x + 0.07, length), (0.20, 0.20, 0.21), UP)
+
+
+def _skyline(mesh: Mesh, rng: np.random.Generator, length: float) -> None:
+    """Add distant towers, and at times a steeple: landmarks that barely move."""
+    for _ in range(int(rng.integers(0, 6))):
+        z = length + rng.uniform(90, 320)
+        x = rng.uniform(-0.9, 0.9) * z
+        width, height = rng.uniform(14, 34), z * rng.uniform(0.18, 0.5)
+        mesh.layer = 3000 + z
+        colour = pick(rng, WALLS[6:])
+        mesh.add(rectangles(x, 0, x + width, height, z), colour, TO_CAMERA)
+        if rng.random() < 0.5:
+            setback = rectangles(x + width * 0.25, height, x + width * 0.75, height * 1.12, z)
+            mesh.add(setback, colour, TO_CAMERA)
+        columns, rows = int(rng.integers(3, 7)), int(rng.integers(6, 14))
+        u = np.tile(x + (np.arange(columns) + 0.2) * width / columns, rows)
+        v = np.repeat((np.arange(rows) + 0.3) * height / rows, columns)
+        panes = rectangles(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows, z)
+        mesh.add(panes, scaled(GLASS, 1.6), TO_CAMERA, Kind.GLASS)
+    if rng.random() < 0.4:
+        z = length + rng.uniform(30, 90)
+        x = rng.uniform(-0.5, 0.5) * z
+        half, height = rng.uniform(2.5, 4), z * rng.uniform(0.28, 0.45)
+        mesh.layer = 2000 + z
+        mesh.add(rectangles(x - half, 0, x + half, height, z), pick(rng, WALLS[:6]), TO_CAMERA)
+        eaves, tip = half + 0.4, height * rng.uniform(1.2, 1.7)
+        spire = polygons((x - eaves, height, z), (x + eaves, height, z), (x, tip, z))
+        mesh.add(spire, pick(rng, ROOFS), (0.0, 0.6, -0.8), Kind.ROOF)
+        bell = rectangles(x - half * 0.3, height * 0.82, x + half * 0.3, height * 0.93, z)
+        mesh.add(bell, (0.12, 0.12, 0.13), TO_CAMERA)
+
+
+def _far_row(mesh: Mesh, rng: np.random.Generator, length: float, habit: Habit) -> list[Body]:
+    """Add the row that closes the street, at varying distances and at times with a gap."""
+    reach = 14 + length * 0.7
+    stands: list[tuple[float, float, float]] = []
+    x = -reach
+    while x < reach:
+        width = rng.uniform(8.0, 18.0)
+        if rng.random() < 0.86:
+            stands.append((length + 11 + rng.choice((0.0, 0.0, 3.0, 7.0)), x, width))
+        x += width
+    bodies = []
+    for z, x, width in sorted(stands, reverse=True):
+        mesh.layer = 1000 + z
+        front = Front(mesh, (x, 0.0, z), (1.0, 0.0, 0.0), TO_CAMERA, sees_start=x > 0)
+        height = building(rng, front, width, habit)
+        bodies.append(Body(x, x + width, z, z + DEPTH, height))
+    return bodies
+
+
+def _row(mesh: Mesh, rng: np.random.Generator, x: float, length: float, habit: Habit) -> list[Body]:
+    """Add one side of the street, from the camera to the crossing, with gaps and setbacks."""
+    side = -1.0 if x < 0 else 1.0
+    bodies = []
+    z = rng.uniform(-9.0, -2.0)
+    while z < length - 5:
+        width = min(rng.uniform(7.0, 17.0), length - z)
+        if z > 4 and rng.random() < 0.12:
+            z += width * 0.6
+            continue
+        face = x + side * rng.choice((0.0, 0.0, 0.0, 0.8, 2.5))
+        mesh.layer = z + width
+        height = building(rng, street_front(mesh, face, z), width, habit)
+        x0, x1 = sorted((face, face + side * DEPTH))
+        bodies.append(Body(x0, x1, z, z + width, height))
+        z += width
+    return bodies
+
+
+def _park(mesh: Mesh, rng: np.random.Generator, x: float, length: float) -> None:
+    """Add lawn and trees behind a wall, on a side without houses."""
+    side = -1.0 if x < 0 else 1.0
+    mesh.layer = GROUND_LAYER + 5
+    mesh.add(flat(x, -5, x + side * 90, length), (0.40, 0.48, 0.30), UP, Kind.GRASS)
+    for z in np.arange(rng.uniform(10, 16), length, rng.uniform(5.0, 9.0)):
+        _tree(mesh, rng, x + side * rng.uniform(2.0, 16.0), float(z))
+    colour, height = pick(rng, WALLS), rng.uniform(0.7, 1.6)
+    # The wall is in pieces, each with its own layer: a tree may stand in front of one and behind
+    # the next.
+    for z in np.arange(-3.0, length, 3.0):
+        mesh.layer = float(z)
+        front = street_front(mesh, x, float(z))
+        front.add(rectangles(0, 0, 3, height), colour)
+        front.add(rectangles(0, height, 3, height + 0.12), colour, Kind.LEDGE)
+
+
+def _tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+    """Add a broad-leaved tree, bare in winter, or an evergreen conifer."""
+    mesh.layer = z
+    height = rng.uniform(4.5, 8.5)
+    bark = (0.26, 0.21, 0.17)
+    mesh.add(rectangles(x - 0.16, 0, x + 0.16, height * 0.6, z), bark, TO_CAMERA)
+    if rng.random() < 0.2:
+        for low, reach in ((0.2, 1.9), (0.44, 1.4), (0.68, 0.9)):
+            y = height * low
+            tier = polygons((x - reach, y, z), (x + reach, y, z), (x, y + height * 0.42, z))
+            mesh.add(tier, (0.13, 0.26, 0.17), (0.0, 0.5, -0.85), Kind.NEEDLE)
+        return
+    n = 9
+    angle = np.linspace(-1.1, 1.1, n) + rng.uniform(-0.12, 0.12, n)
+    fork = height * rng.uniform(0.34, 0.6, n)
+    length = height * rng.uniform(0.28, 0.46, n)
+    tip_x, tip_y = x + np.sin(angle) * length, fork + np.cos(angle) * length
+    mesh.add(polygons((x, fork, z), (x + 0.12, fork, z), (tip_x, tip_y, z)), bark, TO_CAMERA)
+    middle_x, middle_y = (x + tip_x) / 2, (fork + tip_y) / 2
+    twig_x, twig_y = middle_x + np.sin(angle * 0.3) * 0.9, middle_y + 1.0
+    twigs = polygons((middle_x, middle_y, z), (middle_x + 0.08, middle_y, z), (twig_x, twig_y, z))
+    mesh.add(twigs, bark, TO_CAMERA)
+    hue = float(rng.random())
+    for shade, lift, count in ((0.62, -0.25, 6), (0.85, 0.1, 6), (1.08, 0.45, 5)):
+        across = height * 0.21 * (rng.normal(0, 0.62, count) - lift * 0.5)
+        up = height * (0.72 + 0.21 * (rng.normal(0, 0.62, count) + lift))
+        crown = discs(x + across, up, height * 0.21 * rng.uniform(0.5, 0.85, count), z)
+        # Each disc is a part: inside a part, an even number of overlapping polygons leaves a hole.
+        for disc in crown:
+            mesh.add(disc[None], (hue, shade, 0.0), (0.0, 0.6, -0.8), Kind.LEAF)
+
+
+def _lamp(mesh: Mesh, x: float, z: float, height: float) -> Vector:
+    """Add a street lamp with an arm over the street; return the position of its light."""
+    mesh.layer = z
+    tip = x + 1.3 if x < 0 else x - 1.3
+    post = rectangles(x - 0.09, 0, x + 0.09, height, z)
+    arm = rectangles(min(x, tip), height - 0.12, max(x, tip), height, z)
+    mesh.add(np.concatenate((post, arm)), (0.20, 0.22, 0.22), TO_CAMERA)
+    head = rectangles(tip - 0.35, height - 0.32, tip + 0.35, height - 0.08, z)
+    mesh.add(head, (0.75, 0.74, 0.68), TO_CAMERA, Kind.LAMP)
+    return (tip, height - 0.2, z)
+
+
+def _wires(mesh: Mesh, rng: np.random.Generator, x: float, length: float) -> None:
+    """Add a line of poles with sagging wires."""
+    height, gap = rng.uniform(7.0, 9.0), rng.uniform(14.0, 20.0)
+    t = np.linspace(0, 1, 7)
+    sag = height - 0.6 - 3.2 * t * (1 - t)
+    y0, y1 = sag[:-1], sag[1:]
+    for z in np.arange(rng.uniform(4.0, 12.0), length, gap):
+        mesh.layer = float(z)
+        pole = rectangles(x - 0.13, 0, x + 0.13, height, z)
+        bar = rectangles(x - 0.9, height - 0.8, x + 0.9, height - 0.65, z)
+        mesh.add(np.concatenate((pole, bar)), (0.30, 0.25, 0.21), TO_CAMERA)
+        z0, z1 = z + t[:-1] * gap, z + t[1:] * gap
+        for end in (x - 0.8, x + 0.8):
+            wire = polygons(
+                (end, y0, z0), (end, y1, z1), (end, y1 + 0.04, z1), (end, y0 + 0.04, z0)
+            )
+            mesh.add(wire, (0.12, 0.12, 0.13), TO_CAMERA)
+
+
+def _monument(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+    """Add a column with a ball, or an obelisk, on a plinth in the street."""
+    mesh.layer = z
+    stone = pick(rng, WALLS[2:9])
+    block(mesh, (x - 1.5, 0.0, z), (x + 1.5, 0.9, z + 3.0), stone)
+    height, half = rng.uniform(3.0, 9.0), rng.uniform(0.35, 0.9)
+    if rng.random() < 0.5:
+        block(
+            mesh, (x - half, 0.9, z + 1), (x + half, height, z + 1 + 2 * half), scaled(stone, 0.9)
+        )
+        mesh.add(discs(x, height + 0.7, 0.8, z + 1), (0.35, 0.40, 0.36), (0.0, 0.5, -0.85))
+    else:
+        obelisk = polygons(
+            (x - half, 0.9, z), (x + half, 0.9, z), (x + 0.15, height, z), (x - 0.15, height, z)
+        )
+        mesh.add(obelisk, scaled(stone, 0.9), TO_CAMERA)

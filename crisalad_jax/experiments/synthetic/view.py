@@ -1,0 +1,58 @@
+"""The view of a picture: the camera's pose, the season, hour and weather, and the traffic."""
+
+import dataclasses
+from typing import Literal
+
+from crisalad_jax.utils.errors import InputError
+
+Season = Literal["spring", "summer", "autumn", "winter"]
+Time = Literal["noon", "dusk", "night"]
+Weather = Literal["clear", "overcast", "haze", "rain"]
+
+SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
+TIMES: tuple[Time, ...] = ("noon", "dusk", "night")
+WEATHERS: tuple[Weather, ...] = ("clear", "overcast", "haze", "rain")
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """How one picture of a place is taken: the camera's pose, its surroundings, its sensor."""
+
+    lateral: float = 0.0
+    """Metres to the right of the place's centre, across the street."""
+    forward: float = 0.0
+    """Metres along the street, towards its far end."""
+    heading: float = 0.0
+    """Degrees clockwise from the direction in which the place is usually seen."""
+    season: Season = "summer"
+    time: Time = "noon"
+    weather: Weather = "clear"
+    occluders: int | None = None
+    """Seed of the cars, buses and people in the street; None leaves it empty."""
+    exposure: float = 0.0
+    """Exposure in stops."""
+    noise: float = 0.0
+    """Standard deviation of the sensor noise, in grey levels of 255."""
+    seed: int = 0
+    """Seed of the sun's position, clouds, rain, lit windows, white balance and noise."""
+
+    def __post_init__(self) -> None:
+        """Check the names and the ranges."""
+        for name, choices in (("season", SEASONS), ("time", TIMES), ("weather", WEATHERS)):
+            value = getattr(self, name)
+            if value not in choices:
+                raise InputError(
+                    f"View.{name}: found {value!r}, expected one of {', '.join(choices)}"
+                )
+        if not self.noise >= 0:
+            raise InputError(f"View.noise: found {self.noise}, expected at least 0")
+
+
+def check_size(what: str, size: tuple[int, int]) -> None:
+    """Check the height and width of a picture in pixels.
+
+    Raises:
+        InputError: they are not two, or out of range; the message names the argument `what`.
+    """
+    if len(size) != 2 or min(size) < 16 or max(size) > 2048:
+        raise InputError(f"{what}: found {size}, expected a height and a width from 16 to 2048")

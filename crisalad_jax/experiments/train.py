@@ -1,0 +1,110 @@
+"""A training run from folders to curves."""
+
+import os
+import pathlib
+from collections.abc import Callable
+
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.places import read_places
+from crisalad_jax.experiments.report import training_curves
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.loop import FitResult, check_learns, fit
+from crisalad_jax.training.run_files import check_run
+from crisalad_jax.training.start import read_start, with_vocabulary_of
+from crisalad_jax.utils import distributed
+from crisalad_jax.utils.errors import InputError
+
+Path = str | os.PathLike[str]
+
+
+def train(
+    config: TrainConfig,
+    data: Path,
+    out: Path,
+    *,
+    validation: Path | None = None,
+    validation_images: Path | None = None,
+    weights: Path | None = None,
+    backbone: Path | None = None,
+    on_bad_image: OnBadImage = "stop",
+    num_workers: int = 0,
+    shard_state: bool = False,
+    quiet: bool = False,
+    say: Callable[[str], None] = lambda line: None,
+) -> FitResult:
+    """Train on a folder of places, or resume the run in `out`, and draw its curves.
+
+    Args:
+        config: how to train.
+        data: folder in the layout of GSV-Cities.
+        out: folder of the run; see `fit`.
+        validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
+        validation_images: folder of the images that a .mat file or .npy lists at `validation` name.
+        weights: a whole model to start from.
+        backbone: a checkpoint to start the backbone from.
+        on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
+        num_workers: number of processes that read the training images; 0 for threads.
+        shard_state: keep what trains and its moments in shards, one a device.
+        quiet: no progress bars.
+        say: called with each line to print.
+
+    Returns:
+        How the run ended.
+
+    Raises:
+        InputError: what `read_start`, `read_places`, `open_benchmark` and `fit` raise.
+        Stopped: what `fit` raises; the same call resumes.
+
+    Example:
+        >>> import dataclasses
+        >>> from crisalad_jax import recipe
+        >>> config = dataclasses.replace(recipe("tiny"), epochs=1, places_per_batch=4)
+        >>> train(config, places, folder / "run", quiet=True).steps
+        2
+    """
+    out = pathlib.Path(out)
+    check_learns(config)
+    if validation is None and validation_images is not None:
+        raise InputError("--val-images: found no --val, expected it beside --val")
+
+    def read() -> tuple:
+        initial = read_start(config, weights=weights, backbone=backbone)
+        places = read_places(
+            pathlib.Path(data), cities=config.cities, min_images=config.min_images_of_place
+        )
+        if validation is None:
+            return initial, places, None
+        images = None if validation_images is None else pathlib.Path(validation_images)
+        return initial, places, open_benchmark(validation, images=images)
+
+    initial, places, benchmark = distributed.raise_together(read)
+    if (weights, backbone) == (None, None) and config.trainable != "all":
+        say(
+            "Note: no --weights or --backbone, so the frozen part of the model "
+            f"({config.trainable} trains) is random. --trainable all trains everything."
+        )
+    say(
+        f"{data}: {len(places.place_id)} places, {len(places.files)} images"
+        + ("" if benchmark is None else f"; validation on {benchmark.name}")
+    )
+    if weights is None:
+        distributed.run_on_primary(lambda: check_run(out, config))
+        initial = with_vocabulary_of(
+            initial, config, places, on_bad_image=on_bad_image, quiet=quiet
+        )
+    result = fit(
+        config,
+        places,
+        out,
+        validation=benchmark,
+        initial=initial,
+        on_bad_image=on_bad_image,
+        num_workers=num_workers,
+        shard_state=shard_state,
+        quiet=quiet,
+    )
+    if distributed.is_primary():
+        training_curves(out / "curves.png", read_metrics(out / "metrics.jsonl"))
+    return result

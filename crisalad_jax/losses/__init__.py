@@ -1,0 +1,23 @@
+"""Losses on the descriptors of a batch, and the miner that chooses which pairs enter them.
+
+Each is equal to pytorch-metric-learning's of the same name on unit descriptors.
+"""
+
+import importlib
+import pkgutil
+
+from crisalad_jax.losses.base import LOSSES as LOSSES
+from crisalad_jax.losses.base import Loss as Loss
+from crisalad_jax.losses.base import LossBatch as LossBatch
+from crisalad_jax.losses.base import LossValue as LossValue
+from crisalad_jax.losses.base import Pairs as Pairs
+from crisalad_jax.losses.metric import LossConfig as LossConfig
+from crisalad_jax.losses.metric import LossResult as LossResult
+from crisalad_jax.losses.metric import all_pairs as all_pairs
+from crisalad_jax.losses.metric import metric_loss as metric_loss
+from crisalad_jax.losses.metric import mine as mine
+
+register_loss = LOSSES.register
+
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")

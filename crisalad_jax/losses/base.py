@@ -1,0 +1,189 @@
+"""Losses on the descriptors of a batch: their interface and their inputs."""
+
+import abc
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.config.parts import Part, Registry
+
+Similarities = Float[Array, "anchor image"]
+
+
+class Pairs(NamedTuple):
+    """The pairs (anchor, other) that enter the loss."""
+
+    positives: Bool[Array, "anchor image"]
+    negatives: Bool[Array, "anchor image"]
+
+
+@dataclasses.dataclass(frozen=True)
+class LossBatch:
+    """The inputs of a loss for one batch."""
+
+    descriptors: Float[Array, "image descriptor"]
+    """Unit descriptors, in float32 at least."""
+    labels: Int[Array, " image"]
+    """Place, or class, of each image."""
+    valid: Bool[Array, " image"]
+    """Whether an image takes part; the others are neither anchors nor in pairs."""
+    pairs: Pairs
+    """Pairs that the miner chose."""
+    classes: Int[Array, ""] | int | None = None
+    """Number of classes, where the loss has a vector for each."""
+
+    @functools.cached_property
+    def similarities(self) -> Similarities:
+        """Inner products of all descriptors."""
+        return inner_products(self.descriptors)
+
+    @functools.cached_property
+    def distances(self) -> Similarities:
+        """Euclidean distances of all descriptors, with gradient 0 where two are the same."""
+        squared = 2 - 2 * self.similarities
+        apart = squared > 0
+        return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1)), 0)
+
+    @property
+    def anchors(self) -> Int[Array, ""]:
+        """Number of valid images, at least 1."""
+        return jnp.maximum(self.valid.sum(), 1)
+
+
+class LossValue(NamedTuple):
+    """A loss, and an accuracy that a classification logs beside it."""
+
+    loss: Float[Array, ""]
+    accuracy: Float[Array, ""] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Loss(Part, abc.ABC):
+    """A loss of a batch: a frozen dataclass whose fields are its constants.
+
+    `apply` alone is required. A plain function of a `LossBatch` that returns a number is a loss
+    without constants.
+
+    Example:
+        >>> from crisalad_jax import LossConfig, metric_loss, register_loss
+        >>> @register_loss("positive-distance")
+        ... def positive_distance(batch):
+        ...     return jnp.where(batch.pairs.positives, 1 - batch.similarities, 0).sum()
+        >>> config = LossConfig(kind="positive-distance", miner="none")
+        >>> float(metric_loss(jnp.eye(2), jnp.array([0, 0]), config).loss)
+        2.0
+    """
+
+    ranks_all: ClassVar[bool] = False
+    """Whether the loss ranks all images, so that no miner may choose pairs."""
+
+    @property
+    def grouping(self) -> ClassesConfig | None:
+        """Grouping of images into classes; None where the loss is of pairs of places."""
+        return None
+
+    def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Any:
+        """Return the loss's own trainable parameters, a pytree of arrays; by default None.
+
+        Args:
+            key: draws it.
+            classes: number of classes, 0 where the loss is of pairs.
+            dim: width of a descriptor.
+        """
+        return None
+
+    @property
+    def learning_rate(self) -> float:
+        """Learning rate of the loss's own parameters, which have their own Adam optimizer."""
+        return 1e-2
+
+    @abc.abstractmethod
+    def apply(self, params: Any, batch: LossBatch) -> LossValue:
+        """Return the loss of a batch; `params` are of `init`."""
+
+
+def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the methods of a loss that is a plain function of a batch, or of its arrays.
+
+    A function of (descriptors, labels) or (descriptors, labels, valid) is taken as well.
+    """
+    whole = len(inspect.signature(function).parameters) == 1
+
+    def apply(self: Loss, params: Any, batch: LossBatch) -> LossValue:
+        if whole:
+            value = function(batch)
+        else:
+            value = call_loss(function, batch.descriptors, batch.labels, batch.valid)
+        return value if isinstance(value, LossValue) else LossValue(value)
+
+    return {"apply": apply}
+
+
+def call_loss(function: Callable[..., Any], descriptors: Any, labels: Any, valid: Any) -> Any:
+    """Call a function of (descriptors, labels), or of (descriptors, labels, valid)."""
+    takes = len(inspect.signature(function).parameters)
+    return function(*(descriptors, labels, valid)[:takes])
+
+
+def check_value(value: Any, name: str) -> None:
+    """Check that a loss has returned a number.
+
+    Args:
+        value: what it returned.
+        name: what messages call it.
+
+    Raises:
+        InputError: it has not.
+    """
+    require(
+        isinstance(value, LossValue),
+        f"loss {name}: found to return {type(value).__name__}, expected a LossValue",
+    )
+    for what, number in (("", value.loss), ("an accuracy of ", value.accuracy)):
+        if number is None and what:
+            continue
+        is_array = isinstance(number, int | float | np.generic | np.ndarray | jax.Array)
+        shape = f"shape {jnp.shape(number)}" if is_array else type(number).__name__
+        require(
+            is_array and not jnp.shape(number),
+            f"loss {name}: found to return {what}{shape}, expected a single number",
+        )
+
+
+LOSSES = Registry("loss", Loss, of_function=_of_function)
+
+
+def inner_products(descriptors: Float[Array, "image descriptor"]) -> Similarities:
+    """Return the inner products of all descriptors, in float32 at least."""
+    wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
+    return jnp.matmul(wide, wide.T, precision="highest")
+
+
+def mean_of_positive(losses: Float[Array, "*shape"]) -> Float[Array, ""]:
+    """Return the mean over the losses above 0; 0 where there is none."""
+    counted = losses > 0
+    return jnp.where(counted, losses, 0).sum() / jnp.maximum(counted.sum(), 1)
+
+
+def log_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
+    """Compute log(sum of exp(x)) over the chosen entries; 0, with a finite gradient, for none."""
+    some = where.any(axis=1, keepdims=True)
+    # A row without chosen entries sums all of them, to a finite number that is not used.
+    chosen = jnp.where(where | ~some, x, -jnp.inf)
+    return jnp.where(some[:, 0], jax.nn.logsumexp(chosen, axis=1), 0)
+
+
+def log1p_sum_exp(x: Similarities, where: Bool[Array, "anchor image"]) -> Float[Array, " anchor"]:
+    """Compute log(1 + sum of exp(x) over the chosen entries), stable with its gradient."""
+    chosen = jnp.where(where, x, -jnp.inf)
+    # A column of zeros adds the 1 inside the logarithm, and keeps an empty row finite.
+    return jax.nn.logsumexp(jnp.pad(chosen, ((0, 0), (0, 1))), axis=1)

@@ -1,0 +1,161 @@
+"""Compute the loss that a configuration names, over the pairs that its miner chooses."""
+
+import dataclasses
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from crisalad_jax.config.checks import require, require_choice
+from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, Pairs, Similarities, check_value
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """The loss, and the miner that chooses its pairs.
+
+    Example:
+        >>> LossConfig(kind="triplet", miner="none").kind.part_name
+        'triplet'
+    """
+
+    kind: OrName[Loss] = part_field(LOSSES, MultiSimilarityConfig)
+    """Registered loss, or its name; by default the paper's multi-similarity loss."""
+    miner: Literal["multi-similarity", "none"] = "multi-similarity"
+    """Miner of the pairs that enter the loss: the multi-similarity loss's, or none (all pairs)."""
+    miner_margin: float = 0.1
+    """Similarity margin of the miner, epsilon in its paper."""
+    match_pml_zero: bool = False
+    """Whether the loss is 0, as in pytorch-metric-learning, for a batch with at most one positive
+    and at most one negative pair (its triplet loss differs)."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        resolve_names(self)
+        require_choice(self, "miner")
+        require(
+            self.miner_margin >= 0,
+            f"LossConfig.miner_margin: found {self.miner_margin}, expected at least 0",
+        )
+        require(
+            not self.kind.ranks_all or self.miner == "none",
+            f"LossConfig.miner: found {self.miner!r} with the loss {self.kind.part_name!r}, "
+            "expected 'none': it ranks all images",
+        )
+
+
+class LossResult(NamedTuple):
+    """The loss and what is logged beside it."""
+
+    loss: Float[Array, ""]
+    easy_anchor_fraction: Float[Array, ""]
+    """Share of the anchors without a mined positive: all their positives are easy."""
+    accuracy: Float[Array, ""] | None = None
+    """Share of the images whose nearest class is their own; None for losses of pairs."""
+
+
+def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None) -> Pairs:
+    """Find all pairs of two images of one place, and of two places; none of images not `valid`.
+
+    Args:
+        labels: the place of each image.
+        valid: images that take part; None means all.
+
+    Returns:
+        The positive and the negative pairs.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> all_pairs(jnp.array([0, 0, 1])).positives.tolist()
+        [[False, True, False], [True, False, False], [False, False, False]]
+    """
+    same = labels[:, None] == labels[None, :]
+    usable = jnp.ones_like(same) if valid is None else valid[:, None] & valid[None, :]
+    return Pairs(same & usable & ~jnp.eye(len(labels), dtype=bool), ~same & usable)
+
+
+def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
+    """Choose the pairs that violate the order within their row by less than `margin`.
+
+    The miner of the multi-similarity loss (Wang et al., CVPR 2019). A positive is kept if it is
+    less similar than the hardest negative plus the margin, a negative if it is more similar than
+    the hardest positive minus the margin, strictly. An anchor without positives or without
+    negatives mines nothing.
+
+    Args:
+        similarities: of all images.
+        pairs: to choose from.
+        margin: epsilon of the paper.
+
+    Returns:
+        The chosen pairs.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> pairs = all_pairs(jnp.array([0, 0, 1]))
+        >>> similarities = jnp.array([[1.0, 0.9, 0.1], [0.9, 1.0, 0.85], [0.1, 0.85, 1.0]])
+        >>> mine(similarities, pairs, margin=0.1).positives.any(axis=1).tolist()
+        [False, True, False]
+    """
+    positives, negatives = pairs
+    hardest_negative = jnp.where(negatives, similarities, -jnp.inf).max(axis=1, keepdims=True)
+    hardest_positive = jnp.where(positives, similarities, jnp.inf).min(axis=1, keepdims=True)
+    return Pairs(
+        positives & (similarities - margin < hardest_negative),
+        negatives & (similarities + margin > hardest_positive),
+    )
+
+
+def metric_loss(
+    descriptors: Float[Array, "image descriptor"],
+    labels: Int[Array, " image"],
+    config: LossConfig = LossConfig(),
+    *,
+    valid: Bool[Array, " image"] | None = None,
+    params: Any = None,
+    classes: Int[Array, ""] | int | None = None,
+) -> LossResult:
+    """Compute the loss `config.kind` over the pairs that `config.miner` chooses.
+
+    The miner passes no gradient.
+
+    Args:
+        descriptors: unit vectors; their inner products are the similarities.
+        labels: the place, or class, of each image.
+        config: which loss and miner, and their constants.
+        valid: images that take part; None means all. The others are neither anchors nor pairs.
+        params: what trains beside the model (`Loss.init`).
+        classes: number of classes, where `params` have a vector for each and more.
+
+    Returns:
+        The loss and what is logged beside it.
+
+    Raises:
+        InputError: a loss returns something else than a number, or what one of a plug-in raises.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> result = metric_loss(jnp.eye(4), jnp.array([0, 0, 1, 1]))
+        >>> float(result.easy_anchor_fraction)
+        0.0
+    """
+    wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
+    valid = jnp.ones(len(labels), bool) if valid is None else valid
+    every = all_pairs(labels, valid=valid)
+    batch = LossBatch(wide, labels, valid, every, classes)
+    similarities = jax.lax.stop_gradient(batch.similarities)
+    mined = mine(similarities, every, margin=config.miner_margin)
+    pairs = every if config.miner == "none" else mined
+    value = config.kind.apply(params, dataclasses.replace(batch, pairs=pairs))
+    check_value(value, config.kind.part_name)
+    loss = value.loss
+    if config.match_pml_zero:
+        few = (pairs.positives.sum() <= 1) & (pairs.negatives.sum() <= 1)
+        loss = jnp.where(few, 0.0, loss)
+    # NaN similarities violate no margin: without this line the batch would look perfect.
+    loss = jnp.where(jnp.isfinite(similarities).all(), loss, jnp.nan)
+    easy = 1 - mined.positives.any(axis=1).sum() / batch.anchors
+    return LossResult(loss, easy, value.accuracy)

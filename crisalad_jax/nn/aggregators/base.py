@@ -1,0 +1,241 @@
+"""Aggregators, which turn an image's features into tokens: their interface and registry."""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.errors import InputError
+
+
+class TokenShape(NamedTuple):
+    """The shape of an image's tokens: a global one and local ones."""
+
+    global_dim: int
+    """Width of the global token; 0 where there is none."""
+    tokens: int
+    """Number of local tokens."""
+    token_dim: int
+    """Width of a local token, and of the cross-image encoder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Aggregator(Part, abc.ABC):
+    """A method that makes tokens of features: a frozen dataclass whose fields are its settings.
+
+    `token_shape` and `apply` are required. A plain function of one image's `Features` that returns
+    a vector, or a matrix of token vectors, is an aggregator without parameters.
+
+    Example:
+        >>> from crisalad_jax import ModelConfig, register_aggregator
+        >>> @register_aggregator("largest")
+        ... @dataclasses.dataclass(frozen=True)
+        ... class Largest(Aggregator):
+        ...     power: float = 1.0
+        ...
+        ...     def token_shape(self, dim):
+        ...         return TokenShape(dim, 0, dim)
+        ...
+        ...     def apply(self, params, features, grid, *, key):
+        ...         return Tokens.of_global(features.patches.max(axis=-2) ** self.power)
+        >>> ModelConfig(aggregator=Largest(power=2.0)).descriptor_dim
+        768
+    """
+
+    learns: ClassVar[bool] = True
+    """Whether its parameters train; if not, no part of the model does."""
+    fixed_grid: ClassVar[bool] = False
+    """Whether its parameters fit the patches of one image size only."""
+    width_field: ClassVar[str | None] = None
+    """Name of the field that sets the tokens' width; None where the backbone's width does."""
+
+    @abc.abstractmethod
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of an image's tokens for features of width `dim`."""
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Return the features to request from a backbone of `depth` blocks; by default the last.
+
+        Raises:
+            InputError: the backbone has too few blocks.
+        """
+        return FeatureRequest()
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Any:
+        """Draw random parameters, a pytree of arrays in float32; by default None.
+
+        Args:
+            key: draws them.
+            backbone: the backbone of the features.
+            grid: rows and columns of patches in an image of the model's size.
+        """
+        return None
+
+    @abc.abstractmethod
+    def apply(
+        self, params: Any, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return the tokens of one image or of a batch, in float32 at least.
+
+        Args:
+            params: of `init`.
+            features: as `features` asks for.
+            grid: rows and columns of patches.
+            key: draws dropout, one for all or one an image; None means inference.
+        """
+
+    def order(self, local: Float[Array, "token dim"]) -> Array:
+        """Return the local tokens in the published order of the descriptor's numbers."""
+        return local
+
+    def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
+        """Raise InputError where an image with this grid is too small; by default never."""
+
+    def from_centroids(
+        self,
+        centroids: Float[Array, "cluster dim"],
+        features: Float[Array, "feature dim"],
+    ) -> Any:
+        """Make parameters from k-means centroids of unit features.
+
+        `starts_from_centroids` tells whether an aggregator has this.
+        """
+        raise NotImplementedError
+
+    def count_centroids(self, dim: int) -> int:
+        """Return the number of centroids that `from_centroids` takes, for features of width `dim`.
+
+        By default there is one for each local token.
+        """
+        return self.token_shape(dim).tokens
+
+    @property
+    def starts_from_centroids(self) -> bool:
+        """Whether it has a vocabulary, which must be built before the model is used or trained."""
+        return type(self).from_centroids is not Aggregator.from_centroids
+
+    @property
+    def transports(self) -> bool:
+        """Whether it has a `plan`."""
+        return type(self).plan is not Aggregator.plan
+
+    def bind(self, params: Any, backbone: Any) -> Any:
+        """Return parameters with the backbone's digest, if they fit only this backbone."""
+        return params
+
+    def check_backbone(self, params: Any, backbone: Any, source: str) -> None:
+        """Raise InputError, beginning with `source`, where parameters are of another backbone."""
+
+    def metadata(self, params: Any) -> dict[str, str]:
+        """Return the parameters' metadata that a file of weights stores beside their arrays."""
+        return {}
+
+    def with_metadata(self, params: Any, metadata: Mapping[str, str]) -> Any:
+        """Return parameters with the metadata that a file stores beside their arrays."""
+        return params
+
+    def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"] | None:
+        """Return the mass that a transport sends from each patch to each cluster; by default None.
+
+        A patch sends a mass of 1. If there is a dustbin, it is the last column.
+        """
+        return None
+
+
+def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int, ...]) -> None:
+    """Check that an aggregator has returned tokens of its `token_shape`.
+
+    Args:
+        tokens: what `apply` returned.
+        aggregator: which returned it.
+        dim: width of the features.
+        batch: shape of the batch.
+
+    Raises:
+        InputError: it has not; the message names the aggregator.
+    """
+    name = aggregator.part_name
+    require(
+        isinstance(tokens, Tokens),
+        f"aggregator {name}: found to return {_kind(tokens)}, expected Tokens",
+    )
+    shape = aggregator.token_shape(dim)
+    shapes = tokens.global_token.shape, tokens.local.shape
+    expected = (*batch, shape.global_dim), (*batch, shape.tokens, shape.token_dim)
+    require(
+        shapes == expected,
+        f"aggregator {name}: found to return a global token of shape {shapes[0]} and local tokens "
+        f"of {shapes[1]}, expected {expected[0]} and {expected[1]}, as its token_shape says",
+    )
+
+
+def _kind(value: Any) -> str:
+    """Name what a plug-in returned, for a message."""
+    is_array = isinstance(value, jax.Array)
+    return f"an array of shape {value.shape}" if is_array else type(value).__name__
+
+
+def require_side(name: str, grid: tuple[int, int], regions: int, patch_size: int) -> None:
+    """Check that there is a patch for every region of a side.
+
+    Raises:
+        InputError: there is not.
+    """
+    side = regions * patch_size
+    height, width = (patch_size * each for each in grid)
+    require(
+        min(grid) >= regions,
+        f"image size: found {height} x {width}, expected at least {side} x {side}, a patch for "
+        f"every region of aggregator {name}",
+    )
+
+
+def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the methods of an aggregator that is a plain function of one image's features."""
+
+    def outputs(features: Features) -> Tokens:
+        result = function(features)
+        if isinstance(result, Tokens):
+            return result
+        if not isinstance(result, jax.Array) or result.ndim not in (1, 2):
+            raise InputError(
+                f"aggregator {function.__name__}: found to return {_kind(result)}, expected a "
+                "vector, a matrix of token vectors, or Tokens"
+            )
+        made = Tokens.of_global if result.ndim == 1 else Tokens.of_local
+        return made(at_least_float32(result))
+
+    def token_shape(self: Aggregator, dim: int) -> TokenShape:
+        # Use the 256 patches of 224 x 224 pixels: the shape is needed before there is an image.
+        patches = jax.ShapeDtypeStruct((256, dim), "float32")
+        features: Any = Features(jax.ShapeDtypeStruct((dim,), "float32"), patches)  # pyright: ignore
+        tokens = jax.eval_shape(outputs, features)
+        return TokenShape(tokens.global_token.shape[0], *tokens.local.shape)
+
+    def apply(
+        self: Aggregator, params: Any, features: Features, grid: Any, *, key: Keys | None
+    ) -> Tokens:
+        each = outputs
+        for _ in features.class_token.shape[:-1]:
+            each = jax.vmap(each)
+        return each(features)
+
+    return {"token_shape": token_shape, "apply": apply}
+
+
+AGGREGATORS = Registry("aggregator", Aggregator, of_function=_of_function)
+
+
+def to_descriptor(tokens: Tokens, aggregator: Aggregator) -> Float[Array, " descriptor"]:
+    """Return one unit descriptor: the global token, then the local ones in the published order."""
+    local = aggregator.order(tokens.local)
+    return l2_normalise(jnp.concatenate([tokens.global_token, local.ravel()]))

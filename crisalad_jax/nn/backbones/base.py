@@ -1,0 +1,115 @@
+"""Backbones, which turn pixels into features, and the features that an aggregator may request."""
+
+import abc
+import dataclasses
+from typing import Any, ClassVar, Literal, NamedTuple
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.parts import Part, Registry
+
+
+class Features(NamedTuple):
+    """The features of a batch, or of one of its images."""
+
+    class_token: Float[Array, "*batch dim"]
+    """One vector for the whole image; of width 0 where the backbone has none."""
+    patches: Float[Array, "*batch patch dim"]
+    """One vector for each patch, in row order."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureRequest:
+    """The features that an aggregator requests; by default those after the last layer."""
+
+    levels: tuple[int, ...] | None = None
+    """Numbers of blocks, from 1, after which patches are taken and concatenated. Several must
+    include the last block. None takes the last alone."""
+    facet: Literal["token", "query", "key", "value"] = "token"
+    """Facet of the level's last block: its output tokens, or queries, keys or values of its
+    attention, with the heads side by side."""
+    norm: bool = True
+    """Whether tokens go through the last layer norm."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Backbone(Part, abc.ABC):
+    """A network from pixels to features: a frozen dataclass whose fields are its settings.
+
+    A backbone has at least `dim`, `depth` and `patch_size`, and the two methods that are abstract.
+    """
+
+    dim: int = 768
+    """Width of a feature."""
+    depth: int = 12
+    """Number of blocks, or levels."""
+    patch_size: ClassVar[int] = 14
+    """Side of a patch in pixels; sides of images are multiples of it."""
+    class_token: ClassVar[bool] = True
+    """Whether its features have a class token."""
+
+    @abc.abstractmethod
+    def init(self, key: PRNGKeyArray) -> Any:
+        """Draw random parameters, a pytree of arrays in float32."""
+
+    @abc.abstractmethod
+    def apply(
+        self,
+        params: Any,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+    ) -> Features:
+        """Return the features of normalised images.
+
+        Args:
+            params: of `init`, or of `split_blocks`.
+            images: with sides that are multiples of `patch_size`, in the type to compute in.
+            request: the features to return.
+            remat: `ModelConfig.remat`.
+
+        Raises:
+            InputError: while tracing, for a request that this backbone cannot meet.
+        """
+
+    def split_blocks(self, params: Any, first: int) -> Any:
+        """Return parameters whose `params.blocks` is cut in two, after the first `first` blocks.
+
+        Training uses it so that no gradient runs through frozen blocks. `apply` accepts both forms.
+
+        Raises:
+            InputError: this backbone has no blocks to cut.
+        """
+        require(
+            False,
+            f"trainable: found backbone {self.part_name}, which cannot be cut into blocks, "
+            "expected head or all",
+        )
+
+    def join_blocks(self, params: Any) -> Any:
+        """Undo `split_blocks`."""
+        return params
+
+    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """Return the rows and columns of patches in an image of this height and width.
+
+        Raises:
+            InputError: a side is no multiple of `patch_size`.
+        """
+        height, width = image_size
+        size = self.patch_size
+        require(
+            height > 0 and width > 0 and height % size == 0 and width % size == 0,
+            f"image size: found {height} x {width}, expected sides that are multiples of {size} "
+            f"(nearest: {_nearest(height, size)} x {_nearest(width, size)})",
+        )
+        return height // size, width // size
+
+
+def _nearest(side: int, size: int) -> int:
+    return max(size, round(side / size) * size)
+
+
+BACKBONES = Registry("backbone", Backbone)

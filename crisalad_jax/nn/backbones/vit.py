@@ -1,0 +1,448 @@
+"""DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024).
+
+Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it meets.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+import operator
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+
+from crisalad_jax.config.checks import choose, require, require_choice, require_positive
+from crisalad_jax.config.fields import free_field
+from crisalad_jax.nn.adapter import Adapter, AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
+from crisalad_jax.nn.layers import (
+    LayerNorm,
+    Linear,
+    at_least_float32,
+    gelu,
+    init_layer_norm,
+    layer_norm,
+    linear,
+)
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+NORM_EPSILON = 1e-6
+PATCH_SIZE = Backbone.patch_size
+_PRODUCTS = ("qkv", "attended", "hidden", "down", "mixed")
+"""Results of a block's large products and the tokens between its halves, by their names."""
+_POLICIES = {
+    "dots": jax.checkpoint_policies.save_only_these_names(*_PRODUCTS),
+    "full": jax.checkpoint_policies.nothing_saveable,
+    "none": jax.checkpoint_policies.everything_saveable,
+}
+
+
+@pytree_dataclass
+class Mlp:
+    """Feed-forward network: fc1, GELU, fc2."""
+
+    fc1: Linear
+    fc2: Linear
+
+
+@pytree_dataclass
+class SwiGlu:
+    """Feed-forward network of ViT-g: w12 computes gate and value side by side, w3 projects."""
+
+    w12: Linear
+    w3: Linear
+
+
+@pytree_dataclass
+class Block:
+    """One transformer block; `ls1` and `ls2` are LayerScale's gains."""
+
+    norm1: LayerNorm
+    attn: Attention
+    ls1: Float[Array, "*stack dim"]
+    norm2: LayerNorm
+    mlp: Mlp | SwiGlu
+    ls2: Float[Array, "*stack dim"]
+    adapter: Adapter | None
+
+
+@pytree_dataclass
+class ViT:
+    """The backbone. In `blocks` every leaf has a leading depth axis.
+
+    A tuple of such stacks runs in sequence. Training uses it to exclude frozen blocks from the
+    gradient where only the last ones train.
+    """
+
+    patch_embed: Linear
+    """Linear layer whose weight's rows are a patch's pixels in (row, column, channel) order."""
+    cls_token: Float[Array, " dim"]
+    register_tokens: Float[Array, "register dim"]
+    pos_embed_cls: Float[Array, " dim"]
+    pos_embed: Float[Array, "grid grid dim"]
+    blocks: Block | tuple[Block, ...]
+    norm: LayerNorm
+
+
+@BACKBONES.register("vit")
+@dataclasses.dataclass(frozen=True)
+class ViTConfig(Backbone):
+    """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
+
+    heads: int = 12
+    mlp_ratio: float = 4.0
+    ffn: Literal["mlp", "swiglu"] = "mlp"
+    registers: int = 0
+    position_grid: int = 37
+    """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
+    position_init: Literal["random", "sincos"] = free_field("random")
+    """Initialisation of the position embeddings where no weights are loaded."""
+    layer_scale_init: float = free_field(1.0)
+    adapter: AdapterConfig = AdapterConfig()
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "dim", "depth", "heads", "mlp_ratio", "position_grid")
+        require_choice(self, "ffn", "position_init")
+        require(
+            self.registers >= 0,
+            f"ViTConfig.registers: found {self.registers}, expected at least 0",
+        )
+        require(
+            self.dim % self.heads == 0,
+            f"ViTConfig.dim: found {self.dim}, expected a multiple of the {self.heads} heads",
+        )
+        require(
+            self.position_init != "sincos" or self.dim % 4 == 0,
+            f"ViTConfig.dim: found {self.dim}, expected a multiple of 4 for a sin-cos start",
+        )
+        require(
+            self.hidden >= 1,
+            f"ViTConfig.mlp_ratio: found {self.mlp_ratio}, expected a hidden width of at least 1",
+        )
+        self.adapter.width(self.dim)
+
+    @property
+    def hidden(self) -> int:
+        """Hidden width of the feed-forward network; SwiGLU's 2/3 round up to a multiple of 8."""
+        hidden = int(self.dim * self.mlp_ratio)
+        return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
+
+    @property
+    def adapter_dim(self) -> int:
+        """Width of the adapter's bottleneck."""
+        return self.adapter.width(self.dim)
+
+    def init(self, key: PRNGKeyArray) -> ViT:
+        """Draw parameters as DINOv2 does before training."""
+        return init_vit(key, self)
+
+    def apply(
+        self,
+        params: ViT,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+    ) -> Features:
+        """Return the features of normalised images whose sides are multiples of 14."""
+        return vit(params, images, self, request, remat=remat)
+
+    def split_blocks(self, params: ViT, first: int) -> ViT:
+        """Cut the stack of blocks in two."""
+        stack = _one_stack(params)
+        halves = slice(first), slice(first, None)
+        parts = tuple(jax.tree.map(operator.itemgetter(half), stack) for half in halves)
+        return dataclasses.replace(params, blocks=parts)
+
+    def join_blocks(self, params: ViT) -> ViT:
+        """Join the stacks of blocks into one."""
+        if isinstance(params.blocks, Block):
+            return params
+        stack = jax.tree.map(lambda *parts: jnp.concatenate(parts), *params.blocks)
+        return dataclasses.replace(params, blocks=stack)
+
+
+def _one_stack(params: ViT) -> Block:
+    assert isinstance(params.blocks, Block)  # only training cuts the stack
+    return params.blocks
+
+
+def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
+    """Draw parameters as DINOv2 does: linears normal of deviation 0.02, biases 0."""
+    patch_key, class_key, register_key, position_key, block_key = jax.random.split(key, 5)
+    dim, side = config.dim, config.position_grid
+    if config.position_init == "sincos":
+        positions = jnp.asarray(_sincos_positions(side, dim), jnp.float32)
+    else:
+        positions = 0.02 * jax.random.normal(position_key, (side, side, dim))
+    return ViT(
+        patch_embed=_init_linear(patch_key, 3 * PATCH_SIZE**2, dim),
+        cls_token=1e-6 * jax.random.normal(class_key, (dim,)),
+        register_tokens=1e-6 * jax.random.normal(register_key, (config.registers, dim)),
+        pos_embed_cls=jnp.zeros(dim),
+        pos_embed=positions,
+        blocks=jax.vmap(functools.partial(_init_block, config=config))(
+            jax.random.split(block_key, config.depth)
+        ),
+        norm=init_layer_norm(dim),
+    )
+
+
+def _init_linear(key: PRNGKeyArray, d_in: int, d_out: int) -> Linear:
+    weight = 0.02 * jax.random.truncated_normal(key, -2.0, 2.0, (d_in, d_out))
+    return Linear(weight, jnp.zeros(d_out))
+
+
+def _init_block(key: PRNGKeyArray, config: ViTConfig) -> Block:
+    qkv, proj, first, second, adapter_key = jax.random.split(key, 5)
+    dim, hidden = config.dim, config.hidden
+    if config.ffn == "swiglu":
+        mlp = SwiGlu(_init_linear(first, dim, 2 * hidden), _init_linear(second, hidden, dim))
+    else:
+        mlp = Mlp(_init_linear(first, dim, hidden), _init_linear(second, hidden, dim))
+    return Block(
+        norm1=init_layer_norm(dim),
+        attn=Attention(_init_linear(qkv, dim, 3 * dim), _init_linear(proj, dim, dim)),
+        ls1=jnp.full(dim, config.layer_scale_init, jnp.float32),
+        norm2=init_layer_norm(dim),
+        mlp=mlp,
+        ls2=jnp.full(dim, config.layer_scale_init, jnp.float32),
+        adapter=init_adapter(adapter_key, dim, config.adapter),
+    )
+
+
+def _sincos_positions(side: int, dim: int) -> np.ndarray:
+    """Make fixed 2-D sine-cosine codes (MoCo v3): half the width for rows, half for columns."""
+    frequencies = 1e4 ** -(np.arange(dim // 4) / (dim // 4))
+    angles = np.arange(side)[:, None] * frequencies
+    code = np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
+    rows = np.broadcast_to(code[:, None], (side, side, dim // 2))
+    columns = np.broadcast_to(code[None], (side, side, dim // 2))
+    return np.concatenate([rows, columns], axis=-1)
+
+
+def vit(
+    params: ViT,
+    images: Float[Array, "image height width 3"],
+    config: ViTConfig,
+    request: FeatureRequest = FeatureRequest(),
+    *,
+    remat: str = "dots",
+) -> Features:
+    """Compute features of a batch of normalised images whose sides are multiples of 14.
+
+    Levels are concatenated, to a width of levels times dim. The class token is the last level's.
+    With several levels the stack of blocks is cut at each, which for inference needs the memory of
+    its parameters once more. Blocks after the last level are not run.
+
+    Raises:
+        InputError: while tracing, levels that are not in order or more than there are blocks, or
+            several levels of a facet or without the last block.
+    """
+    levels = (config.depth,) if request.levels is None else request.levels
+    require(
+        levels[0] > 0 and levels[-1] <= config.depth and list(levels) == sorted(set(levels)),
+        f"levels: found {levels}, expected numbers of blocks in order, 1 to {config.depth}",
+    )
+    tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+    outputs = []
+    if request.facet == "token" and levels[-1] == config.depth:
+        for part in _cut_at(params.blocks, levels):
+            shorter = dataclasses.replace(params, blocks=part)
+            tokens = run_blocks(shorter, tokens, grid_of(images[0]), config, remat=remat)
+            outputs.append(tokens)
+    else:
+        require(
+            len(levels) == 1,
+            f"levels: found {levels}, expected one of a facet, and several of tokens alone, up to "
+            f"the last block {config.depth}",
+        )
+        outputs.append(_facet(params, tokens, grid_of(images[0]), config, levels[0], request.facet))
+    if request.norm:
+        outputs = [layer_norm(params.norm, level, epsilon=NORM_EPSILON) for level in outputs]
+    patches = [level[:, 1 + config.registers :] for level in outputs]
+    joined = patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1)
+    return Features(outputs[-1][:, 0], joined)
+
+
+def _cut_at(
+    blocks: Block | tuple[Block, ...], depths: Sequence[int]
+) -> Iterator[tuple[Block, ...]]:
+    """Yield the stacks of blocks between each of `depths` and the one before."""
+    stacks = blocks if isinstance(blocks, tuple) else (blocks,)
+    if len(depths) == 1:
+        yield stacks
+        return
+    for begin, end in itertools.pairwise((0, *depths)):
+        parts, start = [], 0
+        for stack in stacks:
+            chosen = slice(max(begin - start, 0), max(end - start, 0))
+            parts.append(jax.tree.map(operator.itemgetter(chosen), stack))
+            start += len(stack.ls1)
+        yield tuple(part for part in parts if len(part.ls1))
+
+
+def _facet(
+    params: ViT,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: ViTConfig,
+    level: int,
+    name: str,
+) -> Float[Array, "image token dim"]:
+    """Compute a facet of the last of `level` blocks; the blocks after it are not run.
+
+    The facets are queries, keys and values of the block's attention, with heads side by side, or
+    its output tokens (AnyLoc: Keetha et al. 2023).
+    """
+    stack = _one_stack(params)
+
+    def numbered(number: Int[Array, ""] | int) -> Block:
+        # Index the stack: a slice of it to scan over would copy its weights.
+        return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
+
+    def body(
+        carry: Float[Array, "image token dim"], number: Int[Array, ""]
+    ) -> tuple[Float[Array, "image token dim"], None]:
+        return block(numbered(number), carry, grid, config), None
+
+    whole = level if name == "token" else level - 1
+    with jax.named_scope("blocks"):
+        tokens, _ = jax.lax.scan(body, tokens, jnp.arange(whole))
+        if name == "token":
+            return tokens
+        last = numbered(level - 1)
+        here = ("query", "key", "value").index(name) * config.dim
+        part = jax.tree.map(lambda x: x[..., here : here + config.dim], last.attn.qkv)
+        return linear(part, layer_norm(last.norm1, tokens, epsilon=NORM_EPSILON))
+
+
+def grid_of(image: Shaped[Array, "height width 3"]) -> tuple[int, int]:
+    """Return the rows and columns of patches of an image."""
+    return image.shape[0] // PATCH_SIZE, image.shape[1] // PATCH_SIZE
+
+
+def embed(
+    params: ViT, image: Float[Array, "height width 3"], config: ViTConfig
+) -> Float[Array, "token dim"]:
+    """Embed an image: class token, registers and patches, with positions for all but registers."""
+    rows, columns = grid_of(image)
+    pixels = image.reshape(rows, PATCH_SIZE, columns, PATCH_SIZE, 3).transpose(0, 2, 1, 3, 4)
+    patches = linear(params.patch_embed, pixels.reshape(rows * columns, -1))
+    positions = interpolate_positions(params.pos_embed, (rows, columns), config)
+    class_token = (params.cls_token + params.pos_embed_cls)[None]
+    placed = at_least_float32(patches) + positions.reshape(rows * columns, -1)
+    return jnp.concatenate([class_token, params.register_tokens, placed]).astype(image.dtype)
+
+
+def run_blocks(
+    params: ViT,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: ViTConfig,
+    *,
+    remat: str = "dots",
+) -> Float[Array, "image token dim"]:
+    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`."""
+
+    def body(
+        carry: Float[Array, "image token dim"], layer: Block
+    ) -> tuple[Float[Array, "image token dim"], None]:
+        return block(layer, carry, grid, config), None
+
+    # prevent_cse=False: inside a scan, CSE cannot undo the remat.
+    body = jax.checkpoint(body, prevent_cse=False, policy=choose("remat", remat, _POLICIES))
+    stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
+    with jax.named_scope("blocks"):
+        for stack in stacks:
+            tokens, _ = jax.lax.scan(body, tokens, stack)
+    return tokens
+
+
+def block(
+    params: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "image token dim"]:
+    """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR."""
+    normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
+    attended = attention(params.attn, normed, config.heads, key=None)
+    tokens = (at_least_float32(tokens) + params.ls1 * at_least_float32(attended)).astype(
+        tokens.dtype
+    )
+    tokens = checkpoint_name(tokens, "attended")
+    normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
+    update = feed_forward(params.mlp, normed)
+    if params.adapter is not None:
+        with jax.named_scope("adapter"):
+            update = update + config.adapter.alpha * adapter(params.adapter, normed, grid)
+    return (at_least_float32(tokens) + params.ls2 * at_least_float32(update)).astype(tokens.dtype)
+
+
+def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
+    """Apply the feed-forward network: GELU, or SwiGLU (Shazeer 2020) if `params` are its.
+
+    All tokens are rows of one matrix, so that XLA can write GELU over the product in place.
+    """
+    rows = x.reshape(-1, x.shape[-1])
+    if isinstance(params, Mlp):
+        y = linear(params.fc2, gelu(checkpoint_name(linear(params.fc1, rows), "hidden")))
+    else:
+        gate, value = jnp.split(checkpoint_name(linear(params.w12, rows), "hidden"), 2, axis=-1)
+        y = linear(params.w3, jax.nn.silu(gate) * value)
+    return y.reshape(x.shape)
+
+
+def interpolate_positions(
+    positions: Float[Array, "grid grid dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "rows columns dim"]:
+    """Resize the stored grid of position embeddings as the public models do.
+
+    Bicubic interpolation is linear and separable: two small matrix products, whose constants are
+    computed while tracing. One set of weights therefore serves every image size. Models without
+    registers use torch's bicubic (a = -0.75) with the scale (size + 0.1) / grid. Models with
+    registers use its antialiased one (a = -0.5) at the exact scale.
+    """
+    side = positions.shape[0]
+    if grid == (side, side):
+        return positions
+    weights = _antialias_weights if config.registers else _bicubic_weights
+    rows, columns = (jnp.asarray(weights(side, size), positions.dtype) for size in grid)
+    precision = jax.lax.Precision.HIGHEST
+    return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision=precision)
+
+
+def _cubic(x: np.ndarray, a: float) -> np.ndarray:
+    """Evaluate Keys' cubic convolution kernel."""
+    x = np.abs(x)
+    near = (a + 2) * x**3 - (a + 3) * x**2 + 1
+    far = a * (x**3 - 5 * x**2 + 8 * x - 4)
+    return np.where(x <= 1, near, np.where(x < 2, far, 0.0))
+
+
+@functools.cache
+def _bicubic_weights(source: int, target: int) -> np.ndarray:
+    """Compute (target, source) weights of torch's bicubic upsampling, with replicated borders."""
+    scale = source / (target + 0.1)
+    centres = (np.arange(target) + 0.5) * scale - 0.5
+    weights = np.zeros((target, source))
+    for row, centre in enumerate(centres):
+        taps = math.floor(centre) + np.arange(-1, 3)
+        np.add.at(weights[row], np.clip(taps, 0, source - 1), _cubic(centre - taps, -0.75))
+    return weights
+
+
+@functools.cache
+def _antialias_weights(source: int, target: int) -> np.ndarray:
+    """Compute (target, source) weights of torch's antialiased bicubic, wider when shrinking."""
+    scale = source / target
+    stretch = max(scale, 1.0)
+    centres = (np.arange(target) + 0.5) * scale
+    weights = _cubic((np.arange(source) + 0.5 - centres[:, None]) / stretch, -0.5)
+    return weights / weights.sum(axis=1, keepdims=True)

@@ -1,0 +1,178 @@
+"""Count a model's parameters, and the multiply-accumulates of its traced program."""
+
+import collections
+import functools
+import math
+import re
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend import core
+
+from crisalad_jax.nn.adapter import adapter, init_adapter
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.layers import TAPS
+from crisalad_jax.nn.model import attend_across_images, extract_tokens, parameter_shapes, self_mask
+from crisalad_jax.utils.pytree import named_leaves
+
+_SCOPES = {
+    "cross_image": "cross-image encoder",
+    "aggregator": "aggregator",
+    "adapter": "adapters",
+    "blocks": "backbone blocks",
+    "backbone": "backbone embedding, norm",
+}
+"""Part by scope in the program's names, the innermost scope first."""
+
+
+# JAX wraps scope names in transformations, as in vmap(taps).
+_NAMES = re.compile(r"\w+")
+
+
+class PartCost(NamedTuple):
+    """The costs of one part of the model."""
+
+    part: str
+    parameters: int
+    macs: int
+    """Number of multiply-accumulates per image in matrix products and convolutions."""
+
+
+def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
+    """Count the parameters of each part, and its multiply-accumulates per image.
+
+    Work that a batch does once, independent of its images, does not count.
+
+    Args:
+        config: the model; images are of its `image_size`.
+        images: number of images that attend to each other in the cross-image encoder. Only the
+            cost of its attention depends on it.
+
+    Returns:
+        A row for each part.
+
+    Example:
+        >>> from crisalad_jax import PRESETS
+        >>> [cost.part for cost in part_costs(PRESETS["tiny"])][-1]
+        'cross-image encoder'
+    """
+    params = parameter_shapes(config)
+
+    def tokens_of(count: int) -> Any:
+        pixels = jax.ShapeDtypeStruct((count, *config.image_size, 3), jnp.uint8)
+        return jax.make_jaxpr(functools.partial(extract_tokens, config=config))(params, pixels)
+
+    single, double = (_count(tokens_of(count)) for count in (1, 2))
+    macs = {part: double[part] - single[part] for part in _SCOPES.values()}
+    if params.cross_image is not None:
+        pixels = jax.ShapeDtypeStruct((images, *config.image_size, 3), jnp.uint8)
+        tokens = jax.eval_shape(functools.partial(extract_tokens, config=config), params, pixels)
+        attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
+        attended = _count(jax.make_jaxpr(attend)(params, tokens))
+        macs["cross-image encoder"] = attended["cross-image encoder"] // images
+    counts = collections.Counter[str]()
+    for name, leaf in named_leaves(params).items():
+        counts[_part_of(name)] += math.prod(leaf.shape)
+    return [PartCost(part, counts[part], macs[part]) for part in reversed(_SCOPES.values())]
+
+
+def _part_of(name: str) -> str:
+    if name.startswith("cross_image."):
+        return "cross-image encoder"
+    if name.startswith("aggregator"):
+        return "aggregator"
+    if ".adapter." in name:
+        return "adapters"
+    return "backbone blocks" if name.startswith("backbone.blocks.") else "backbone embedding, norm"
+
+
+def count_macs(function: Any, *arguments: Any) -> int:
+    """Count the multiply-accumulates of a function's program, in products and convolutions.
+
+    Args:
+        function: of arrays.
+        arguments: arrays, or their shapes.
+
+    Returns:
+        The count; of the branches of a conditional, the cheapest counts.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> count_macs(jnp.matmul, jnp.zeros((2, 3)), jnp.zeros((3, 4)))
+        24
+    """
+    return _count(jax.make_jaxpr(function)(*arguments)).total()
+
+
+def _count(closed: Any) -> "collections.Counter[str]":
+    totals = collections.Counter[str]()
+    _walk(closed.jaxpr, "", 1, totals)
+    return totals
+
+
+def _walk(jaxpr: Any, scope: str, times: int, totals: "collections.Counter[str]") -> None:
+    for equation in jaxpr.eqns:
+        here = f"{scope}/{equation.source_info.name_stack}"
+        name = equation.primitive.name
+        if name == "cond":
+            branches = []
+            for branch in equation.params["branches"]:
+                branches.append(collections.Counter[str]())
+                _walk(branch.jaxpr, here, times, branches[-1])
+            totals.update(min(branches, key=lambda branch: branch.total()))
+            continue
+        inside = times * equation.params.get("length", 1) if name == "scan" else times
+        for inner in _inner(equation):
+            _walk(inner, here, inside, totals)
+        macs = times * _macs(equation, name, here)
+        if macs:
+            names = _NAMES.findall(here)
+            part = next((_SCOPES[each] for each in _SCOPES if each in names), "")
+            totals[part] += macs
+
+
+def _inner(equation: Any) -> Iterator[Any]:
+    """Yield the inner programs (jaxprs) of an equation."""
+    for value in equation.params.values():
+        if isinstance(value, core.ClosedJaxpr):
+            yield value.jaxpr
+        elif isinstance(value, core.Jaxpr):
+            yield value
+
+
+def _macs(equation: Any, name: str, scope: str) -> int:
+    out = math.prod(equation.outvars[0].aval.shape) if equation.outvars else 0
+    if name == "dot_general":
+        (contracted, _), _ = equation.params["dimension_numbers"]
+        left = equation.invars[0].aval.shape
+        return out * math.prod(left[axis] for axis in contracted)
+    if name == "conv_general_dilated":
+        kernel = equation.invars[1].aval.shape
+        channels = equation.params["dimension_numbers"].rhs_spec[0]
+        return out * math.prod(kernel) // kernel[channels]
+    # A depthwise convolution is implemented as products with its taps.
+    return out if name == "mul" and TAPS in _NAMES.findall(scope) else 0
+
+
+def adapter_macs(config: ModelConfig) -> int:
+    """Count one adapter's true multiply-accumulates per image, with linears at every token."""
+    backbone: Any = config.backbone
+    grid = config.grid
+    tokens = 1 + backbone.registers + math.prod(grid)
+    make = functools.partial(init_adapter, dim=backbone.dim, config=backbone.adapter)
+    params = jax.eval_shape(make, jax.random.key(0))
+    x = jax.ShapeDtypeStruct((1, tokens, backbone.dim), jnp.float32)
+    return count_macs(functools.partial(adapter, grid=grid), params, x)
+
+
+def paper_adapter_macs(config: ModelConfig) -> int:
+    """Count an adapter's multiply-accumulates as the paper (Table 3: 39.223 M), each linear once.
+
+    `adapter_macs` counts a linear layer at every token instead.
+    """
+    backbone: Any = config.backbone
+    tokens = 1 + backbone.registers + config.patches
+    linears = 2 * backbone.dim * backbone.adapter_dim
+    return adapter_macs(config) - (tokens - 1) * linears

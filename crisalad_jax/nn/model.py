@@ -1,0 +1,335 @@
+"""Compose backbone, aggregation and cross-image encoder into CriSALAD (paper Figure 1).
+
+DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
+
+from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
+from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise, split_key
+from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
+from crisalad_jax.utils import compiler
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
+
+
+@pytree_dataclass
+class Crisalad:
+    """All parameters of a model."""
+
+    backbone: Any
+    """Parameters of `ModelConfig.backbone`."""
+    aggregator: Any
+    """Parameters of `ModelConfig.aggregator`; None where it has none."""
+    cross_image: CrossImageEncoder | None
+    """Parameters of the cross-image encoder; None without one."""
+
+
+def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
+    """Draw random parameters in float32.
+
+    Args:
+        key: draws them.
+        config: the model.
+
+    Returns:
+        The parameters. To use DINOv2's weights, replace `backbone` by them.
+
+    Raises:
+        InputError: a part of a plug-in that returns no pytree of arrays.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS
+        >>> params = init_crisalad(jax.random.key(0), PRESETS["tiny"])
+        >>> params.backbone.cls_token.shape
+        (128,)
+    """
+    backbone, aggregator, cross_image = jax.random.split(key, 3)
+    return Crisalad(
+        backbone=config.backbone.init(backbone),
+        aggregator=config.aggregator.init(aggregator, config.backbone, config.grid),
+        cross_image=init_cross_image(cross_image, config.token_shape.token_dim, config.cross_image)
+        if config.cross_image.layers
+        else None,
+    )
+
+
+def parameter_shapes(config: ModelConfig) -> Crisalad:
+    """Return shapes and types of all parameters (`jax.ShapeDtypeStruct`); nothing is computed."""
+    return jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+
+
+@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
+def describe(
+    params: Crisalad,
+    images: Images,
+    config: ModelConfig,
+    *,
+    mask: Bool[Array, "image image"] | None = None,
+    key: Key[Array, ""] | None = None,
+    micro_batch: int | None = None,
+) -> Float[Array, "image descriptor"]:
+    """Describe a batch of RGB images by unit vectors.
+
+    With a cross-image encoder a descriptor depends on the images that `mask` lets it attend to:
+    `mask[i, j]` allows image i to attend to image j, and None allows all. See `self_mask` and
+    `valid_mask`.
+
+    It works under `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`), once and
+    twice. Forward mode (`jax.jvp`, `jax.hessian`) does not work: the gradient of attention is
+    written out, for speed. Take `jax.jacrev` of `jax.grad` for a Hessian.
+
+    Args:
+        params: from `init_crisalad` or a weight file.
+        images: 8-bit pixels, which are normalised here as `config.normalisation` says, or floats
+            that already are. The sides are multiples of 14; they need not be `config.image_size`.
+        config: the model, static.
+        mask: which images attend to which.
+        key: draws the dropout (a `jax.random.key`); None means inference.
+        micro_batch: see `extract_tokens`; images still attend to the whole batch.
+
+    Returns:
+        Descriptors of length 1, in float32 at least.
+
+    Raises:
+        InputError: while tracing, for images of the wrong rank, channels or sides, or with too few
+            patches for the clusters; or a batch is no multiple of `micro_batch`.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> describe(params, np.zeros((2, 98, 98, 3), np.uint8), config).shape
+        (2, 576)
+    """
+    tokens_key, cross_key = split_key(key, 2)
+    tokens = extract_tokens(params, images, config, key=tokens_key, micro_batch=micro_batch)
+    return attend_across_images(params, tokens, config, mask=mask, key=cross_key)
+
+
+@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
+def extract_tokens(
+    params: Crisalad,
+    images: Images,
+    config: ModelConfig,
+    *,
+    key: Key[Array, ""] | None = None,
+    micro_batch: int | None = None,
+) -> Tokens:
+    """Extract every image's tokens, which depend on no other image: the first half of `describe`.
+
+    With `micro_batch` the backbone runs on that many images at a time, and again for the gradient.
+    Memory then holds the activations of one micro-batch (as in GradCache, Gao et al. 2021). Tokens
+    and gradients equal those of the whole batch up to rounding, dropout included.
+
+    Args:
+        params: see `describe`.
+        images: see `describe`.
+        config: see `describe`.
+        key: see `describe`.
+        micro_batch: a divisor of the batch; None is the whole batch.
+
+    Returns:
+        The tokens of each image.
+
+    Raises:
+        InputError: as `describe`.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> extract_tokens(params, np.zeros((1, 98, 98, 3), np.uint8), config).local.shape
+        (1, 16, 32)
+    """
+
+    def tokens_of(images: Images, keys: Keys | None) -> Tokens:
+        features = extract_features(params, images, config)
+        grid = config.backbone.grid((images.shape[1], images.shape[2]))
+        with jax.named_scope("aggregator"):
+            tokens = config.aggregator.apply(params.aggregator, features, grid, key=keys)
+        check_tokens(tokens, config.aggregator, config.backbone.dim, (images.shape[0],))
+        return tokens
+
+    count = images.shape[0]  # which may be symbolic, where `len` is not
+    keys = None if key is None else jax.random.split(key, count)
+    if micro_batch is None or micro_batch == count:
+        return tokens_of(images, keys)
+    if count % micro_batch:
+        raise InputError(
+            f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
+        )
+
+    # Parts are interleaved, so that each device of a sharded batch has a share of every part.
+    def split(x: Array) -> Array:
+        return x.reshape(micro_batch, -1, *x.shape[1:]).swapaxes(0, 1)
+
+    def join(x: Array) -> Array:
+        return x.swapaxes(0, 1).reshape(count, *x.shape[2:])
+
+    once = jax.checkpoint(lambda part: tokens_of(*part), prevent_cse=False)
+    return jax.tree.map(join, jax.lax.map(once, jax.tree.map(split, (images, keys))))
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
+    """Extract the features of every image that the aggregator requests.
+
+    Args:
+        params: see `describe`.
+        images: see `describe`.
+        config: see `describe`.
+
+    Returns:
+        The features that the aggregator asks for.
+
+    Raises:
+        InputError: as `describe`.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> extract_features(params, np.zeros((1, 98, 98, 3), np.uint8), config).patches.shape
+        (1, 49, 128)
+    """
+    if images.ndim != 4 or images.shape[-1] != 3:
+        raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
+    config.check_image_size((images.shape[1], images.shape[2]))
+    if images.dtype == jnp.uint8:
+        images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
+    request = config.aggregator.features(config.backbone.depth)
+    pixels = images.astype(config.compute_dtype)
+    with jax.named_scope("backbone"):
+        return config.backbone.apply(params.backbone, pixels, request, remat=config.remat)
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def unit_features(
+    params: Crisalad, images: Images, config: ModelConfig
+) -> Float[Array, "image patch dim"]:
+    """Return the aggregator's patch features as unit vectors, for vocabularies.
+
+    They are in float32 at least.
+
+    Raises:
+        InputError: as `describe`.
+    """
+    return l2_normalise(at_least_float32(extract_features(params, images, config).patches))
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def attend_across_images(
+    params: Crisalad,
+    tokens: Tokens,
+    config: ModelConfig,
+    *,
+    mask: Bool[Array, "image image"] | None = None,
+    key: Key[Array, ""] | None = None,
+) -> Float[Array, "image descriptor"]:
+    """Attend across images and make their descriptors, the second half of `describe`.
+
+    To describe the same images in several groupings, extract their tokens once.
+
+    Args:
+        params: see `describe`.
+        tokens: of `extract_tokens`.
+        config: see `describe`.
+        mask: see `describe`.
+        key: see `describe`.
+
+    Returns:
+        Descriptors of length 1, in float32 at least.
+
+    Raises:
+        InputError: never by itself; shapes that do not fit are JAX's own errors.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> tokens = extract_tokens(params, np.zeros((2, 98, 98, 3), np.uint8), config)
+        >>> attend_across_images(params, tokens, config, mask=self_mask(2)).shape
+        (2, 576)
+    """
+    if params.cross_image is not None:
+        options = config.cross_image
+        enter = functools.partial(as_sequence, global_token=options.global_token)
+        leave = functools.partial(from_sequence, global_token=options.global_token)
+        with jax.named_scope("cross_image"):
+            sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
+            sequence = cross_image_encoder(
+                params.cross_image, sequence, options, mask=mask, key=key
+            )
+        tokens = jax.vmap(leave)(sequence.astype(tokens.local.dtype), tokens)
+    return jax.vmap(functools.partial(to_descriptor, aggregator=config.aggregator))(tokens)
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def transport_masses(
+    params: Crisalad, images: Images, config: ModelConfig
+) -> Float[Array, "image patch column"]:
+    """Compute the mass that a transport sends from each patch, in row order, to each cluster.
+
+    A patch sends a mass of 1. If there is a dustbin, it is the last column.
+
+    Raises:
+        InputError: the model's aggregator has no transport, or as `describe`.
+    """
+    features = extract_features(params, images, config)
+    plan = config.aggregator.plan(params.aggregator, features)
+    if plan is None:
+        raise InputError(
+            f"aggregator: found {config.aggregator.part_name}, expected one that transports, such "
+            "as salad"
+        )
+    return plan
+
+
+def self_mask(count: Any) -> Bool[Array, "image image"]:
+    """Return the mask that lets every image attend to itself alone, independent of its batch.
+
+    Args:
+        count: number of images in the batch, which may be symbolic in an export.
+
+    Returns:
+        A mask for `describe`.
+
+    Example:
+        >>> self_mask(2).tolist()
+        [[True, False], [False, True]]
+    """
+    return jnp.eye(count, dtype=bool)
+
+
+def valid_mask(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
+    """Return the mask that lets valid images attend to each other, and the others to themselves.
+
+    Args:
+        valid: which images are no padding.
+
+    Returns:
+        A mask for `describe`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> valid_mask(jnp.array([True, False])).tolist()
+        [[True, False], [False, True]]
+    """
+    return valid[None, :] & valid[:, None] | jnp.eye(len(valid), dtype=bool)

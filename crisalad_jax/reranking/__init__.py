@@ -1,6 +1,0 @@
-"""A second stage over any first: its best retrievals in the order of what their patches show."""
-
-from crisalad_jax.reranking.stage import Reranker as Reranker
-from crisalad_jax.reranking.stage import Reranking as Reranking
-from crisalad_jax.reranking.stage import parse_reranking as parse_reranking
-from crisalad_jax.reranking.stage import rerank as rerank

@@ -1,0 +1,1 @@
+"""Retrieval: descriptors of folders, search, re-ranking, maps."""

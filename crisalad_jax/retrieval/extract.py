@@ -1,0 +1,256 @@
+"""Descriptors of a folder or a list of images, in files or in memory."""
+
+import os
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.images import check_lines, list_images, names_in
+from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.descriptor_files import (
+    Descriptors,
+    config_of,
+    read_descriptors,
+    targets,
+    writer_for,
+)
+from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
+from crisalad_jax.retrieval.pca import Pca, load_pca
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_target, write_json
+
+StrPath = str | os.PathLike[str]
+
+
+class Extracted(NamedTuple):
+    """The descriptors of a set of images."""
+
+    names: list[str]
+    """Names of the images that could be read, in order."""
+    descriptors: Descriptors
+    """Their descriptors, float32."""
+    skipped: list[str]
+    """Names of the images that could not be read."""
+    pairs: list[tuple[str, str]] | None
+    """Each image with those most similar to it, best first; None where no pairs were asked for."""
+
+
+def extract(
+    params: Crisalad,
+    config: ModelConfig,
+    images: StrPath | Sequence[StrPath],
+    out: StrPath | None = None,
+    *,
+    weights: StrPath | None = None,
+    grouping: str = "single",
+    batch_size: int = 16,
+    seed: int = 0,
+    root: StrPath | None = None,
+    pairs: StrPath | None = None,
+    database: StrPath | None = None,
+    k: int = 20,
+    pca: StrPath | Pca | None = None,
+    on_bad_image: OnBadImage = "stop",
+    quiet: bool = False,
+) -> Extracted:
+    """Describe images, and write the descriptors where they are asked for.
+
+    Args:
+        params: the model's parameters.
+        config: the model; images are resized to its `image_size`.
+        images: a folder, searched with its subfolders in sorted order, or a list of files.
+        out: a file .npy, with the names beside it, or .h5, as hloc reads it. What was asked for is
+            written beside it too, as JSON. None writes nothing.
+        weights: the file that the parameters are from, for that JSON and for messages.
+        grouping: one of `GROUPINGS`: which images look at each other.
+        batch_size: number of images described together.
+        seed: draws the order of the grouping "shuffled".
+        root: folder that names are relative to. By default it is the folder `images`; files of a
+            list keep their names.
+        pairs: a file for hloc's pairs: each image with those most similar to it, never itself.
+        database: descriptors, .h5 or .npy, of the images to pair these with; None is these.
+        k: number of pairs of each image.
+        pca: components that shorten the descriptors, or a file of them.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        Names and descriptors of the images that could be read.
+
+    Raises:
+        InputError: what `check_extraction` raises; components or a database of another length; no
+            image, an image that cannot be read, or none that can; a name that is no line of text or
+            does not lie under `root`; or a file that cannot be read or written.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, init_crisalad
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> extract(params, config, pictures, quiet=True).descriptors.shape
+        (4, 576)
+    """
+    check_extraction(
+        out,
+        grouping=grouping,
+        batch_size=batch_size,
+        seed=seed,
+        pairs=pairs,
+        database=database,
+        k=k,
+    )
+    components = _components(pca, config, weights, unit=pairs is not None)
+    paths, names = _listed(images, root)
+    length = config.descriptor_dim if components is None else len(components.components)
+    others = None if pairs is None else _others(pairs, names, database, length)
+    folder = read_tokens(
+        params,
+        config,
+        paths,
+        batch_size=batch_size,
+        label="images",
+        on_bad_image=on_bad_image,
+        quiet=quiet,
+    )
+    if not folder.readable.any():
+        raise InputError(f"{_source(images)}: found {len(paths)} images, none of them readable")
+    descriptors = group(
+        params, config, folder, grouping, batch_size=batch_size, seed=seed, quiet=quiet
+    )[folder.readable]
+    if components is not None:
+        descriptors = components.apply(descriptors)
+    readable = [name for name, ok in zip(names, folder.readable, strict=True) if ok]
+    skipped = [name for name, ok in zip(names, folder.readable, strict=True) if not ok]
+    if out is not None:
+        writer_for(out)(pathlib.Path(out), descriptors, readable)
+        record = {
+            "weights": None if weights is None else str(weights),
+            "images": _source(images),
+            "grouping": grouping,
+            "batch_size": batch_size,
+            "seed": seed,
+            "pca": _words(pca),
+            "skipped": skipped,
+            "model": to_plain(config),
+        }
+        write_json(config_of(pathlib.Path(out)), record)
+    nearest = None
+    if pairs is not None:
+        nearest = nearest_pairs(readable, descriptors, *(others or (readable, descriptors)), k=k)
+        write_pairs(pairs, nearest)
+    return Extracted(readable, descriptors, skipped, nearest)
+
+
+def check_extraction(
+    out: StrPath | None,
+    *,
+    grouping: str = "single",
+    batch_size: int = 16,
+    seed: int = 0,
+    pairs: StrPath | None = None,
+    database: StrPath | None = None,
+    k: int = 20,
+) -> None:
+    """Check what can be checked of an extraction before a model is loaded.
+
+    Args:
+        out: as `extract` takes it, and so are the others.
+        grouping: which images look at each other.
+        batch_size: number of images described together.
+        seed: draws the order of the grouping "shuffled".
+        pairs: a file for hloc's pairs.
+        database: descriptors of the images to pair these with.
+        k: number of pairs of each image.
+
+    Raises:
+        InputError: an unknown suffix or grouping; a file that cannot be made, or that would take
+            the place of another; a number out of range; or a database without pairs.
+
+    Example:
+        >>> check_extraction("descriptors.npy", grouping="single")
+    """
+    files: list[pathlib.Path] = []
+    if out is not None:
+        writer_for(out)
+        files = targets(pathlib.Path(out))
+    for target in (*files, *([] if pairs is None else [pairs])):
+        check_target(target)
+    if pairs is not None and pathlib.Path(pairs) in files:
+        raise InputError(f"--pairs: found {pairs}, which --out writes, expected another")
+    if database is not None and pairs is None:
+        raise InputError("--database: found without --pairs, expected both")
+    check_grouping([grouping], batch_size, seed)
+    if pairs is not None and k < 1:
+        raise InputError(f"k: found {k}, expected at least 1")
+
+
+def _components(
+    pca: StrPath | Pca | None, config: ModelConfig, weights: StrPath | None, *, unit: bool
+) -> Pca | None:
+    """Load components, and check that they fit the model and, for pairs, give unit vectors."""
+    if pca is None:
+        return None
+    components = pca if isinstance(pca, Pca) else load_pca(pca)
+    components.check(config.descriptor_dim, "model" if weights is None else str(weights))
+    if unit and not components.config.renormalise:
+        raise InputError(
+            f"--pairs: found {'components' if isinstance(pca, Pca) else pca}, which leaves lengths "
+            "as they are, expected components that make unit vectors, which are paired by cosine"
+        )
+    return components
+
+
+def _words(pca: StrPath | Pca | None) -> str | None:
+    if pca is None:
+        return None
+    return f"{len(pca.components)} components" if isinstance(pca, Pca) else str(pca)
+
+
+def _source(images: StrPath | Sequence[StrPath]) -> str:
+    return str(images) if isinstance(images, str | os.PathLike) else "images"
+
+
+def _listed(
+    images: StrPath | Sequence[StrPath], root: StrPath | None
+) -> tuple[list[pathlib.Path], list[str]]:
+    """List the images, and their names relative to the root."""
+    if isinstance(images, str | os.PathLike):
+        folder = pathlib.Path(images)
+        paths = list_images(folder)
+        inside = _inside(folder, root) if root is not None else pathlib.PurePath()
+        return paths, [(inside / name).as_posix() for name in names_in(folder, paths)]
+    paths = [pathlib.Path(path) for path in images]
+    if not paths:
+        raise InputError("images: found none, expected at least one")
+    names = [(path if root is None else _inside(path, root)).as_posix() for path in paths]
+    check_lines(names, "images")
+    return paths, names
+
+
+def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
+    whole, holder = path.resolve(), pathlib.Path(root).resolve()
+    if not whole.is_relative_to(holder):
+        raise InputError(f"--root: found {holder}, expected a folder that holds {whole}")
+    return whole.relative_to(holder)
+
+
+def _others(
+    pairs: StrPath, names: list[str], database: StrPath | None, length: int
+) -> tuple[list[str], Descriptors] | None:
+    """Read the descriptors to pair the images with; None pairs them with themselves."""
+    check_names(pairs, names)
+    if database is None:
+        return None
+    listed, descriptors = read_descriptors(database)
+    check_names(pairs, listed)
+    if descriptors.shape[1] != length:
+        raise InputError(
+            f"{database}: found descriptors of {descriptors.shape[1]} numbers, expected {length} "
+            "as of these images"
+        )
+    return listed, descriptors

@@ -1,0 +1,224 @@
+"""Approximate search by FAISS, for databases whose exact search takes too long.
+
+A graph (HNSW: Malkov and Yashunin, 2018) keeps the descriptors as they are and finds nearly all
+neighbours. IVF-PQ (Jegou, Douze and Schmid, 2011) keeps 128 bytes of each at most, and looks at a
+part of them. What either misses is measured against the exact search: `recall_against_exact`.
+Descriptors of thousands of numbers are reduced first (`pca`).
+"""
+
+import itertools
+import math
+import os
+import pathlib
+from typing import Any, Literal, NamedTuple
+
+import faiss as _faiss
+import numpy as np
+from jaxtyping import Float, Int
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, pieces, sample
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path, check_source
+from crisalad_jax.utils.progress import progress_bar
+
+faiss: Any = _faiss  # its classes are made when it is loaded
+Kind = Literal["hnsw", "ivf-pq"]
+KINDS = {
+    "hnsw": "a graph over the descriptors as they are: nearly exact, and as large as they are",
+    "ivf-pq": "lists of codes of at most 128 bytes each: small, and less exact",
+}
+_LINKS = 32
+"""Number of links of a vector in each layer of the graph; twice as many in the lowest. Faiss
+recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
+_BUILD_EFFORT = 128
+"""Number of candidates kept while a vector is inserted; the paper's examples keep 100."""
+_LEAST_EFFORT = 128
+"""Number of candidates kept while a graph is searched, at least."""
+_CODE_BYTES = 128
+_CENTROIDS = 256
+"""Number of centroids of each part of a vector: a code of one byte."""
+_PER_CENTROID = 39
+"""Number of vectors to train a centroid from; with fewer, faiss warns of a poor clustering."""
+LEAST_ROWS = _PER_CENTROID * _CENTROIDS
+"""Smallest number of descriptors that an IVF-PQ index is trained from."""
+_TRAINING_BYTES = 2**30
+"""Largest size in bytes of the descriptors that an index is trained from."""
+_CHUNK_BYTES = 2**26
+
+
+class Index(NamedTuple):
+    """An index for approximate search, made by `build`."""
+
+    kind: Kind
+    faiss_index: Any
+    """The index of faiss."""
+
+    @property
+    def size(self) -> int:
+        """Number of descriptors in the index."""
+        return self.faiss_index.ntotal
+
+    def search(
+        self, queries: Float[np.ndarray, "q d"], k: int, effort: int | None = None
+    ) -> Neighbours:
+        """Find the most similar descriptors of each query, approximately.
+
+        Where fewer than k are found, the last indices are -1 and their similarities -inf. IVF-PQ's
+        similarities are products with the vectors that its codes approximate.
+
+        Args:
+            queries: unit descriptors.
+            k: neighbours per query; at most all.
+            effort: how much is looked at, for more to be found in more time: of HNSW, candidates
+                kept while searching (by default 128, or 2 k); of IVF-PQ, lists looked into (by
+                default a sixteenth of them).
+
+        Raises:
+            InputError: queries of another length, not finite or not of unit length; k or effort
+                below 1.
+        """
+        for name, value in (("k", k), ("effort", effort)):
+            if value is not None and value < 1:
+                raise InputError(f"{name}: found {value}, expected at least 1")
+        queries = as_rows(queries, "queries")
+        if queries.shape[1] != self.faiss_index.d:
+            raise InputError(
+                f"queries: found descriptors of length {queries.shape[1]}, expected "
+                f"{self.faiss_index.d} as in the index"
+            )
+        k = min(k, self.size)
+        if self.kind == "hnsw":
+            chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
+        else:
+            lists = self.faiss_index.nlist
+            chosen = faiss.SearchParametersIVF(nprobe=min(effort or -(-lists // 16), lists))
+        whole = iter([np.empty(queries.shape, WIDE)])
+        (block,) = blocks(queries, "queries", whole)
+        similarities, indices = self.faiss_index.search(block.rows, k, params=chosen)
+        return Neighbours(indices, np.where(indices < 0, -np.inf, similarities).astype(np.float32))
+
+
+def build(
+    kind: Kind, database: Float[np.ndarray, "n d"], *, seed: int = 0, quiet: bool = True
+) -> Index:
+    """Build an index of unit descriptors, which may be a memory map, reading some at a time.
+
+    IVF-PQ has 4 sqrt(n) lists (faiss's guidelines: 4 to 16 sqrt(n)), or fewer, so that each is
+    trained from 39 vectors. A vector is split into equal parts of 2 numbers or more, at most 128,
+    with a byte for each. The training sample is random, 1 GiB of descriptors at most.
+
+    HNSW has 32 links for each vector. Its graph, and so the few neighbours that it misses, depend
+    on the order in which threads insert vectors. With one thread (OMP_NUM_THREADS=1) the graph
+    depends on the seed alone, as IVF-PQ always does.
+
+    Args:
+        kind: of `KINDS`.
+        database: unit descriptors, as `retrieval.search` takes them.
+        seed: of the clustering and its sample, or of the vectors' layers in the graph.
+        quiet: no progress bar.
+
+    Raises:
+        InputError: an unknown kind; an array that is empty or no matrix; rows that are not finite
+            or not of unit length; too few to train from.
+    """
+    choose("kind", kind, KINDS)
+    database = as_rows(database, "database")
+    count, length = database.shape
+    index = _graph(length, seed) if kind == "hnsw" else _trained_lists(database, seed)
+    size = max(1, _CHUNK_BYTES // (4 * length))
+    buffer = np.empty((min(size, count), length), WIDE)
+    with progress_bar(kind, count, "rows", quiet=quiet) as bar:
+        for block in blocks(database, "database", itertools.repeat(buffer)):
+            index.add(block.rows[: block.valid])
+            bar.advance(block.valid)
+    return Index(kind, index)
+
+
+def _graph(length: int, seed: int) -> Any:
+    index = faiss.IndexHNSWFlat(length, _LINKS, faiss.METRIC_INNER_PRODUCT)
+    index.hnsw.efConstruction = _BUILD_EFFORT
+    index.hnsw.rng = faiss.RandomGenerator(seed)
+    return index
+
+
+def _trained_lists(database: Float[np.ndarray, "n d"], seed: int) -> Any:
+    count, length = database.shape
+    if count < LEAST_ROWS:
+        raise InputError(
+            f"database: found {count} descriptors, expected at least {LEAST_ROWS} to train an "
+            "IVF-PQ index from; search so few exactly, or by hnsw"
+        )
+    largest = max(LEAST_ROWS, _TRAINING_BYTES // (4 * length))
+    wanted = round(4 * math.sqrt(count))
+    trained_from = min(count, largest, max(LEAST_ROWS, 2 * _PER_CENTROID * wanted))
+    lists = min(wanted, trained_from // _PER_CENTROID)
+    parts = max(n for n in range(1, _CODE_BYTES + 1) if length % n == 0 and 2 * n <= max(2, length))
+    index = faiss.IndexIVFPQ(
+        faiss.IndexFlatIP(length), length, lists, parts, 8, faiss.METRIC_INNER_PRODUCT
+    )
+    # The centroids are unit vectors, for they are compared by inner products.
+    index.cp.spherical = True
+    index.cp.seed = index.pq.cp.seed = seed
+    size = max(1, _CHUNK_BYTES // (4 * length))
+    places = sample(count, trained_from, seed)
+    index.train(np.concatenate(list(pieces(database, "database", size, places))))
+    return index
+
+
+def save_index(path: str | os.PathLike[str], index: Index) -> None:
+    """Write an index in faiss's format, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        try:
+            faiss.write_index(index.faiss_index, str(temporary))
+        except RuntimeError as error:
+            raise InputError(f"{path}: cannot be written: {_first_line(error)}") from error
+
+
+def load_index(path: str | os.PathLike[str]) -> Index:
+    """Read an index that `save_index` wrote.
+
+    Raises:
+        InputError: there is no such file, or it holds no index of `KINDS`.
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a faiss index")
+    try:
+        index = faiss.read_index(str(path))
+    except (RuntimeError, MemoryError) as error:
+        raise InputError(f"{path}: not a whole faiss index: {_first_line(error)}") from error
+    kinds: dict[type, Kind] = {faiss.IndexHNSWFlat: "hnsw", faiss.IndexIVFPQ: "ivf-pq"}
+    if type(index) not in kinds or index.metric_type != faiss.METRIC_INNER_PRODUCT:
+        raise InputError(
+            f"{path}: found a {type(index).__name__}, expected one of inner products, as `build` "
+            "makes it"
+        )
+    return Index(kinds[type(index)], index)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+
+
+def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "q k"]) -> float:
+    """Measure the share of the exact neighbours that a search found over all queries, 0 to 1.
+
+    Args:
+        found: indices by an approximate search.
+        exact: those by `retrieval.search`.
+
+    Raises:
+        InputError: the arrays differ in shape, or are empty.
+    """
+    if found.shape != exact.shape or not exact.size:
+        raise InputError(
+            f"found: found indices of shape {found.shape}, expected {exact.shape} as the exact "
+            "ones, not empty"
+        )
+    pairs = zip(found, exact, strict=True)
+    return sum(np.intersect1d(a, b).size for a, b in pairs) / exact.size

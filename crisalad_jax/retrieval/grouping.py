@@ -1,0 +1,170 @@
+"""Grouping protocols: which images look at each other in the cross-image encoder.
+
+A descriptor of such a model depends on the images that its own image looked at. A recall therefore
+means nothing without its protocol, for queries and for the database.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.utils.errors import InputError
+
+GROUPINGS = {
+    "single": "every image alone",
+    "shuffled": "batches of images in random order",
+    "sequential": "batches of images in file order: neighbours help each other",
+    "window": "every image with those just before it in file order: what a moving camera has",
+}
+"""Groupings of the images of one side, queries or database. The two sides never mix."""
+
+DEFAULT_GROUPINGS = ("single", "shuffled", "sequential", "window/single")
+"""The last is a robot's: it has its latest frames, and a map of images described alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Grouping:
+    """A protocol: one of `GROUPINGS` for the queries and one for the database.
+
+    `window` takes the order of the files for the order in time. That holds for numbered frames, but
+    @UTM names are sorted by easting. A database by `window` is a map whose images were described
+    one by one while they were recorded.
+    """
+
+    queries: str
+    database: str
+
+    def __post_init__(self) -> None:
+        """Check both sides' groupings.
+
+        Raises:
+            InputError: a grouping is unknown.
+        """
+        for kind in (self.queries, self.database):
+            choose("grouping", kind, GROUPINGS)
+
+    @classmethod
+    def parse(cls, text: str) -> "Grouping":
+        """Read "window/single", queries and database apart, or "single" for both alike.
+
+        Raises:
+            InputError: an unknown grouping, or more than two.
+        """
+        kinds = text.split("/")
+        if len(kinds) > 2:
+            raise InputError(
+                f"grouping: found {text!r}, expected one for both sides, or QUERIES/DATABASE"
+            )
+        return cls(kinds[0], kinds[-1])
+
+    def __str__(self) -> str:
+        """Return the text that `parse` reads."""
+        if self.queries == self.database:
+            return self.queries
+        return f"{self.queries}/{self.database}"
+
+
+def grouping_words(groupings: Iterable[str]) -> str:
+    """Explain groupings in words, for under a table.
+
+    Args:
+        groupings: some of `GROUPINGS`.
+
+    Returns:
+        A clause for each, in their order.
+
+    Example:
+        >>> grouping_words(["single"])
+        'single = every image alone'
+    """
+    return "; ".join(f"{name} = {GROUPINGS[name]}" for name in groupings)
+
+
+def parse_groupings(texts: Iterable[str]) -> list[Grouping]:
+    """Read protocols in order, without repeats.
+
+    Raises:
+        InputError: what `Grouping.parse` raises.
+    """
+    return list(dict.fromkeys(map(Grouping.parse, texts)))
+
+
+def check_grouping(groupings: Sequence[str], batch_size: int, seed: int, seeds: int = 1) -> None:
+    """Check a side's groupings and the numbers that go with them, before images are described.
+
+    Raises:
+        InputError: one that is not among `GROUPINGS`, a batch of none, a negative seed, or no seed.
+    """
+    for grouping in groupings:
+        choose("grouping", grouping, GROUPINGS)
+    numbers = (("batch size", batch_size, 1), ("seed", seed, 0), ("seeds", seeds, 1))
+    for name, value, least in numbers:
+        if value < least:
+            raise InputError(f"{name}: found {value}, expected at least {least}")
+
+
+class Batches(NamedTuple):
+    """All images of a side in batches, and whose descriptor each batch gives."""
+
+    images: Int64[np.ndarray, "batch place"]
+    """The images of each batch, by number; a place of padding repeats one of them."""
+    filled: Bool[np.ndarray, "batch place"]
+    """Whether a place holds an image, and not padding."""
+    kept: Bool[np.ndarray, "batch place"]
+    """Whether a place's descriptor is kept; every image is kept in exactly one batch."""
+    mutual: bool
+    """Whether the images of a batch look at each other, or each at itself alone."""
+
+    def part(self, start: int, stop: int) -> "Batches":
+        """Return batches `start` to `stop`."""
+        return Batches(
+            self.images[start:stop], self.filled[start:stop], self.kept[start:stop], self.mutual
+        )
+
+    def looks(self, readable: Bool[np.ndarray, " image"]) -> Bool[np.ndarray, "batch place place"]:
+        """Return whether the image at place i of a batch attends to the one at place j.
+
+        Each attends to itself. None attends to padding, nor to an image that could not be read.
+        """
+        seen = self.filled & readable[self.images] & self.mutual
+        return seen[:, :, None] & seen[:, None, :] | np.eye(self.images.shape[1], dtype=bool)
+
+
+def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Batches:
+    """Split images 0 to `count` into batches under one of `GROUPINGS`.
+
+    Under `window`, image i has a batch of its own: the last `batch_size` images up to and with i
+    (the first images have fewer). Only the descriptor of i is kept. One long batch with a banded
+    mask would not do: over several layers, information from images before the window would arrive.
+
+    Args:
+        count: images of the side.
+        grouping: how they are grouped.
+        batch_size: images that look at each other.
+        seed: draws the order of `shuffled`.
+
+    Raises:
+        InputError: what `check_grouping` raises.
+    """
+    check_grouping([grouping], batch_size, seed)
+    order = np.arange(count)
+    if grouping == "window":
+        images = order[:, None] + np.arange(1 - batch_size, 1)
+        filled = images >= 0
+        keep = np.zeros_like(filled)
+        keep[:, -1] = True
+        return Batches(np.where(filled, images, order[:, None]), filled, keep, mutual=True)
+    if grouping == "shuffled":
+        order = np.random.default_rng(seed).permutation(count)
+    starts = np.arange(0, count, batch_size)
+    places = starts[:, None] + np.arange(batch_size)
+    filled = places < count
+    # The last batch is padded with its own images, masked out, so that all have one shape.
+    wrapped = (
+        starts[:, None] + np.arange(batch_size) % np.minimum(count - starts, batch_size)[:, None]
+    )
+    return Batches(order[wrapped], filled, filled, mutual=grouping != "single")

@@ -1,0 +1,1 @@
+"""Maps: descriptors of images that are kept, appended to and searched."""

@@ -1,0 +1,302 @@
+"""Build maps from folders of images: each image is described alone, in bounded memory."""
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.data.images import list_images, names_in
+from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.positions import Positions, read_positions, utm_positions
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.describe import group, tokens_in_batches
+from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.maps.manifest import (
+    MapDescription,
+    check_model,
+    describe_map,
+    has_images,
+    read_description,
+)
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.progress import progress_bar
+
+SEGMENT = 256
+"""Number of images appended together, and so described again at most after a kill."""
+
+
+class Described(NamedTuple):
+    """Descriptors of a few images."""
+
+    indices: Int64[np.ndarray, " n"]
+    """Indices of the readable images in the list of paths."""
+    descriptors: Float32[np.ndarray, "n d"]
+    unreadable: Int64[np.ndarray, " _"]
+    """Indices of the images that could not be read."""
+
+
+def describe_alone(
+    params: Crisalad,
+    config: ModelConfig,
+    paths: Sequence[pathlib.Path],
+    *,
+    batch_size: int,
+    on_bad_image: OnBadImage = "stop",
+) -> Iterator[Described]:
+    """Describe images in order, each as if it were alone, and yield batch by batch.
+
+    The descriptors equal those of the grouping `single` (`retrieval.describe.group`). Two batches
+    are in memory, and the images that are read ahead.
+
+    Raises:
+        InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
+    """
+    stream = tokens_in_batches(
+        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image
+    )
+    for tokens, batch in stream:
+        descriptors = group(params, config, tokens, "single", batch_size=batch_size)
+        unreadable = (batch.indices >= 0) & ~batch.valid
+        yield Described(
+            batch.indices[batch.valid], descriptors[batch.valid], batch.indices[unreadable]
+        )
+
+
+class Indexed(NamedTuple):
+    """Counts and names of a folder's images after indexing it."""
+
+    added: int
+    there: int
+    """Number of images that the map had already."""
+    positions: int
+    """Number of added images whose position is known."""
+    stay: int
+    """Number of given positions of images that the map had already; it keeps its own."""
+    unreadable: list[str]
+    """Names of the images that could not be read."""
+    unmatched: list[str]
+    """Names in the given positions that no image in the folder has."""
+    images: int
+    """Number of images that the map has now."""
+    description: MapDescription
+    """The map's description."""
+
+
+def index_images(
+    target: Map,
+    params: Crisalad,
+    root: pathlib.Path,
+    paths: Sequence[pathlib.Path],
+    *,
+    positions: Positions,
+    batch_size: int = 16,
+    on_bad_image: OnBadImage = "stop",
+    quiet: bool = False,
+) -> Indexed:
+    """Describe images as the map is described, and append them, `SEGMENT` at a time.
+
+    Images whose names the map has are left out, so that the same call resumes after a kill.
+
+    Args:
+        target: open for appending.
+        params: the map's model.
+        root: the folder that names are relative to.
+        paths: images in `root`.
+        positions: by name, as far as known.
+        batch_size: images described at once.
+        on_bad_image: whether an image that cannot be read ends it, or is left out.
+        quiet: no progress bar.
+
+    Raises:
+        InputError: an image cannot be read; a name in the map is of another picture here; or what
+            `Map.append` raises.
+    """
+    config = target.description.config
+    names, sizes, new, listed = [], [], [], set[str]()
+    for path in paths:
+        name, size = path.relative_to(root).as_posix(), path.stat().st_size
+        listed.add(name)
+        if (known := target.image(name)) is None:
+            names.append(name)
+            sizes.append(size)
+            new.append(path)
+        elif known.bytes != size:
+            raise InputError(
+                f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
+                f"{known.root}, expected new names for new pictures"
+            )
+    target.axes_of(names, positions)  # checks them before any work
+    stay = sum(target.image(name) is not None for name in positions.of)
+    waiting: list[Described] = []
+    unreadable: list[str] = []
+
+    def append() -> None:
+        chosen = [int(i) for part in waiting for i in part.indices]
+        if chosen:
+            target.append(
+                [names[i] for i in chosen],
+                [sizes[i] for i in chosen],
+                np.concatenate([part.descriptors for part in waiting]),
+                root=root.resolve().as_posix(),
+                positions=positions,
+            )
+        waiting.clear()
+
+    there = len(target)
+    stream = describe_alone(params, config, new, batch_size=batch_size, on_bad_image=on_bad_image)
+    with progress_bar(
+        "images", len(paths), "images", quiet=quiet, done=len(paths) - len(new)
+    ) as bar:
+        for part in stream:
+            waiting.append(part)
+            unreadable += [names[i] for i in part.unreadable]
+            bar.advance(len(part.indices) + len(part.unreadable))
+            if sum(len(part.indices) for part in waiting) >= SEGMENT:
+                append()
+        append()
+    added = target.images[there:]
+    return Indexed(
+        added=len(added),
+        there=len(paths) - len(new),
+        positions=sum(image.position is not None for image in added),
+        stay=stay,
+        unreadable=unreadable,
+        unmatched=[name for name in positions.of if name not in listed],
+        images=len(target),
+        description=target.description,
+    )
+
+
+def index(
+    params: Crisalad,
+    config: ModelConfig,
+    images: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    weights: str | os.PathLike[str],
+    image_size: tuple[int, int] | None = None,
+    compute_dtype: Literal["float32", "bfloat16"] | None = None,
+    positions: Positions | str | os.PathLike[str] | None = None,
+    store: str | None = None,
+    dtype: Literal["float32", "float16"] | None = None,
+    batch_size: int = 16,
+    on_bad_image: OnBadImage = "stop",
+    quiet: bool = False,
+) -> Indexed:
+    """Make a map of a folder of images, or append to it those that it lacks.
+
+    The same call resumes after a kill.
+
+    Args:
+        params: the model's parameters.
+        config: the model.
+        images: the folder, searched with its subfolders; the map names images by their paths in it.
+        out: the map's folder.
+        weights: the file that the parameters are from, which queries load by default.
+        image_size: height and width in pixels. None is the map's, and of a new map the model's.
+        compute_dtype: type of the matrix products. None is the map's, and of a new map the model's.
+        positions: where images were taken, or a table of it; None is what @UTM names say.
+        store: "files", or "milvus:URI". None is the map's, and of a new map "files".
+        dtype: what files keep descriptors as. None is the map's, and of a new map "float32".
+        batch_size: number of images described at once, each as if it were alone.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        What became of the images.
+
+    Raises:
+        InputError: no image, or none that can be read; positions of none of them; a map of another
+            model or of other settings; what `index_images`, `describe_map` and
+            `open_for_appending` raise.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, init_crisalad, save_weights
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> weights = folder / "weights.safetensors"
+        >>> save_weights(weights, params, config)
+        >>> index(params, config, pictures, folder / "map", weights=weights, quiet=True).added
+        4
+    """
+    check_grouping((), batch_size, seed=0)
+    images, out = pathlib.Path(images), pathlib.Path(out)
+    description = read_description(out)
+    if not has_images(out):
+        description = None  # a map that a kill left without images binds nobody
+    paths = list_images(images)
+    known = _positions(positions, images, names_in(images, paths))
+    if description is None:
+        config = config.resized(image_size)
+        if compute_dtype is not None:
+            config = dataclasses.replace(config, compute_dtype=compute_dtype)
+        description = describe_map(
+            params,
+            config,
+            pathlib.Path(weights),
+            out,
+            store=store or "files",
+            dtype=dtype or "float32",
+        )
+    else:
+        check_model(description, out, model_hash(params, config), weights)
+        _check_settings(description, out, image_size, compute_dtype, dtype, store)
+    with open_for_appending(out, description) as target:
+        result = index_images(
+            target,
+            params,
+            images,
+            paths,
+            positions=known,
+            batch_size=batch_size,
+            on_bad_image=on_bad_image,
+            quiet=quiet,
+        )
+        if not result.images:
+            raise InputError(f"{images}: found {len(paths)} images, none of them readable")
+    return result if positions is not None else result._replace(stay=0)
+
+
+def _positions(
+    given: Positions | str | os.PathLike[str] | None, images: pathlib.Path, names: Sequence[str]
+) -> Positions:
+    """Read the positions of the images; a table has to name at least one of them."""
+    if given is None:
+        return utm_positions(names)
+    positions = given if isinstance(given, Positions) else read_positions(given)
+    if positions.of.keys().isdisjoint(names):
+        source = "positions" if isinstance(given, Positions) else given
+        raise InputError(
+            f"{source}: found none of the {len(names)} images of {images}, expected names such as "
+            f"{names[0]!r}"
+        )
+    return positions
+
+
+def _check_settings(
+    description: MapDescription,
+    folder: pathlib.Path,
+    image_size: tuple[int, int] | None,
+    compute_dtype: str | None,
+    dtype: str | None,
+    store: str | None,
+) -> None:
+    """Check that the given settings agree with those of an existing map."""
+    store = store and store_name(store, folder, description.dtype)
+    for name, given, there in (
+        ("image size", image_size, description.config.image_size),
+        ("compute dtype", compute_dtype, description.config.compute_dtype),
+        ("dtype", dtype, description.dtype),
+        ("store", store, description.store),
+    ):
+        if given is not None and given != there:
+            raise InputError(f"{folder}: found {name} {given}, expected {there} as in the map")

@@ -1,0 +1,131 @@
+"""Descriptors in .npy files, one for each addition, searched exactly by FAISS."""
+
+import bisect
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+
+from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.maps.ties import lower_first
+from crisalad_jax.retrieval.search import Neighbours, exact_similarities, rounding
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import durable_path, write_npy
+
+_SPARE = 16
+"""Number of candidates beyond k, for products that float32 cannot tell apart."""
+
+
+class FileStore:
+    """A `Store` in a folder of files, each named by the number of its first descriptor.
+
+    Files are memory-mapped one after the other, and closed again. A search has one file open and in
+    memory, whatever the size of the map.
+    """
+
+    def __init__(self, folder: pathlib.Path, length: int, dtype: str) -> None:
+        """Open a folder of descriptors of `length` numbers; the first `add` makes the folder."""
+        self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
+        names = (path.stem for path in folder.glob("*.npy") if path.stem.isdecimal())
+        self._firsts = sorted(map(int, names))
+
+    def _path(self, first: int) -> pathlib.Path:
+        return self._folder / f"{first:010d}.npy"
+
+    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+        """Write descriptors to a file; see `Store.add`."""
+        path = self._path(first)
+        try:
+            with durable_path(path) as temporary:
+                write_npy(temporary, descriptors.astype(self._dtype))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        # Files that a killed addition left may have these numbers already.
+        del self._firsts[bisect.bisect_left(self._firsts, first) :]
+        self._firsts.append(first)
+
+    def check(self, segments: Sequence[tuple[int, int]]) -> None:
+        """Open the file of each addition; see `Store.check`."""
+        for first, count in segments:
+            self._open(first, count)
+
+    def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
+        """Read the file of one addition; see `Store.read`."""
+        return np.array(self._open(first, count))
+
+    def _open(self, first: int, count: int | None = None) -> Float[np.ndarray, "n d"]:
+        path = self._path(first)
+        try:
+            rows = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise InputError(f"{path}: not a whole file of descriptors: {reason}") from error
+        expected = (len(rows) if count is None else count, self._length)
+        if rows.dtype != self._dtype or rows.shape != expected:
+            raise InputError(
+                f"{path}: found {rows.dtype} {rows.shape}, expected {self._dtype} {expected}"
+            )
+        return rows
+
+    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+        """Find the k most similar descriptors of each query; see `Store.search`.
+
+        FAISS selects candidates by float32 products, whose rounding differs with the segment and
+        the number of queries. Their similarities are then summed in float64 and rounded once.
+        """
+        firsts = self._firsts[: bisect.bisect_left(self._firsts, count)]
+
+        def ask(queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+            return self._exact(queries, self._candidates(queries, k, firsts), firsts)
+
+        # Twice: a row left out and the row taken in its place may each be off by `rounding`.
+        return lower_first(
+            ask,
+            np.ascontiguousarray(queries, np.float32),
+            k,
+            count,
+            spare=_SPARE,
+            margin=2 * rounding(self._length),
+        )
+
+    def _candidates(
+        self, queries: Float32[np.ndarray, "q d"], k: int, firsts: Sequence[int]
+    ) -> Int64[np.ndarray, "q k"]:
+        """Number the k largest products in float32 of each query, in these files."""
+        import faiss
+
+        numbers = np.empty((len(queries), 0), np.int64)
+        products = np.empty((len(queries), 0), np.float32)
+        for first in firsts:
+            block = np.ascontiguousarray(self._open(first), np.float32)
+            check_rows(block, str(self._path(first)), range(len(block)), unit=True)
+            values, places = faiss.knn(
+                queries, block, min(k, len(block)), metric=faiss.METRIC_INNER_PRODUCT
+            )
+            products = np.concatenate([products, values], axis=1)
+            numbers = np.concatenate([numbers, places + first], axis=1)
+            order = np.argsort(-products, axis=1, kind="stable")[:, :k]
+            products = np.take_along_axis(products, order, axis=1)
+            numbers = np.take_along_axis(numbers, order, axis=1)
+        return numbers
+
+    def _exact(
+        self,
+        queries: Float32[np.ndarray, "q d"],
+        numbers: Int64[np.ndarray, "q k"],
+        firsts: Sequence[int],
+    ) -> Neighbours:
+        """Compute exact similarities of candidates; no other rows are read."""
+        similarities = np.empty(numbers.shape, np.float32)
+        segments = np.searchsorted(firsts, numbers, side="right") - 1
+        for segment in np.unique(segments):
+            first = firsts[segment]
+            query, column = np.nonzero(segments == segment)
+            similarities[query, column] = exact_similarities(
+                queries, self._open(first), query, numbers[query, column] - first
+            )
+        return Neighbours(numbers, similarities)
+
+    def close(self) -> None:
+        """Do nothing: no connection is open."""

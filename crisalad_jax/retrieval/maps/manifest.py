@@ -1,0 +1,187 @@
+"""A map's description in map.json: the model, its settings, where descriptors are."""
+
+import contextlib
+import dataclasses
+import datetime
+import json
+import os
+import pathlib
+import uuid
+from collections.abc import Iterator
+from typing import Any
+
+from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.config.io import from_plain
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import durable_path, is_temporary, remove_temporaries
+from crisalad_jax.utils.notes import tell
+
+FORMAT = 2
+"""Version of the format that this package writes, and the newest that it reads. Maps of format 1
+(package version 0.1) have a hash of all fields that a model had then."""
+DESCRIPTION, SEGMENTS, LOCK = "map.json", "segments", ".lock"
+"""Names of the description, of the folder of additions, and of the lock for appending."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MapDescription:
+    """The contents of map.json."""
+
+    model: str
+    """The `model_hash` of the weights that describe its images, and its queries."""
+    weights: str
+    """Where those weights were."""
+    config: ModelConfig
+    """The model, at the image size and in the type in which images are described."""
+    descriptor_length: int
+    store: str = "files"
+    """Where descriptors are stored; see `store.store_name`."""
+    dtype: str = "float32"
+    """Type of the stored descriptors."""
+    grouping: str = "single"
+    """Every image is described alone, so that no descriptor depends on neighbouring images."""
+    collection: str = ""
+    """Name of Milvus' collection of the descriptors."""
+    created: str = ""
+    format: int = FORMAT
+
+
+def describe_map(
+    params: Crisalad,
+    config: ModelConfig,
+    weights: pathlib.Path,
+    folder: pathlib.Path,
+    *,
+    store: str = "files",
+    dtype: str = "float32",
+) -> MapDescription:
+    """Make the description of a new map in `folder`, whose images this model will describe.
+
+    Raises:
+        InputError: what `store_name` raises.
+    """
+    return MapDescription(
+        model=model_hash(params, config),
+        weights=str(weights.resolve()),
+        config=config,
+        descriptor_length=config.descriptor_dim,
+        store=store_name(store, folder, dtype),
+        dtype=dtype,
+        collection=f"crisalad_{uuid.uuid4().hex}",
+        created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    )
+
+
+def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
+    """Read the description of the map in `folder`; None where a new map can be made.
+
+    Raises:
+        InputError: the folder is a file or holds other things than a map, or the map is damaged or
+            of a newer version of this package.
+    """
+    folder = pathlib.Path(folder)
+    path = folder / DESCRIPTION
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: found a file, expected a map's folder") from None
+        # A process killed before it has made the map leaves its lock and temporary files behind.
+        others = sorted(_others(folder, LOCK, SEGMENTS))
+        if _others(folder / SEGMENTS):
+            others.append(SEGMENTS)
+        if others:
+            raise InputError(
+                f"{folder}: found {others[0]} and no {DESCRIPTION}, expected a map or an empty "
+                "folder"
+            ) from None
+        return None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read this map: {error}") from error
+    version = value.get("format") if isinstance(value, dict) else None
+    if type(version) is int and version > FORMAT:
+        raise InputError(
+            f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
+            "crisalad-jax"
+        )
+    description = from_plain(MapDescription, value, source=str(path))
+    try:
+        store_name(description.store, folder, description.dtype)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return description
+
+
+def _others(folder: pathlib.Path, *names: str) -> list[str]:
+    """Return the names in `folder` that are neither temporary nor in `names`."""
+    if not folder.is_dir():
+        return []
+    return [p.name for p in folder.iterdir() if p.name not in names and not is_temporary(p)]
+
+
+def has_images(folder: pathlib.Path) -> bool:
+    """Return whether a folder holds a map with images; a map without any counts as none."""
+    return any((folder / SEGMENTS).glob("[0-9]*.json"))
+
+
+@contextlib.contextmanager
+def undone_without_images(folder: pathlib.Path) -> Iterator[None]:
+    """Remove the map if the block raises before it has images: nothing is lost."""
+    try:
+        yield
+    except BaseException:
+        if not has_images(folder):
+            with contextlib.suppress(OSError):
+                _remove(folder)
+        raise
+
+
+def _remove(folder: pathlib.Path) -> None:
+    """Remove a map without images; its description stays where other files are left."""
+    segments = folder / SEGMENTS
+    remove_temporaries(segments)
+    for path in segments.glob("[0-9]*.npy"):
+        path.unlink()
+    segments.rmdir()
+    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, LOCK}:
+        (folder / DESCRIPTION).unlink(missing_ok=True)
+        (folder / LOCK).unlink()
+        folder.rmdir()
+
+
+def check_model(
+    description: MapDescription, folder: str | os.PathLike[str], digest: str, weights: object
+) -> None:
+    """Check that a map was made by the model with the hash `digest`.
+
+    A map of version 0.1 cannot be checked; a note tells so.
+
+    Raises:
+        InputError: the hashes differ; the message has both.
+    """
+    if description.format < FORMAT:
+        tell(
+            f"{folder}: found a map of crisalad-jax 0.1, which cannot tell whether {weights} made "
+            "it; `crisalad index` into a new folder makes one that can"
+        )
+    elif digest != description.model:
+        raise InputError(
+            f"{folder}: found a map made by model {description.model[:12]} "
+            f"({description.weights}), but {weights} is model {digest[:12]}"
+        )
+
+
+def write_record(path: pathlib.Path, value: Any, indent: int | None = None) -> None:
+    """Write JSON whole or not at all, and flush it to the disk.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written to.
+    """
+    try:
+        with durable_path(path) as temporary:
+            temporary.write_text(json.dumps(value, indent=indent) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

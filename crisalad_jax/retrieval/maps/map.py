@@ -1,0 +1,393 @@
+"""Maps: a folder of descriptors with a description of itself, which grows by appending.
+
+Each addition is a segment: its descriptors go to the store, then the record of its images appears
+under its name. That single rename commits the addition. A map whose writer is killed at any moment
+is as it was before the addition or after it. docs/maps.md has the format.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import pathlib
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from crisalad_jax.checkpoints.weights import load_weights, model_hash
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.positions import Positions
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.maps.manifest import (
+    DESCRIPTION,
+    LOCK,
+    SEGMENTS,
+    MapDescription,
+    check_model,
+    has_images,
+    read_description,
+    undone_without_images,
+    write_record,
+)
+from crisalad_jax.retrieval.maps.store import Store, open_store
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import remove_temporaries
+
+
+class MapImage(NamedTuple):
+    """An image of a map: everything but its descriptor."""
+
+    name: str
+    """Its posix path relative to `root`; no two images of a map share one."""
+    bytes: int
+    """Size of the described file in bytes; a file of another size is another picture."""
+    position: tuple[float, float] | None
+    root: str
+
+
+class _Segment(NamedTuple):
+    first: int
+    count: int
+    sha256: str
+
+
+class Map:
+    """An open map: made by `Map.open` to search it, or by `open_for_appending`.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, index, init_crisalad, save_weights
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> weights = folder / "weights.safetensors"
+        >>> save_weights(weights, params, config)
+        >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+        >>> with Map.open(folder / "map") as places:
+        ...     len(places)
+        4
+    """
+
+    def __init__(self, folder: pathlib.Path, description: MapDescription, store: Store) -> None:
+        """Read all records, and check that the store has all of their descriptors."""
+        self.folder, self.description = folder, description
+        self.images: list[MapImage] = []
+        """The images by number."""
+        self._numbers: dict[str, int] = {}
+        self.axes: tuple[str, str] | None = None
+        """Axes of the positions, see `positions.AXES`; None where no image has a position."""
+        self._store = store
+        self._segments: list[_Segment] = []
+        for path in sorted((folder / SEGMENTS).glob("[0-9]*.json")):
+            self._read_record(path)
+        store.check([(first, count) for first, count, _ in self._segments])
+
+    @classmethod
+    def open(cls, folder: str | os.PathLike[str]) -> Self:
+        """Open a map to search it as it is now; images appended meanwhile are not seen.
+
+        Args:
+            folder: what `index` made.
+
+        Returns:
+            The map, a context manager that lets go of its store.
+
+        Raises:
+            InputError: there is no map, it has no images yet, or it or its store is damaged, gone,
+                or of a newer version.
+
+        Example:
+            >>> with Map.open("no-map") as places:
+            ...     len(places)
+            Traceback (most recent call last):
+            ...
+            crisalad_jax.utils.errors.InputError: no-map: found no map, expected a folder that ...
+        """
+        folder = pathlib.Path(folder)
+        description = read_description(folder)
+        if description is None:
+            raise InputError(
+                f"{folder}: found no map, expected a folder that `crisalad index` wrote"
+            )
+        if not has_images(folder):
+            raise InputError(f"{folder}: found a map without images, expected at least one")
+        return cls._opened(folder, description)
+
+    @classmethod
+    def _opened(cls, folder: pathlib.Path, description: MapDescription) -> Self:
+        store = open_store(
+            description.store,
+            folder,
+            collection=description.collection,
+            length=description.descriptor_length,
+            dtype=description.dtype,
+            new=not has_images(folder),
+        )
+        try:
+            return cls(folder, description, store)
+        except BaseException:
+            store.close()
+            raise
+
+    def __enter__(self) -> Self:
+        """Return the map itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the map."""
+        self.close()
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self.images)
+
+    def image(self, name: str) -> MapImage | None:
+        """Return what the map knows of the image of this name; None if it has none."""
+        number = self._numbers.get(name)
+        return None if number is None else self.images[number]
+
+    def _record(self, first: int) -> pathlib.Path:
+        return self.folder / SEGMENTS / f"{first:010d}.json"
+
+    def _read_record(self, path: pathlib.Path) -> None:
+        if path != self._record(len(self)):
+            raise InputError(f"{path}: expected {self._record(len(self)).name} before it")
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            columns = (record["names"], record["bytes"], record["positions"])
+            images = [
+                MapImage(str(name), int(size), at and (float(at[0]), float(at[1])), record["root"])
+                for name, size, at in zip(*columns, strict=True)
+            ]
+            axes = record["axes"] and (record["axes"][0], record["axes"][1])
+            segment = _Segment(len(self), len(images), str(record["sha256"]))
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise InputError(f"{path}: not a whole record of images: {error!r}") from error
+        self._take(images, axes, segment)
+
+    def _take(
+        self, images: list[MapImage], axes: tuple[str, str] | None, segment: _Segment
+    ) -> None:
+        self._numbers |= {image.name: segment.first + i for i, image in enumerate(images)}
+        self.images += images
+        self.axes = self.axes or axes
+        self._segments.append(segment)
+
+    def search(self, queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+        """Find the k most similar images of each query, best first; all where there are fewer.
+
+        Search is exact, by inner product; of equal similarities the earlier image stands first.
+
+        Args:
+            queries: unit descriptors, of the map's model.
+            k: neighbours per query.
+
+        Raises:
+            InputError: no queries, none in the map, descriptors that are no unit vectors of the
+                map's length, k below 1; or the store is damaged or gone.
+        """
+        if k < 1:
+            raise InputError(f"k: found {k}, expected at least 1")
+        if not len(self):
+            raise InputError(f"{self.folder}: found a map without images, expected at least one")
+        self._check_descriptors("queries", queries)
+        return self._store.search(queries, min(k, len(self)), len(self))
+
+    def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
+        length = self.description.descriptor_length
+        if descriptors.ndim != 2 or not len(descriptors) or descriptors.shape[1] != length:
+            raise InputError(
+                f"{name}: found shape {descriptors.shape}, expected (images, {length})"
+            )
+        check_rows(descriptors, name, range(len(descriptors)), unit=True)
+
+    def axes_of(self, names: Iterable[str], positions: Positions | None) -> tuple[str, str] | None:
+        """Return the axes of the positions of new images; None where none of them has one.
+
+        Raises:
+            InputError: the map's positions are in other axes.
+        """
+        if positions is None or positions.of.keys().isdisjoint(names):
+            return None
+        if self.axes and positions.axes != self.axes:
+            raise InputError(
+                f"{self.folder}: found positions in {', '.join(positions.axes)}, expected "
+                f"{', '.join(self.axes)} as in the map"
+            )
+        return positions.axes
+
+    def append(
+        self,
+        names: Sequence[str],
+        sizes: Sequence[int],
+        descriptors: Float[np.ndarray, "n d"],
+        *,
+        root: str,
+        positions: Positions | None = None,
+    ) -> None:
+        """Append images: all of them are there for good once this returns, and none before.
+
+        Args:
+            names: relative to `root`, none of which the map has.
+            sizes: of their files, in bytes.
+            descriptors: unit vectors; kept as the map's type.
+            root: the folder of these images.
+            positions: where they were taken, as far as that is known.
+
+        Raises:
+            InputError: a name that is there already or twice, descriptors that are no unit vectors,
+                positions in other axes than the map's, or a store that cannot be written to.
+        """
+        self._check_descriptors("descriptors", descriptors)
+        if twice := len(names) - len(set(names) - self._numbers.keys()):
+            raise InputError(
+                f"{self.folder}: found {twice} of {len(names)} names twice, or in the map already, "
+                "expected new ones"
+            )
+        known = positions.of if positions else {}
+        images = [
+            MapImage(name, size, known.get(name), root)
+            for name, size in zip(names, sizes, strict=True)
+        ]
+        axes = self.axes_of(names, positions)
+        rows = np.ascontiguousarray(descriptors, self.description.dtype)
+        segment = _Segment(len(self), len(images), hashlib.sha256(rows.data).hexdigest())
+        self._store.add(segment.first, rows)
+        record = {
+            "root": root,
+            "axes": axes,
+            "sha256": segment.sha256,
+            "names": list(names),
+            "bytes": list(sizes),
+            "positions": [image.position for image in images],
+        }
+        write_record(self._record(segment.first), record)
+        self._take(images, axes, segment)
+
+    @property
+    def descriptors(self) -> Iterator[Float[np.ndarray, "n d"]]:
+        """Descriptors in order, one array for each addition."""
+        for first, count, _ in self._segments:
+            yield self._store.read(first, count)
+
+    def verify(self) -> None:
+        """Read all descriptors, and compare them with the digests in the records.
+
+        Raises:
+            InputError: one has changed; the message says of which images.
+        """
+        for segment, descriptors in zip(self._segments, self.descriptors, strict=True):
+            rows = np.ascontiguousarray(descriptors, self.description.dtype)
+            if hashlib.sha256(rows.data).hexdigest() != segment.sha256:
+                raise InputError(
+                    f"{self._record(segment.first).with_suffix('')}: descriptors {segment.first} "
+                    f"to {segment.first + segment.count - 1} have changed since they were written"
+                )
+
+    def summary(self, *, verify: bool = False) -> dict[str, Any]:
+        """Summarise the map as JSON values by name.
+
+        Args:
+            verify: whether to read all descriptors, as `verify` does.
+
+        Returns:
+            Numbers of images and positions, the model, its settings, and where descriptors are.
+
+        Raises:
+            InputError: what `verify` raises.
+        """
+        if verify:
+            self.verify()
+        description = self.description
+        return {
+            "images": len(self),
+            "positions": sum(image.position is not None for image in self.images),
+            "axes": self.axes,
+            "descriptor": f"{description.descriptor_length} numbers, {description.dtype}",
+            "image_size": list(description.config.image_size),
+            "grouping": description.grouping,
+            "store": description.store,
+            "model": description.model,
+            "weights": description.weights,
+            "created": description.created,
+            "verified": verify,
+        }
+
+    def load_params(self, weights: str | os.PathLike[str] | None = None) -> Crisalad:
+        """Load the parameters of the model that made the map.
+
+        Args:
+            weights: the file; None is where it was then.
+
+        Returns:
+            The parameters, which go with `description.config`.
+
+        Raises:
+            InputError: there is no such file, or it is of another model.
+        """
+        file = pathlib.Path(self.description.weights) if weights is None else weights
+        if weights is None and not pathlib.Path(file).is_file():
+            raise InputError(
+                f"{self.folder}: found no {file}, which made this map, expected it there or as "
+                "--weights"
+            )
+        params, config = load_weights(file)
+        check_model(self.description, self.folder, model_hash(params, config), file)
+        return params
+
+    def close(self) -> None:
+        """Close the store."""
+        self._store.close()
+
+
+@contextlib.contextmanager
+def open_for_appending(
+    folder: str | os.PathLike[str], description: MapDescription
+) -> Iterator[Map]:
+    """Open the map with this description to append to it, or make it.
+
+    One process at a time may append; others may search meanwhile. A map that a kill left without
+    images is made anew; one that an exception leaves without images is removed.
+
+    Raises:
+        InputError: another process appends, the map there is another one or what `Map.open` raises,
+            or the folder cannot be written to.
+    """
+    folder = pathlib.Path(folder)
+    read_description(folder)  # raises where something else is there, before anything is made
+    with contextlib.ExitStack() as stack:
+        try:
+            (folder / SEGMENTS).mkdir(parents=True, exist_ok=True)
+            stack.enter_context(_locked(folder))
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+        existing = read_description(folder)
+        remove_temporaries(folder / SEGMENTS)
+        stack.enter_context(undone_without_images(folder))
+        if existing != description:
+            if has_images(folder):
+                raise InputError(f"{folder}: found another map than was expected here")
+            write_record(folder / DESCRIPTION, to_plain(description), indent=2)
+        yield stack.enter_context(Map._opened(folder, description))
+
+
+@contextlib.contextmanager
+def _locked(folder: pathlib.Path) -> Iterator[None]:
+    """Hold the map's lock; it is released at the end of the process at the latest."""
+    import fcntl
+
+    taken = InputError(
+        f"{folder}: another process is appending to this map, expected to be the only one"
+    )
+    with (folder / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise taken from error
+        # Another process may have removed the map with its lock since this one opened the lock.
+        if os.fstat(file.fileno()).st_nlink == 0:
+            raise taken
+        yield

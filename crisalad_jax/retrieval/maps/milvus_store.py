@@ -1,0 +1,229 @@
+"""Descriptors in Milvus: a server, or milvus-lite in this process, by the same code."""
+
+import contextlib
+import importlib.util
+import logging
+import os
+import pathlib
+import urllib.parse
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from crisalad_jax.retrieval.maps.ties import lower_first
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.errors import InputError
+
+TOKEN = "CRISALAD_MILVUS_TOKEN"
+"""The environment variable that holds a server's token, or its user:password."""
+# Bytes in a message, at most: Milvus takes 64 MiB by default.
+_MESSAGE_BYTES = 2**24
+_MOST = 16384
+"""Largest number of neighbours, of queries at once, and of returned rows that Milvus allows."""
+# The last one logs a call that milvus-lite lacks, whose failure the client expects.
+_LOGS = ("pymilvus.decorators", "milvus_lite.server_manager", "grpc._server")
+
+
+def check_address(address: str) -> bool:
+    """Check Milvus' address; return True for an http address, False for a file.
+
+    Raises:
+        InputError: neither, or an address with a user's name.
+    """
+    if address.startswith(("http://", "https://")):
+        if "@" in urllib.parse.urlsplit(address).netloc:
+            raise InputError(
+                "store: found a user's name in the address, expected it in the environment "
+                f"variable {TOKEN}, which no file keeps"
+            )
+        return True
+    if "://" in address or not address.endswith(".db"):
+        raise InputError(
+            f"store: found {address!r} after milvus:, expected a file name.db or an address "
+            "http://host:port"
+        )
+    return False
+
+
+class MilvusStore:
+    """A `Store` in a collection of Milvus with the index FLAT, which is exact."""
+
+    def __init__(self, address: str, collection: str, length: int, *, new: bool) -> None:
+        """Connect to `address`, and make the collection if it is `new`."""
+        needed = ("pymilvus",) if check_address(address) else ("pymilvus", "milvus_lite")
+        if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
+            raise InputError(
+                f"store: found no {' nor '.join(missing)}, expected them installed: "
+                'pip install "crisalad-jax[milvus]"'
+            )
+        import pymilvus
+
+        self._address, self._collection = address, collection
+        self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
+        self._is_file = "milvus_lite" in needed
+        if self._is_file and new:
+            _make_folder(pathlib.Path(address).parent)
+        if self._is_file and not new and not pathlib.Path(address).exists():
+            raise InputError(f"{address}: found nothing, expected the descriptors of this map")
+        with self._one_line():
+            token = os.environ.get(TOKEN, "")
+            self._client = pymilvus.MilvusClient(address, token=token)
+            if new:
+                self._client.drop_collection(collection)
+                self._create(length)
+            elif not self._client.has_collection(collection):
+                raise InputError(
+                    f"{address}: found no collection {collection}, expected it with the "
+                    "descriptors of this map"
+                )
+            self._load()
+
+    @contextlib.contextmanager
+    def _one_line(self) -> Iterator[None]:
+        """Turn Milvus' errors into one line, and silence its own logs of them."""
+        import grpc
+        import pymilvus
+
+        loggers = [logging.getLogger(name) for name in _LOGS]
+        levels = [logger.level for logger in loggers]
+        try:
+            for logger in loggers:
+                logger.setLevel(logging.CRITICAL + 1)
+            yield
+        except (pymilvus.MilvusException, grpc.RpcError) as error:
+            words = getattr(error, "message", None) or str(error)
+            if "Open local milvus failed" in words:
+                words += " (damaged, or another process has it open)"
+            raise InputError(f"{self._address}: Milvus says: {' '.join(words.split())}") from error
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+
+    def _create(self, length: int) -> None:
+        from pymilvus import DataType
+
+        schema = self._client.create_schema(auto_id=False, enable_dynamic_field=False)
+        schema.add_field("id", DataType.INT64, is_primary=True)
+        schema.add_field("descriptor", DataType.FLOAT_VECTOR, dim=length)
+        self._client.create_collection(
+            self._collection, schema=schema, index_params=self._flat(), consistency_level="Strong"
+        )
+
+    def _flat(self) -> Any:
+        index = self._client.prepare_index_params()
+        index.add_index("descriptor", index_type="FLAT", metric_type="IP")
+        return index
+
+    def _load(self) -> None:
+        import pymilvus
+
+        try:
+            self._client.load_collection(self._collection)
+        except pymilvus.MilvusException:
+            if not self._is_file:
+                raise
+            # milvus-lite writes an index in place: one that a kill cut short never loads again. It
+            # can be rebuilt from the descriptors.
+            self._client.release_collection(self._collection)
+            self._client.drop_index(self._collection, "descriptor")
+            self._client.create_index(self._collection, self._flat())
+            self._client.load_collection(self._collection)
+
+    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+        """Upsert descriptors by number; see `Store.add`."""
+        rows = np.ascontiguousarray(descriptors, np.float32)
+        with self._one_line():
+            for start in range(0, len(rows), self._rows):
+                part = rows[start : start + self._rows]
+                self._client.upsert(
+                    self._collection,
+                    [{"id": first + start + i, "descriptor": row} for i, row in enumerate(part)],
+                )
+            self._client.flush(self._collection)
+
+    def check(self, segments: Sequence[tuple[int, int]]) -> None:
+        """Count the stored descriptors; see `Store.check`."""
+        expected = sum(count for _, count in segments)
+        with self._one_line():
+            answer = self._client.query(
+                self._collection, filter=f"id < {expected}", output_fields=["count(*)"]
+            )
+        if (stored := answer[0]["count(*)"]) != expected:
+            raise InputError(
+                f"{self._address}: found {stored} descriptors in {self._collection}, expected "
+                f"{expected}, as many as the map has images"
+            )
+
+    def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
+        """Fetch the descriptors of one addition; see `Store.read`."""
+        parts: list[Any] = []
+        for start in range(first, first + count, self._rows):
+            stop = min(start + self._rows, first + count)
+            with self._one_line():
+                parts += self._client.query(
+                    self._collection,
+                    filter=f"{start} <= id and id < {stop}",
+                    output_fields=["id", "descriptor"],
+                )
+        parts.sort(key=lambda part: part["id"])
+        if [part["id"] for part in parts] != list(range(first, first + count)):
+            raise InputError(
+                f"{self._address}: found {len(parts)} descriptors in {self._collection} from "
+                f"{first}, expected {count}"
+            )
+        return np.array([part["descriptor"] for part in parts], np.float32)
+
+    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+        """Find the k most similar descriptors of each query; see `Store.search`."""
+        if k > _MOST:
+            raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
+
+        def ask(queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+            # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
+            size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
+            parts = [
+                self._ask(queries[start : start + size], k, count)
+                for start in range(0, len(queries), size)
+            ]
+            return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
+
+        return lower_first(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
+
+    def _ask(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+        with self._one_line():
+            answers = self._client.search(
+                self._collection,
+                data=list(queries),
+                limit=k,
+                filter=f"id < {count}",
+                # milvus-lite reads an empty list as all fields, descriptors included.
+                output_fields=["id"],
+                search_params={"metric_type": "IP"},
+            )
+        if any(len(hits) != k for hits in answers):
+            raise InputError(
+                f"{self._address}: found {min(map(len, answers))} descriptors in "
+                f"{self._collection}, expected at least {k}"
+            )
+        return Neighbours(
+            np.array([[hit["id"] for hit in hits] for hits in answers], np.int64),
+            np.array([[hit["distance"] for hit in hits] for hits in answers], np.float32),
+        )
+
+    def close(self) -> None:
+        """Disconnect; other processes may then open the file."""
+        with self._one_line():
+            self._client.close()
+        if self._is_file:
+            from milvus_lite.server_manager import server_manager_instance
+
+            server_manager_instance.release_server(self._address)
+
+
+def _make_folder(folder: pathlib.Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot make this folder: {error.strerror}") from error

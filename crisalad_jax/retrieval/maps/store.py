@@ -1,0 +1,97 @@
+"""Where a map's descriptors are: files that FAISS searches, or Milvus, behind one interface.
+
+A store knows descriptors by their numbers, from 0, and nothing of images. The map says how many of
+them count. Descriptors beyond, which a killed addition left, are never returned, and the next
+addition overwrites them.
+"""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.errors import InputError
+
+DTYPES = ("float32", "float16")
+"""Types that descriptors may be stored as."""
+_MILVUS = "milvus:"
+
+
+class Store(Protocol):
+    """Descriptors by number. Each method raises InputError where the store is damaged or gone."""
+
+    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+        """Write descriptors as numbers `first` and on; they are durable once this returns."""
+        ...
+
+    def check(self, segments: Sequence[tuple[int, int]]) -> None:
+        """Check, without reading them, that all additions, as (first, count), are there."""
+        ...
+
+    def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
+        """Read the descriptors that were added together as numbers `first` and on."""
+        ...
+
+    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+        """Find the k nearest of numbers below `count`, exactly, by inner product; 1 <= k <= count.
+
+        Of equal similarities the lower number stands first, also at the k-th place.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close connections, if there are any."""
+        ...
+
+
+def store_name(name: str, folder: pathlib.Path, dtype: str) -> str:
+    """Check a store's name on the command line; return the name that a map in `folder` stores.
+
+    The name holds a file of Milvus by its absolute path, or by one relative to the map's folder if
+    it is inside.
+
+    Raises:
+        InputError: neither "files" nor "milvus:URI", or such an URI or type that Milvus has not.
+    """
+    if dtype not in DTYPES:
+        raise InputError(f"dtype: found {dtype!r}, expected one of {', '.join(DTYPES)}")
+    if name == "files":
+        return name
+    if not name.startswith(_MILVUS):
+        raise InputError(f"store: found {name!r}, expected files or milvus:URI")
+    if dtype != "float32":
+        raise InputError(f"dtype: found {dtype}, expected float32, which {name} keeps")
+    address = name.removeprefix(_MILVUS)
+    if not check_address(address):
+        path, folder = pathlib.Path(address).resolve(), folder.resolve()
+        address = str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+    return _MILVUS + address
+
+
+def open_store(
+    name: str, folder: pathlib.Path, *, collection: str, length: int, dtype: str, new: bool
+) -> Store:
+    """Open the store that `store_name` named for the map in `folder`.
+
+    Args:
+        name: the store.
+        folder: the map's.
+        collection: what Milvus keeps this map's descriptors under.
+        length: numbers in a descriptor.
+        dtype: of the files.
+        new: whether the store is made anew, in place of one that a kill left unfinished.
+
+    Raises:
+        InputError: it cannot be reached, is missing, or holds something else.
+    """
+    if name == "files":
+        return FileStore(folder / "segments", length, dtype)
+    address = name.removeprefix(_MILVUS)
+    if not check_address(address):
+        address = str(folder.resolve() / address)
+    return MilvusStore(address, collection, length, new=new)

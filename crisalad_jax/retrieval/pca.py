@@ -1,0 +1,294 @@
+"""Principal components of descriptors: fewer numbers each, with or without whitening."""
+
+import dataclasses
+import itertools
+import json
+import os
+import pathlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import safetensors
+from jaxtyping import Float, Float32, Float64
+
+from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.retrieval.chunks import as_rows, pieces, sample
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source, write_safetensors
+from crisalad_jax.utils.progress import Bar, progress_bar
+
+FORMAT = "crisalad-jax pca 1"
+"""The one key of a file's metadata; its value is the `PcaConfig` as JSON."""
+SAMPLES = 2**14
+"""Largest number of descriptors that components are fitted to, as in CricaVPR."""
+_ARRAYS = ("mean", "components", "variances", "total")
+_CHUNK_BYTES = 2**26
+
+
+@dataclasses.dataclass(frozen=True)
+class PcaConfig:
+    """How descriptors are reduced to their components."""
+
+    whiten: bool = False
+    """Divide every component by its standard deviation, for all to count alike (Jegou and Chum,
+    2012). CricaVPR does not."""
+    renormalise: bool = True
+    """Make the reduced descriptors unit vectors again, as `retrieval.search` and all that compares
+    by cosine take them (and Jegou and Chum after whitening). CricaVPR leaves them as they are, and
+    searches by L2: its published figures are without."""
+
+
+class Pca(NamedTuple):
+    """Principal components, fitted by `fit_pca`."""
+
+    mean: Float32[np.ndarray, " d"]
+    components: Float32[np.ndarray, "dim d"]
+    """Orthonormal rows by falling variance; the largest number of each in size is positive."""
+    variances: Float32[np.ndarray, " dim"]
+    """Sample variances (divided by n - 1) of the fitted descriptors along the components."""
+    total: Float32[np.ndarray, ""]
+    """Variance of the fitted descriptors in all directions."""
+    config: PcaConfig
+
+    @property
+    def kept(self) -> float:
+        """Share of the variance that lies along the components, 0 to 1."""
+        return float(self.variances.sum() / self.total)
+
+    def apply(self, descriptors: Float[np.ndarray, "n d"]) -> Float32[np.ndarray, "n dim"]:
+        """Reduce descriptors to their components, a few thousand rows at a time.
+
+        Raises:
+            InputError: descriptors of another length than those that were fitted, no matrix, or
+                rows that are not finite; where they are to be unit vectors, one that lies at the
+                mean.
+        """
+        descriptors = as_rows(descriptors, "descriptors")
+        self.check(descriptors.shape[1], "descriptors")
+        scale = np.sqrt(self.variances) if self.config.whiten else np.float32(1)
+        reduced = np.empty((len(descriptors), len(self.components)), np.float32)
+        start = 0
+        for rows in pieces(descriptors, "descriptors", _rows_at_a_time(len(self.mean))):
+            rows -= self.mean
+            part = rows @ self.components.T / scale
+            if self.config.renormalise:
+                lengths = np.linalg.norm(part, axis=1, keepdims=True)
+                if not lengths.all():
+                    raise InputError(
+                        f"descriptors: row {start + np.argmin(lengths)} lies at the mean, expected "
+                        "one with a direction from there"
+                    )
+                part /= lengths
+            reduced[start : start + len(rows)] = part
+            start += len(rows)
+        return reduced
+
+    def check(self, length: int, name: str) -> None:
+        """Check that descriptors have the length of those that were fitted.
+
+        Raises:
+            InputError: they are not.
+        """
+        if length != len(self.mean):
+            raise InputError(
+                f"{name}: found descriptors of length {length}, expected {len(self.mean)} as the "
+                "components were fitted to"
+            )
+
+
+def fit_pca(
+    descriptors: Float[np.ndarray, "n d"],
+    dim: int,
+    config: PcaConfig | None = None,
+    *,
+    samples: int | None = SAMPLES,
+    seed: int = 0,
+    quiet: bool = True,
+) -> Pca:
+    """Fit `dim` principal components, in memory that depends on d alone.
+
+    The d x d covariance is summed in float64 over some rows at a time, and its leading eigenvectors
+    computed. Fewer descriptors than d give the same components from their n x n Gram matrix.
+
+    Args:
+        descriptors: n descriptors, as `retrieval.search` takes them, of any length.
+        dim: components that are kept.
+        config: whether to whiten, and whether to normalise.
+        samples: fit at most so many descriptors, drawn at random; None for all.
+        seed: draws them.
+        quiet: no progress bar.
+
+    Returns:
+        The components, which `Pca.apply` shortens descriptors by.
+
+    Raises:
+        InputError: an array that is empty, no matrix, or holds a row that is not finite; fewer
+            than two descriptors or samples; `dim` below 1, or above the rank of what is fitted; a
+            negative seed.
+
+    Example:
+        >>> import numpy as np
+        >>> descriptors = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
+        >>> fit_pca(descriptors, 3).apply(descriptors).shape
+        (50, 3)
+    """
+    if seed < 0:
+        raise InputError(f"seed: found {seed}, expected at least 0")
+    descriptors = as_rows(descriptors, "descriptors")
+    total, length = descriptors.shape
+    count = total if samples is None else min(samples, total)
+    if count < 2:
+        raise InputError(f"descriptors: found {count} to fit to, expected at least 2")
+    if not 1 <= dim <= min(count - 1, length):
+        raise InputError(
+            f"dim: found {dim}, expected 1 to {min(count - 1, length)}, the highest rank that "
+            f"{count} descriptors of length {length} can have about their mean"
+        )
+    places = None if count == total else sample(total, count, seed)
+    chunks = pieces(descriptors, "descriptors", _rows_at_a_time(length), places)
+    with progress_bar("components", count, "rows", quiet=quiet) as bar:
+        if count <= length:
+            fitted = _by_gram(_told(chunks, bar), dim)
+        else:
+            fitted = _by_covariance(_told(chunks, bar), dim)
+    components = fitted.components
+    # Fixes the sign of each component, which otherwise depends on the solver.
+    largest = np.take_along_axis(components, np.abs(components).argmax(axis=1)[:, None], axis=1)
+    components *= np.sign(largest)
+    arrays = {name: np.asarray(array, np.float32) for name, array in fitted._asdict().items()}
+    return Pca(**arrays, config=PcaConfig() if config is None else config)
+
+
+def _rows_at_a_time(length: int) -> int:
+    return max(1, _CHUNK_BYTES // (8 * length))
+
+
+def _told(chunks: Iterator[np.ndarray], bar: Bar) -> Iterator[np.ndarray]:
+    for rows in chunks:
+        yield rows
+        bar.advance(len(rows))
+
+
+class _Found(NamedTuple):
+    """The fields of `Pca`, in float64."""
+
+    mean: Float64[np.ndarray, " d"]
+    components: Float64[np.ndarray, "dim d"]
+    variances: Float64[np.ndarray, " dim"]
+    total: float
+
+
+def _by_gram(chunks: Iterator[Float32[np.ndarray, "rows d"]], dim: int) -> _Found:
+    """Fit descriptors that are fewer than their length, by their Gram matrix."""
+    rows = np.concatenate(list(chunks))
+    count, length = rows.shape
+    mean = rows.mean(axis=0, dtype=np.float64)
+    centred = rows - mean
+    gram = centred @ centred.T / (count - 1)
+    total = np.trace(gram)
+    variances, vectors = _leading(gram, dim, count, length)
+    components = vectors @ centred
+    components /= np.linalg.norm(components, axis=1, keepdims=True)
+    return _Found(mean, components, variances, total)
+
+
+def _by_covariance(chunks: Iterator[Float32[np.ndarray, "rows d"]], dim: int) -> _Found:
+    """Fit any number of descriptors, by their covariance matrix."""
+    first = next(chunks)
+    # Centred at the first rows' mean: with a mean far from zero the sums would lose digits.
+    origin = first.mean(axis=0, dtype=np.float64)
+    length = len(origin)
+    count, total, products = 0, np.zeros(length), np.zeros((length, length))
+    for rows in itertools.chain([first], chunks):
+        centred = rows - origin
+        count += len(rows)
+        total += centred.sum(axis=0)
+        products += centred.T @ centred
+    offset = total / count
+    products -= count * np.outer(offset, offset)
+    products /= count - 1
+    total = np.trace(products)
+    variances, components = _leading(products, dim, count, length)
+    return _Found(origin + offset, components, variances, total)
+
+
+def _leading(
+    matrix: Float64[np.ndarray, "m m"], dim: int, count: int, length: int
+) -> tuple[Float64[np.ndarray, " dim"], Float64[np.ndarray, "dim m"]]:
+    """Return the `dim` largest eigenvalues and their vectors, largest first."""
+    import scipy.linalg  # takes a tenth of a second, which applying components does not need
+
+    size = len(matrix)
+    values, vectors = scipy.linalg.eigh(
+        matrix, subset_by_index=(size - dim, size - 1), overwrite_a=True, check_finite=False
+    )
+    values, vectors = values[::-1], vectors[:, ::-1].T.copy()
+    rank = int((values > values[0] * max(count, length) * np.finfo(np.float64).eps).sum())
+    if rank < dim or values[0] <= 0:
+        raise InputError(
+            f"dim: found {dim}, expected at most {rank if values[0] > 0 else 0}, the rank of these "
+            f"{count} descriptors of length {length} about their mean"
+        )
+    return values, vectors
+
+
+def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
+    """Write the components as safetensors, their configuration in the metadata.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    arrays = {name: np.array(getattr(pca, name), order="C") for name in _ARRAYS}
+    write_safetensors(path, arrays, {FORMAT: json.dumps(to_plain(pca.config))})
+
+
+def load_pca(path: str | os.PathLike[str]) -> Pca:
+    """Read components that `save_pca` wrote.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The components.
+
+    Raises:
+        InputError: the file is missing, cut short or no such file, or its arrays do not fit each
+            other.
+
+    Example:
+        >>> import numpy as np
+        >>> from crisalad_jax.retrieval.pca import save_pca
+        >>> descriptors = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
+        >>> save_pca(folder / "pca.safetensors", fit_pca(descriptors, 3))
+        >>> load_pca(folder / "pca.safetensors").apply(descriptors).shape
+        (50, 3)
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a .safetensors file of principal components")
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            names = set(file.keys())
+            if FORMAT not in metadata or names != set(_ARRAYS):
+                raise InputError(
+                    f"{path}: found arrays {sorted(names)[:3]} and metadata {sorted(metadata)}, "
+                    f"expected {FORMAT!r}, as `crisalad pca` writes it"
+                )
+            arrays = {name: file.get_tensor(name) for name in _ARRAYS}
+            plain = json.loads(metadata[FORMAT])
+    except (safetensors.SafetensorError, OSError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: not a whole file of principal components: {error}") from error
+    shape = arrays["components"].shape
+    dim, length = shape if len(shape) == 2 else (0, 0)
+    shapes = [array.shape for array in arrays.values()]
+    if shapes != [(length,), (dim, length), (dim,), ()] or 0 in (dim, length):
+        raise InputError(
+            f"{path}: found {', '.join(_ARRAYS)} of shapes {shapes}, expected (d,), (dim, d), "
+            "(dim,), ()"
+        )
+    if not all(array.dtype == np.float32 and np.isfinite(array).all() for array in arrays.values()):
+        raise InputError(f"{path}: found numbers that are not finite, or not of float32")
+    if arrays["variances"].min() <= 0 or arrays["total"] <= 0:
+        raise InputError(f"{path}: found variances of zero or below, expected positive ones")
+    return Pca(**arrays, config=from_plain(PcaConfig, plain, source=str(path)))

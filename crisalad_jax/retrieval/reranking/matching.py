@@ -1,0 +1,70 @@
+"""Patches of two images that are each other's nearest, and whether they lie alike."""
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+INLIER_DISTANCE = 1.5
+"""Largest distance of an inlier from where the homography maps it, in patches (public codes)."""
+_LEAST_MATCHES = 4
+"""Number of matches that a homography needs."""
+
+
+def mutual_matches(query: Float[Array, "m d"], candidate: Float[Array, "n d"]) -> Int[Array, " m"]:
+    """Match patches that are each other's nearest: for each of the query's, the candidate's.
+
+    The nearest patch has the largest inner product; of equal ones it is the first. The result is
+    -1 where there is no match. Patches of zeros match nothing.
+    """
+    query, candidate = query.astype(jnp.float32), candidate.astype(jnp.float32)
+    products = jnp.matmul(query, candidate.T, precision=jax.lax.Precision.HIGHEST)
+    ours, theirs = jnp.any(query != 0, axis=1), jnp.any(candidate != 0, axis=1)
+    products = jnp.where(ours[:, None] & theirs, products, -jnp.inf)
+    forward, backward = products.argmax(axis=1), products.argmax(axis=0)
+    mutual = backward[forward] == jnp.arange(len(query))
+    return jnp.where(mutual & ours & theirs[forward], forward, -1)
+
+
+def spatial_score(matches: Int[Array, " m"], grid: tuple[int, int]) -> Float[Array, ""]:
+    """Compute Patch-NetVLAD's rapid spatial score (Hausler et al., CVPR 2021, section 3.4).
+
+    A match's displacement on the grid, minus the mean displacement, is subtracted from the largest
+    possible one. The squares are summed over matches, rows and columns, and divided by the number
+    of patches. A displacement beyond the largest adds nothing; the printed formula would add its
+    square again.
+
+    Args:
+        matches: from `mutual_matches`, of patches in row order.
+        grid: rows and columns of patches, the same of both images.
+    """
+    here = _places(jnp.arange(len(matches)), grid)
+    moved = (_places(matches, grid) - here).astype(jnp.float32)
+    matched = (matches >= 0)[:, None]
+    mean = jnp.where(matched, moved, 0).sum(axis=0) / jnp.maximum(matched.sum(), 1)
+    largest = jnp.asarray([side - 1 for side in grid], jnp.float32)
+    near = jnp.maximum(largest - jnp.abs(moved - mean), 0)
+    return jnp.where(matched, near**2, 0).sum() / len(matches)
+
+
+def _places(patches: Int[Array, " m"], grid: tuple[int, int]) -> Int[Array, "m 2"]:
+    return jnp.stack([patches // grid[1], patches % grid[1]], axis=1)
+
+
+def inliers(matches: Int[np.ndarray, " m"], grid: tuple[int, int]) -> int:
+    """Count the matches that one homography explains, found by RANSAC from a fixed seed.
+
+    The arguments are those of `spatial_score`. Fewer than four matches are explained by none.
+    """
+    query = np.flatnonzero(matches >= 0)
+    if len(query) < _LEAST_MATCHES:
+        return 0
+    there = matches[query]
+    before, after = (
+        np.stack([patches % grid[1], patches // grid[1]], axis=1).astype(np.float32)
+        for patches in (query, there)
+    )
+    cv2.setRNGSeed(0)
+    _, mask = cv2.findHomography(before, after, cv2.RANSAC, INLIER_DISTANCE)
+    return 0 if mask is None else int(np.count_nonzero(mask))

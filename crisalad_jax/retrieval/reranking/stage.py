@@ -1,0 +1,292 @@
+"""The second stage: local features of the retrieved images, computed once, and the new order."""
+
+import dataclasses
+import math
+import pathlib
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.data.loader import ImageCache, image_batches
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.reranking import patch_netvlad, transvpr
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.devices import devices_for
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.progress import progress_bar
+
+_METHODS: Mapping[str, tuple[str, ModuleType]] = {
+    "patch-netvlad": ("netvlad", patch_netvlad),
+    "transvpr": ("transvpr", transvpr),
+}
+"""The aggregator that each method needs, and its module with `shape`, `describe` and `score`."""
+_AT_ONCE = 16
+"""Largest number of candidates of a query that are scored together."""
+_NUMBERS = 2**25
+"""Largest size of the features that are scored together, in numbers: 64 MiB."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reranking:
+    """Which retrievals are re-ranked, by which method, with which model."""
+
+    name: str
+    """patch-netvlad, by a model with NetVLAD; or transvpr, by one with TransVPR."""
+    top: int
+    """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
+    params: Crisalad | None = None
+    """Parameters of the model that makes local features; None uses the first stage's model."""
+    config: ModelConfig | None = None
+    """Configuration of that model."""
+
+    def __post_init__(self) -> None:
+        """Check the name and the number."""
+        choose("rerank", self.name, _METHODS)
+        if self.top < 2:
+            raise InputError(
+                f"rerank: found {self.label}, expected at least 2 retrievals to put in order"
+            )
+        if (self.params is None) != (self.config is None):
+            raise InputError("rerank: found params or config alone, expected both or neither")
+
+    @property
+    def label(self) -> str:
+        """Name and number in the form that `parse_reranking` reads."""
+        return f"{self.name}:{self.top}"
+
+    def over(self, params: Crisalad, config: ModelConfig) -> "Reranking":
+        """Return this re-ranking, with the first stage's model if it has none of its own."""
+        if self.params is not None:
+            return self
+        return dataclasses.replace(self, params=params, config=config)
+
+    def check(self, config: ModelConfig, database: int | None = None) -> None:
+        """Check that this re-ranking fits a first stage of `config`.
+
+        Raises:
+            InputError: the model that makes local features has another aggregator, or its images
+                too few patches; more retrievals than the database has images, if that is given.
+        """
+        aggregator, method = _METHODS[self.name]
+        own = self.config or config
+        if own.aggregator.part_name != aggregator:
+            raise InputError(
+                f"rerank: found a model with aggregator {own.aggregator.part_name}, expected "
+                f"{aggregator}, whose local features {self.name} compares (--rerank-weights takes "
+                "another model than the first stage's)"
+            )
+        method.shape(own)
+        if database is not None and self.top > database:
+            raise InputError(
+                f"rerank: found {self.label} over a database of {database} images, expected at "
+                f"most {database}"
+            )
+
+
+def parse_reranking(text: str) -> Reranking:
+    """Read NAME:TOPK, as in patch-netvlad:100.
+
+    Raises:
+        InputError: the form, the name or the number is wrong.
+    """
+    name, colon, top = text.partition(":")
+    if not colon or not top.isascii() or not top.isdecimal() or len(top) > 9:
+        raise InputError(
+            f"rerank: found {text!r}, expected NAME:TOPK, as in patch-netvlad:100, with one of "
+            f"{', '.join(sorted(_METHODS))}"
+        )
+    return Reranking(name, int(top))
+
+
+def rerank(
+    reranking: Reranking,
+    neighbours: Neighbours,
+    database: Sequence[pathlib.Path],
+    queries: Sequence[pathlib.Path],
+    *,
+    batch_size: int = 16,
+    cache: ImageCache | None = None,
+    quiet: bool = False,
+) -> Neighbours:
+    """Re-rank the neighbours of one first stage; see `Reranker`.
+
+    Raises:
+        InputError: what `Reranker` raises.
+    """
+    with Reranker(
+        reranking, database, queries, batch_size=batch_size, cache=cache, quiet=quiet
+    ) as stage:
+        return stage(neighbours)
+
+
+class Reranker:
+    """Puts the neighbours of any number of first stages over the same images in a new order.
+
+    Local features of the queries and of the retrieved database images are computed once, by
+    `batch_size`. Temporary files hold them in float16, and the system caches these in memory as far
+    as there is room; scores of pairs stay in memory. The device scores up to 16 candidates of a
+    query at a time, in one compiled program.
+    """
+
+    def __init__(
+        self,
+        reranking: Reranking,
+        database: Sequence[pathlib.Path],
+        queries: Sequence[pathlib.Path],
+        *,
+        batch_size: int = 16,
+        cache: ImageCache | None = None,
+        quiet: bool = False,
+    ) -> None:
+        """Prepare the second stage; enter it as a context before use.
+
+        Raises:
+            InputError: no model, or what `Reranking.check` raises.
+        """
+        if reranking.params is None or reranking.config is None:
+            raise InputError("rerank: found no model, expected one, or `over` the first stage's")
+        reranking.check(reranking.config, len(database))
+        self._top, self._config = reranking.top, reranking.config
+        _, self._method = _METHODS[reranking.name]
+        self._label, self._quiet = reranking.name, quiet
+        self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
+        self._scores: dict[tuple[int, int], float] = {}
+
+        def describe(images: Any) -> Any:
+            return self._method.describe(shared, devices.shard_batch(images), self._config)
+
+        def side(name: str, paths: Sequence[pathlib.Path]) -> _Features:
+            return _Features(
+                paths,
+                describe,
+                self._method.shape(self._config),
+                pathlib.Path(self._folder.name) / name,
+                self._config.image_size,
+                batch_size,
+                cache,
+            )
+
+        devices = devices_for(batch_size)
+        shared = devices.replicate(reranking.params)
+        self._database, self._queries = side("database", database), side("queries", queries)
+
+    def __enter__(self) -> Self:
+        """Return the second stage itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the temporary files."""
+        self._database.close()
+        self._queries.close()
+        self._folder.cleanup()
+
+    def __call__(self, neighbours: Neighbours) -> Neighbours:
+        """Sort each query's first `top` neighbours by falling score.
+
+        Equal scores keep the first stage's order, and so do the neighbours after the first `top`.
+        Scores replace the similarities of the neighbours that are re-ranked.
+
+        Raises:
+            InputError: neighbours of fewer columns than `top`, or of other queries; an image
+                cannot be read; the disk has no room for the features.
+        """
+        indices, similarities = (np.array(part) for part in neighbours)
+        top = self._top
+        if indices.shape[0] != len(self._queries.paths) or indices.shape[1] < top:
+            raise InputError(
+                f"rerank: found {indices.shape[1]} neighbours of {indices.shape[0]} queries, "
+                f"expected at least {top} of {len(self._queries.paths)}"
+            )
+        first = indices[:, :top]
+        for side, wanted, name in (
+            (self._queries, np.arange(len(indices)), "queries"),
+            (self._database, np.unique(first), "candidates"),
+        ):
+            side.ensure(wanted, f"{self._label}, {name}", quiet=self._quiet)
+        pairs = len(first) * top
+        with progress_bar(f"{self._label}, pairs", pairs, "pairs", quiet=self._quiet) as bar:
+            for query, candidates in enumerate(first):
+                scores = self._score(query, candidates)
+                order = np.argsort(-scores, kind="stable")
+                indices[query, :top] = candidates[order]
+                similarities[query, :top] = scores[order]
+                bar.advance(top)
+        return Neighbours(indices, similarities)
+
+    def _score(
+        self, query: int, candidates: Int[np.ndarray, " candidate"]
+    ) -> Float[np.ndarray, " candidate"]:
+        """Score all candidates of one query; scores of earlier calls are reused."""
+        new = np.array([c for c in candidates if (query, int(c)) not in self._scores], int)
+        patches, dim = self._queries.features.shape[1:]
+        step = max(1, min(_AT_ONCE, self._top, _NUMBERS // (patches * dim)))
+        for start in range(0, len(new), step):
+            part = new[start : start + step]
+            # The last part is padded, so that all have one shape and compile once.
+            filled = np.resize(part, step)
+            values = self._method.score(
+                self._queries.features[query], self._database.features[filled], self._config
+            )
+            self._scores |= {
+                (query, int(c)): float(s) for c, s in zip(part, values[: len(part)], strict=True)
+            }
+        return np.array([self._scores[query, int(c)] for c in candidates], np.float32)
+
+
+class _Features:
+    """Local features of a side's images in a sparse file, computed when first asked for."""
+
+    def __init__(
+        self,
+        paths: Sequence[pathlib.Path],
+        describe: Callable[[Any], Any],
+        shape: tuple[int, int],
+        file: pathlib.Path,
+        image_size: tuple[int, int],
+        batch_size: int,
+        cache: ImageCache | None,
+    ) -> None:
+        self.paths, self._describe, self._file = paths, describe, file
+        self._image_size, self._batch_size, self._cache = image_size, batch_size, cache
+        self.features = np.memmap(file, np.float16, "w+", shape=(len(paths), *shape))
+        self._known: Bool[np.ndarray, " image"] = np.zeros(len(paths), bool)
+
+    def ensure(self, images: Int[np.ndarray, " image"], label: str, *, quiet: bool) -> None:
+        """Compute the features of those images that have none yet.
+
+        Raises:
+            InputError: an image cannot be read, or the disk has no room.
+        """
+        missing = images[~self._known[images]]
+        if not len(missing):
+            return
+        needed = len(missing) * math.prod(self.features.shape[1:]) * self.features.itemsize
+        free = shutil.disk_usage(self._file.parent).free
+        if needed > free:
+            raise InputError(
+                f"{self._file.parent}: found {free / 2**30:.1f} GiB free, expected "
+                f"{needed / 2**30:.1f} GiB for the local features of {len(missing)} images"
+            )
+        batches = image_batches(
+            [self.paths[i] for i in missing],
+            image_size=self._image_size,
+            batch_size=self._batch_size,
+            cache=self._cache,
+        )
+        with progress_bar(label, len(missing), "images", quiet=quiet) as bar:
+            for batch in batches:
+                rows = missing[batch.indices[batch.valid]]
+                self.features[rows] = np.asarray(self._describe(batch.images))[batch.valid]
+                self._known[rows] = True
+                bar.advance(len(rows))
+
+    def close(self) -> None:
+        """Release the file; some systems cannot remove it before."""
+        del self.features

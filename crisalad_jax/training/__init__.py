@@ -1,0 +1,1 @@
+"""Training: the compiled step, the optimiser, what is frozen, the loop and its files."""

@@ -1,0 +1,67 @@
+"""Parameters of a loss, for each group of classes: they train beside the model."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Int, PRNGKeyArray, PyTree
+
+from crisalad_jax.losses import Loss
+
+
+class Classifiers(NamedTuple):
+    """Parameters of all groups, padded to the largest, so that one program trains each."""
+
+    weights: PyTree
+    """Leaves have a leading axis of groups. Rows of padding, beyond a group's classes, stay."""
+    optimiser: PyTree
+    """Adam's state for each group: a group keeps its moments while others train."""
+
+
+def init_classifiers(
+    key: PRNGKeyArray, loss: Loss, classes: tuple[int, ...], dim: int
+) -> Classifiers | None:
+    """Initialise a loss's parameters for each group; None where it has none.
+
+    Args:
+        key: draws them.
+        loss: whose parameters they are.
+        classes: number of classes of each group; (0,) where there are no classes.
+        dim: width of a descriptor.
+    """
+    keys = jax.random.split(key, len(classes))
+    groups = [loss.init(each, count, dim) for each, count in zip(keys, classes, strict=True)]
+    if not jax.tree.leaves(groups):
+        return None
+    largest = max(classes)
+
+    def together(*leaves: Array) -> Array:
+        # Leaves with a row for each class are padded with zeros.
+        return jnp.stack(
+            [_filled(leaf, n, largest) for leaf, n in zip(leaves, classes, strict=True)]
+        )
+
+    weights = jax.tree.map(together, *groups)
+    return Classifiers(weights, jax.vmap(adam(loss.learning_rate).init)(weights))
+
+
+def _filled(leaf: Array, count: int, largest: int) -> Array:
+    if leaf.ndim == 0 or leaf.shape[0] != count:
+        return leaf
+    return jnp.pad(leaf, [(0, largest - count), *[(0, 0)] * (leaf.ndim - 1)])
+
+
+def adam(learning_rate: float) -> optax.GradientTransformation:
+    """Make torch's Adam with its defaults (Kingma and Ba 2015)."""
+    return optax.adam(learning_rate)
+
+
+def update_classifiers(
+    classifiers: Classifiers, group: Int[Array, ""], gradient: PyTree, learning_rate: float
+) -> Classifiers:
+    """Take a step of one group's optimiser; the others stay as they are."""
+    mine = jax.tree.map(lambda leaf: leaf[group], classifiers)
+    updates, optimiser = adam(learning_rate).update(gradient, mine.optimiser)
+    stepped = Classifiers(optax.apply_updates(mine.weights, updates), optimiser)
+    return jax.tree.map(lambda all_, new: all_.at[group].set(new), classifiers, stepped)

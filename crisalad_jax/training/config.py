@@ -1,0 +1,151 @@
+"""Configuration of a training run."""
+
+import dataclasses
+import re
+from typing import Literal
+
+from crisalad_jax.config.checks import require, require_choice, require_fraction, require_positive
+from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.nn.config import ModelConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimiserConfig:
+    """AdamW or Adam with an optional warm-up and a learning rate that falls.
+
+    Example:
+        >>> OptimiserConfig(learning_rate=1e-3, warmup_steps=100).kind
+        'adamw'
+    """
+
+    kind: Literal["adamw", "adam"] = "adamw"
+    """In Adam the weight decay is part of the gradient."""
+    learning_rate: float = 6e-5
+    schedule: Literal["linear", "step"] = "linear"
+    """Linear decay step by step, or one step down every few epochs."""
+    end_lr_fraction: float = 0.0
+    """Share of the learning rate that is left at the end of a linear decay."""
+    decay_steps: int | None = None
+    """Length of a linear decay, after which the learning rate stays; None is the whole run."""
+    step_epochs: int = 3
+    """Epochs from one step down to the next (CricaVPR's)."""
+    step_gamma: float = 0.5
+    """What a step down multiplies the learning rate by (CricaVPR's)."""
+    warmup_steps: int = 0
+    weight_decay: float = 0.01
+    """Torch's default for AdamW; the paper names none."""
+    b1: float = 0.9
+    b2: float = 0.999
+    clip_norm: float | None = None
+    """Largest norm of the whole gradient."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges of the fields."""
+        require_choice(self, "kind", "schedule")
+        require_positive(self, "learning_rate", "step_epochs", "step_gamma")
+        if self.decay_steps is not None:
+            require(
+                self.decay_steps > 0,
+                f"OptimiserConfig.decay_steps: found {self.decay_steps}, expected more than 0, or "
+                "None",
+            )
+        for name in ("end_lr_fraction", "warmup_steps", "weight_decay"):
+            value = getattr(self, name)
+            require(value >= 0, f"OptimiserConfig.{name}: found {value}, expected at least 0")
+        require_fraction(self, "b1", "b2")
+        if self.clip_norm is not None:
+            require_positive(self, "clip_norm")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A whole training run, apart from where its files lie.
+
+    Example:
+        >>> from crisalad_jax import PRESETS
+        >>> TrainConfig(model=PRESETS["tiny"], trainable="all", epochs=2).images_per_place
+        4
+    """
+
+    model: ModelConfig = ModelConfig()
+    loss: LossConfig = LossConfig()
+    optimiser: OptimiserConfig = OptimiserConfig()
+    trainable: str = "adapters+head"
+    """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), head, or all."""
+    augmentation: OrName[Augmentation] = part_field(AUGMENTATIONS, "rand-augment")
+    """How training images are changed; a registered augmentation, or its name."""
+    places_per_batch: int = 48
+    """Number of places in a batch; where the loss classifies, of classes."""
+    images_per_place: int = 4
+    micro_batch: int | None = None
+    """So many images' activations are in memory at a time: a step takes less of it and a forward
+    pass longer, and is the same. None is the whole batch."""
+    min_images: int = 4
+    """Places, or classes, with fewer images are left out."""
+    batch_order: Literal["within-city", "shuffled"] = "within-city"
+    """A batch of one city's places (hard negatives; the public loaders) or of all cities'."""
+    cities: tuple[str, ...] | None = None
+    """Which cities; None takes all."""
+    epochs: int = 8
+    """The paper converged within five, and stopped after three without gain."""
+    validate_every: int = 1
+    """Epochs from one validation to the next."""
+    patience: int | None = 3
+    """Validations without a better Recall@5 after which training stops; None never stops early."""
+    keep_best: int = 1
+    """So many validations' weights are kept, those of the best Recall@5."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the ranges of the fields."""
+        resolve_names(self)
+        require_choice(self, "batch_order")
+        require_positive(
+            self, "places_per_batch", "images_per_place", "epochs", "validate_every", "keep_best"
+        )
+        require(
+            self.images_per_place >= 2 or self.loss.kind.grouping is not None,
+            f"TrainConfig.images_per_place: found {self.images_per_place}, expected at least 2: "
+            "the loss needs pairs of one place",
+        )
+        batch = self.places_per_batch * self.images_per_place
+        require(
+            self.micro_batch is None or (self.micro_batch > 0 and batch % self.micro_batch == 0),
+            f"TrainConfig.micro_batch: found {self.micro_batch}, expected a divisor of the batch's "
+            f"{batch} images, or None",
+        )
+        require(
+            self.min_images >= self.images_per_place,
+            f"TrainConfig.min_images: found {self.min_images}, expected at least images_per_place "
+            f"({self.images_per_place})",
+        )
+        require(
+            re.fullmatch(r"head|adapters\+head|last-\d+-blocks\+head|all", self.trainable)
+            is not None,
+            f"TrainConfig.trainable: found {self.trainable!r}, expected head, adapters+head, "
+            "last-N-blocks+head or all",
+        )
+        require(
+            self.trainable != "adapters+head" or has_adapters(self.model),
+            "TrainConfig.trainable: found adapters+head for a model without adapters, expected "
+            "head, last-N-blocks+head or all",
+        )
+        require(
+            self.patience is None or self.patience > 0,
+            f"TrainConfig.patience: found {self.patience}, expected more than 0, or None",
+        )
+        require(self.seed >= 0, f"TrainConfig.seed: found {self.seed}, expected at least 0")
+
+    @property
+    def min_images_of_place(self) -> int:
+        """Smallest number of images of a place; 1 where images are regrouped to classes."""
+        grouping = self.loss.kind.grouping
+        return 1 if grouping is not None and grouping.kind != "places" else self.min_images
+
+
+def has_adapters(model: ModelConfig) -> bool:
+    """Return whether a model's backbone has adapters."""
+    adapter = getattr(model.backbone, "adapter", None)
+    return adapter is not None and adapter.kind != "none"

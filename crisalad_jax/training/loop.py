@@ -1,0 +1,175 @@
+"""The training loop: epochs, validation, early stop, and the files of a run (paper section 4.2)."""
+
+import contextlib
+import os
+import pathlib
+from collections.abc import Callable, Generator
+from typing import NamedTuple
+
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.places import Places
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.run import Batch, Run
+from crisalad_jax.utils import distributed
+from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.progress import Bar, progress_bar
+from crisalad_jax.utils.signals import SignalState, defer_signals
+
+
+class FitResult(NamedTuple):
+    """Result of a run."""
+
+    params: Crisalad
+    """Parameters after the last step."""
+    steps: int
+    best_recall: float | None
+    """Best Recall@5 of a validation, as a fraction; None without validation."""
+    stopped_early: bool
+    skipped_images: int
+    """Number of unreadable images that were masked out, counted each time they came up."""
+
+
+def fit(
+    config: TrainConfig,
+    places: Places,
+    out: str | os.PathLike[str],
+    *,
+    validation: Benchmark | None = None,
+    initial: Crisalad | None = None,
+    on_bad_image: OnBadImage = "stop",
+    num_workers: int = 0,
+    shard_state: bool = False,
+    quiet: bool = False,
+) -> FitResult:
+    """Train, or resume the run that `out` holds, and leave its files there.
+
+    The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
+    same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
+    and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best
+    Recall@5 (grouping `single`), and the best `config.keep_best` weights in `best/`.
+
+    A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one.
+
+    Args:
+        config: everything but the files.
+        places: training images.
+        out: folder of the run.
+        validation: evaluated every `config.validate_every` epochs, for early stopping.
+        initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
+        on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
+        num_workers: processes that read the training images; 0 reads them by threads of this one.
+        shard_state: keep what trains and its moments in shards, one a device, not whole on each.
+        quiet: no progress bar.
+
+    Returns:
+        How the run ended.
+
+    Raises:
+        InputError: nothing of the model trains; an argument is out of range; the validation has no
+            ground truth; `out` holds something else, or a run of another configuration or start; an
+            image cannot be read; there are too few places, classes or images; the loss is no longer
+            finite (the state before that step is saved); or a file cannot be written.
+        Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
+
+    Example:
+        >>> import dataclasses
+        >>> from crisalad_jax import read_places, recipe
+        >>> config = dataclasses.replace(recipe("tiny"), epochs=1, places_per_batch=4)
+        >>> fit(config, read_places(places, min_images=3), folder / "run", quiet=True).steps
+        2
+    """
+    check_learns(config)
+    if num_workers < 0:
+        raise InputError(f"num_workers: found {num_workers}, expected at least 0")
+    if validation is not None:
+        # A missing ground truth raises now, not after the first epoch.
+        validation.ground_truth()
+    run = Run(config, places, pathlib.Path(out), initial, validation, shard_state=shard_state)
+    with contextlib.closing(run):
+        _train(run, lambda: run.rest_of_epoch(on_bad_image, num_workers), quiet)
+        distributed.raise_together(run.save)
+    record = run.record
+    best = record.best[0][0] if record.best else None
+    return FitResult(run.params(), run.step, best, record.stopped_early, record.skipped_images)
+
+
+def check_learns(config: TrainConfig) -> None:
+    """Check that a model trains; AnyLoc's does not, whose vocabulary fits one backbone.
+
+    Raises:
+        InputError: nothing of the model trains.
+    """
+    if not config.model.aggregator.learns:
+        raise InputError(
+            f"aggregator: found {config.model.aggregator.part_name}, with which nothing trains, "
+            "expected another; `crisalad vocabulary` makes its models"
+        )
+
+
+_Epoch = Callable[[], Generator[Batch, None, None]]
+
+
+def _train(run: Run, rest_of_epoch: _Epoch, quiet: bool) -> None:
+    silent = quiet or not distributed.is_primary()
+    bar = progress_bar("training", run.steps, "steps", quiet=silent, done=run.step)
+    with defer_signals() as signals, bar as bar:
+        if run.classes:
+            bar.say(
+                f"classes in {len(run.classes)} groups: {min(run.classes)} to {max(run.classes)}"
+            )
+        try:
+            try:
+                while not run.is_done():
+                    if run.validation_is_due():
+                        bar.say(run.validate(signals))
+                        distributed.raise_together(run.save)
+                    _train_epoch(run, rest_of_epoch, signals, bar)
+            except InputError:
+                # A signal to the process group also ends the workers that read images.
+                (number,) = distributed.all_max(signals.number)
+                if number:
+                    raise Stopped(number) from None
+                raise
+        except Stopped as stopped:
+            run.save()
+            where = f"after step {run.step}; the same command goes on"
+            raise Stopped(stopped.number, where) from None
+
+
+def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar) -> None:
+    """Take the steps of an epoch; the processes agree once before each step."""
+    error: Exception | None = None
+
+    def finish() -> None:
+        note = distributed.raise_together(run.finish_step)
+        if note is not None:
+            bar.advance(1, note=note)
+
+    with contextlib.closing(rest_of_epoch()) as batches:
+        while True:
+            batch = None
+            try:
+                batch = None if error is not None else run.next_batch(batches)
+            except Exception as raised:
+                error = raised
+            has_failed, has_ended, number, save_is_due = distributed.all_max(
+                error is not None, batch is None, signals.number, run.save_is_due()
+            )
+            if has_failed:
+                raise error or InputError(distributed.ANOTHER_FAILED)
+            if number or save_is_due or has_ended:
+                finish()
+            if number:
+                raise Stopped(number)
+            if save_is_due:
+                distributed.raise_together(run.save)
+            if batch is None:
+                break
+            try:
+                note = run.take_step(batch)
+            except Exception as raised:  # told to the others before the next step
+                error, note = raised, None
+            if note is not None:
+                bar.advance(1, note=note)

@@ -1,0 +1,56 @@
+"""The optimiser and its learning rate, equal to torch's."""
+
+import jax.numpy as jnp
+import optax
+
+from crisalad_jax.training.config import OptimiserConfig
+
+
+def learning_rate_schedule(
+    config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
+) -> optax.Schedule:
+    """Make a linear warm-up, followed by the decay that `config.schedule` names.
+
+    Linear decay reaches `end_lr_fraction` after `config.decay_steps`, or after the last of `steps`.
+    Step decay multiplies by `step_gamma` every `step_epochs`, counted from the end of the warm-up.
+    """
+    peak, end = config.learning_rate, config.learning_rate * config.end_lr_fraction
+    if config.schedule == "linear":
+        length = config.decay_steps or max(steps - config.warmup_steps, 1)
+        decay = optax.linear_schedule(peak, end, length)
+    else:
+        decay = optax.exponential_decay(
+            peak, config.step_epochs * steps_per_epoch, config.step_gamma, staircase=True
+        )
+    if not config.warmup_steps:
+        return _of_real_steps(decay)
+    # A warm-up of n steps starts at 1 / n of the peak: its first step would otherwise be 0.
+    warmup = optax.linear_schedule(
+        peak / config.warmup_steps, peak, max(config.warmup_steps - 1, 1)
+    )
+    return _of_real_steps(optax.join_schedules([warmup, decay], [config.warmup_steps]))
+
+
+def _of_real_steps(schedule: optax.Schedule) -> optax.Schedule:
+    # Optax divides its int32 count in float32, also in JAX's 64-bit mode: the count is cast here.
+    return lambda count: schedule(jnp.asarray(count, float))
+
+
+def make_optimiser(
+    config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
+) -> optax.GradientTransformation:
+    """Make torch's AdamW (Loshchilov and Hutter 2019) or Adam (Kingma and Ba 2015).
+
+    Both decay every parameter: AdamW the parameter itself, Adam through its gradient. With
+    `config.clip_norm` the gradient is clipped first.
+    """
+    schedule = learning_rate_schedule(config, steps, steps_per_epoch)
+    b1, b2 = config.b1, config.b2
+    if config.kind == "adamw":
+        optimiser = optax.adamw(schedule, b1, b2, weight_decay=config.weight_decay)
+    else:
+        decay = optax.add_decayed_weights(config.weight_decay)
+        optimiser = optax.chain(decay, optax.adam(schedule, b1, b2))
+    if config.clip_norm is None:
+        return optimiser
+    return optax.chain(optax.clip_by_global_norm(config.clip_norm), optimiser)

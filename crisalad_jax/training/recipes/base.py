@@ -1,0 +1,236 @@
+"""Recipes: how a published method is trained, by its name; or CriSALAD with one part swapped."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.config.parts import REGISTRIES, Part
+from crisalad_jax.config.plugins import load_entry_points
+from crisalad_jax.data.augmentations.light import LightAugmentConfig
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.utils.errors import InputError
+
+Make = Callable[[ModelConfig, str], TrainConfig]
+"""Takes the model of a preset and the preset's name; returns the configuration."""
+RECIPES: dict[str, Make] = {}
+"""Recipes by name. Rows of Table 2 that are missing here differ from `crisalad` by one flag."""
+
+
+def register_recipe(name: str) -> Callable[[Make], Make]:
+    """Make a decorator that registers a function as the recipe `name`.
+
+    Args:
+        name: what flags call the recipe.
+
+    Returns:
+        The decorator; the function takes the model of a preset and the preset's name, and returns
+        how to train.
+
+    Raises:
+        InputError: when it decorates: the name is taken by another function.
+
+    Example:
+        >>> @register_recipe("crisalad-two-epochs")
+        ... def two_epochs(model, preset):
+        ...     return TrainConfig(model=model, epochs=2)
+        >>> recipe("tiny", "crisalad-two-epochs").epochs
+        2
+    """
+
+    def decorate(make: Make) -> Make:
+        there = RECIPES.get(name)
+        if there is not None and (there.__module__, there.__qualname__) != (
+            make.__module__,
+            make.__qualname__,
+        ):
+            raise InputError(
+                f"register_recipe {name!r}: found the name taken by {there.__module__}, expected "
+                "another"
+            )
+        RECIPES[name] = make
+        return make
+
+    return decorate
+
+
+def recipe(preset: str, name: str | None = None) -> TrainConfig:
+    """Look up how a model is trained, and which parts it has for that.
+
+    Args:
+        preset: the size of the model (`PRESETS`).
+        name: what to reproduce (`RECIPES`), or a registered part, as NAME or KIND:NAME: CriSALAD's
+            recipe with that part in the place of its own. None is the paper's way, except for
+            `tiny`, which starts from nothing.
+
+    Returns:
+        The configuration of a training run.
+
+    Raises:
+        InputError: no such preset, recipe or part, or one that does not fit the preset.
+
+    Example:
+        >>> recipe("b14").optimiser.learning_rate
+        6e-05
+        >>> recipe("b14", "gem").model.descriptor_dim
+        768
+    """
+    model = choose("preset", preset, PRESETS)
+    name = ("scratch" if preset == "tiny" else "crisalad") if name is None else name
+    if name in RECIPES:
+        return RECIPES[name](model, preset)
+    return with_part(TrainConfig(model=model), find_part(name, preset))
+
+
+def find_part(
+    name: str, preset: str, *, what: str = "recipe", others: Iterable[str] = RECIPES
+) -> Part:
+    """Look up a part that `with_part` can put in place.
+
+    Args:
+        name: the part's name, or KIND:NAME where several kinds have one of it.
+        preset: the size of the model, which the part comes in.
+        what: what messages call the name.
+        others: names that could have been given in the place of a part's, for messages.
+
+    Returns:
+        The part.
+
+    Raises:
+        InputError: no such part, or several.
+
+    Example:
+        >>> find_part("step:newton", "b14").part_name
+        'newton'
+    """
+    kind, colon, part = name.rpartition(":")
+    kinds = [kind] if colon else list(_PLACES)
+    for again in (False, True):
+        if again:
+            load_entry_points()
+        matches = [k for k in kinds if k in _PLACES and part in REGISTRIES[k]]
+        if matches:
+            break
+    if not matches:
+        raise InputError(
+            f"{what}: found {name!r}, expected one of {', '.join(sorted(others))}, or a "
+            f"registered part as NAME or KIND:NAME, with a kind of {', '.join(_PLACES)} (is a "
+            "plug-in missing? --plugin FILE.py or MODULE)"
+        )
+    if len(matches) > 1:
+        raise InputError(
+            f"{what}: found {name!r}, which is a part of several kinds, expected "
+            f"{' or '.join(f'{k}:{part}' for k in matches)}"
+        )
+    return REGISTRIES[matches[0]].make(part, preset)
+
+
+def with_part(config: TrainConfig, part: Part) -> TrainConfig:
+    """Replace a recipe's part by another of the same kind.
+
+    Raises:
+        InputError: the part does not fit, or the recipe has no place for it.
+    """
+    return _PLACES[part.registry.kind](config, part)
+
+
+def _with_aggregator(config: TrainConfig, part: Any) -> TrainConfig:
+    """Replace CriSALAD's head by another aggregator, and train all else as the paper does.
+
+    The backbone stays frozen, with the same adapters, so that methods differ only in what they make
+    of its features. There is no cross-image encoder: a descriptor depends on its own image alone.
+    """
+    cross_image = dataclasses.replace(config.model.cross_image, layers=0)
+    model = dataclasses.replace(config.model, aggregator=part, cross_image=cross_image)
+    return dataclasses.replace(config, model=model)
+
+
+def _with_backbone(config: TrainConfig, part: Any) -> TrainConfig:
+    model = dataclasses.replace(config.model, backbone=part)
+    trainable = "head" if getattr(part, "adapter", None) is None else config.trainable
+    return dataclasses.replace(config, model=model, trainable=trainable)
+
+
+def _with_loss(config: TrainConfig, part: Any) -> TrainConfig:
+    miner = "none" if part.ranks_all else config.loss.miner
+    loss = dataclasses.replace(config.loss, kind=part, miner=miner)
+    return dataclasses.replace(config, loss=loss)
+
+
+def _in_aggregator(field: str, inside: str | None = None) -> Callable[[TrainConfig, Any], Any]:
+    def put(config: TrainConfig, part: Any) -> TrainConfig:
+        aggregator = config.model.aggregator
+        if not hasattr(aggregator, field):
+            raise InputError(
+                f"recipe: found {part.registry.kind} {part.part_name!r} for aggregator "
+                f"{aggregator.part_name}, expected one that transports, such as salad"
+            )
+        if inside is not None:
+            part = dataclasses.replace(getattr(aggregator, field), **{inside: part})
+        aggregator = dataclasses.replace(aggregator, **{field: part})
+        model = dataclasses.replace(config.model, aggregator=aggregator)
+        return dataclasses.replace(config, model=model)
+
+    return put
+
+
+_PLACES: Mapping[str, Callable[[TrainConfig, Any], TrainConfig]] = {
+    "aggregator": _with_aggregator,
+    "step": _in_aggregator("sinkhorn", "step"),
+    "dustbin": _in_aggregator("dustbin"),
+    "loss": _with_loss,
+    "backbone": _with_backbone,
+    "augmentation": lambda config, part: dataclasses.replace(config, augmentation=part),
+    "gradient": _in_aggregator("sinkhorn", "gradient"),
+}
+"""Functions that put a part in place, by its kind."""
+
+
+def from_scratch(config: TrainConfig) -> TrainConfig:
+    """Make another recipe's model and loss train from random weights, as `scratch` does.
+
+    The recipe's model and kind of loss are kept, for they make its method. The optimiser, the
+    loss's constants, the augmentation and the batches are those of `scratch`, in float32. All of
+    the model trains. A plug-in's augmentation is kept.
+
+    Args:
+        config: the recipe.
+
+    Returns:
+        The configuration of a training run from random weights.
+
+    Example:
+        >>> from_scratch(recipe("tiny", "gem")).trainable
+        'all'
+    """
+    loss = config.loss
+    if isinstance(loss.kind, MultiSimilarityConfig):
+        # base 0.5, because from random weights base 0 drives all similarities to 0 together.
+        loss = dataclasses.replace(loss, kind=MultiSimilarityConfig(base=0.5))
+    built_in = type(config.augmentation).__module__.startswith("crisalad_jax.")
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, compute_dtype="float32"),
+        loss=loss,
+        optimiser=OptimiserConfig(
+            learning_rate=1e-3,
+            end_lr_fraction=0.02,
+            warmup_steps=30,
+            weight_decay=0.05,
+            b2=0.99,
+            clip_norm=1.0,
+        ),
+        trainable="all",
+        augmentation=LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6)
+        if built_in
+        else config.augmentation,
+        places_per_batch=TrainConfig.places_per_batch,
+        images_per_place=2,
+        min_images=2,
+        batch_order="shuffled",
+        epochs=150,
+        validate_every=10,
+        patience=None,
+    )

@@ -1,0 +1,22 @@
+"""CricaVPR, as Lu-Feng/CricaVPR trains it (CVPR 2024)."""
+
+import dataclasses
+
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.config import ModelConfig, with_aggregator
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.recipes.base import register_recipe
+
+
+@register_recipe("cricavpr")
+def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make CricaVPR's recipe: multi-resolution adapters, a GeM pyramid, Adam with step decay."""
+    adapter = AdapterConfig(kind="multi-resolution")
+    backbone = dataclasses.replace(model.backbone, adapter=adapter)
+    return TrainConfig(
+        model=with_aggregator(model, "gem-pyramid", preset, backbone=backbone),
+        optimiser=OptimiserConfig(
+            kind="adam", learning_rate=1e-4, schedule="step", weight_decay=0.0
+        ),
+        places_per_batch=72,
+    )

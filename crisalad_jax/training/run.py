@@ -1,0 +1,412 @@
+"""A run of training: its state in memory, and what happens to it."""
+
+import dataclasses
+import functools
+import json
+import math
+import pathlib
+import time
+import zlib
+from collections.abc import Generator, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
+from crisalad_jax.data.places import Places
+from crisalad_jax.data.read_ahead import one_ahead
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.nn.model import Crisalad, extract_tokens, init_crisalad
+from crisalad_jax.nn.tokens import TransportStatistics
+from crisalad_jax.training.batches import batches_of, groups_of, steps_per_epoch
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.run_files import (
+    RunFiles,
+    RunRecord,
+    checksum,
+    checksum_of_benchmark,
+    checksum_of_places,
+)
+from crisalad_jax.training.step import (
+    Metrics,
+    StepConfig,
+    TrainState,
+    cast_frozen,
+    init_train_state,
+    train_step,
+)
+from crisalad_jax.training.trainable import merge_params, shards_batch
+from crisalad_jax.utils import distributed
+from crisalad_jax.utils.devices import Devices, devices_for
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.signals import SignalState
+
+WATCHED_QUERIES = 16
+"""Number of images whose transport statistics every validation logs."""
+SAVE_SECONDS = 300
+"""Longest time between saved states; validations and the end of a run save too."""
+
+
+class Batch(NamedTuple):
+    """A batch on the devices."""
+
+    images: jax.Array
+    labels: jax.Array
+    valid: jax.Array
+
+
+class _Pending(NamedTuple):
+    """A step that the devices may still be computing."""
+
+    metrics: Metrics
+    images: int
+    waited: float
+    """Seconds of waiting for its images."""
+
+
+class Run:
+    """The state of a run in memory and its files."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        places: Places,
+        out: pathlib.Path,
+        initial: Crisalad | None,
+        validation: Benchmark | None,
+        *,
+        shard_state: bool = False,
+    ) -> None:
+        """Begin a run, or resume the one in `out`; see `fit` for the arguments."""
+        # Arguments that do not fit raise in all processes, before the first file is written.
+        checksums = {
+            "configuration": zlib.crc32(json.dumps(to_plain(config)).encode()),
+            "places": checksum_of_places(places),
+            "validation": 0 if validation is None else checksum_of_benchmark(validation),
+        }
+        for what, number in (checksums | {"--shard-state": int(shard_state)}).items():
+            distributed.check_same(what, number)
+        self._groups = groups_of(config, places)
+        self.steps_per_epoch = steps_per_epoch(config, self._groups)
+        self.config, self.out = config, out
+        self._validation = validation
+        self._devices = _devices(config)
+        if shard_state and self._devices.mesh.size == 1:
+            raise InputError(
+                "shard_state: found one device to keep the state on, expected several; a CPU's do "
+                "not share a step where all trains"
+            )
+        self.steps = self.steps_per_epoch * config.epochs
+        self.classes = (
+            tuple(len(group.place_id) for group in self._groups)
+            if config.loss.kind.grouping is not None
+            else ()
+        )
+        self._cache = ImageCache()
+        self._step_config = StepConfig(
+            config.model,
+            config.loss,
+            config.optimiser,
+            self.steps,
+            self.steps_per_epoch,
+            config.micro_batch,
+            self._devices.mesh if shard_state else None,
+            self.classes,
+        )
+        init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
+        # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.
+        classifiers_key = jax.random.fold_in(jax.random.key(config.seed), 2)
+        params = init_crisalad(init_key, config.model) if initial is None else initial
+        state, frozen = init_train_state(
+            params, config.trainable, self._step_config, key=classifiers_key
+        )
+        self._frozen: PyTree = jax.device_get(frozen)
+        self._frozen_there = self._devices.replicate(cast_frozen(self._frozen, config.model))
+        self.record = RunRecord(
+            weights_checksum=checksum(jax.tree.leaves(params)),
+            places_checksum=checksums["places"],
+            validation_checksum=checksums["validation"],
+        )
+        distributed.check_same("weights", self.record.weights_checksum)
+        self._files: RunFiles | None = None
+        state = self._open_files(state)
+        # Copied, because a step donates the buffers of its state.
+        place = self._devices.shard if shard_state else self._devices.replicate
+        self.state: TrainState = _copied(place(state))
+        self._pending: _Pending | None = None
+        self._all_is_well = self._devices.replicate(np.asarray(True))
+        self._saved_at = self._stepped_at = time.monotonic()
+        self._waited = 0.0
+
+    def _open_files(self, state: TrainState) -> TrainState:
+        """Open the run's files in the primary process; return the saved state, or `state`."""
+
+        def find() -> tuple[int, dict[str, Any]]:
+            nonlocal state
+            files = RunFiles(self.out, self.config)
+            step, record = 0, dataclasses.asdict(self.record)
+            try:
+                saved = files.load(state)
+                if saved is not None:
+                    self._check_start(saved.record)
+                    step, state, record = saved
+                files.go_on(step, RunRecord(**record), is_saved=saved is not None)
+            except BaseException:
+                files.close()
+                raise
+            self._files = files
+            return step, record
+
+        self.step, record = distributed.run_on_primary(find)
+        self.record = RunRecord(**record)
+        return distributed.broadcast(state)
+
+    def _check_start(self, saved: Mapping[str, Any]) -> None:
+        for what in ("weights", "places", "validation"):
+            if saved[f"{what}_checksum"] != getattr(self.record, f"{what}_checksum"):
+                raise InputError(
+                    f"{self.out}: the run started from other {what} than are given now; "
+                    "expected the same, or another folder"
+                )
+
+    def is_done(self) -> bool:
+        """Return whether no step and no validation is left."""
+        trained = self.step == self.steps or self.record.stopped_early
+        return trained and not self.validation_is_due()
+
+    def validation_is_due(self) -> bool:
+        """Return whether the epoch that has just ended still needs its validation."""
+        epoch, step = divmod(self.step, self.steps_per_epoch)
+        asked = epoch % self.config.validate_every == 0 or epoch == self.config.epochs
+        new = step == 0 and self.step > self.record.validated
+        return self._validation is not None and new and asked
+
+    def rest_of_epoch(
+        self, on_bad_image: OnBadImage, num_workers: int
+    ) -> Generator[Batch, None, None]:
+        """Yield the batches from the next step to the end of its epoch; none if the run is done.
+
+        Each is copied to the devices while they compute the one before.
+        """
+        if self.is_done():
+            return
+        epoch, start_step = divmod(self.step, self.steps_per_epoch)
+        batches = batches_of(
+            self.config,
+            self._groups[epoch % len(self._groups)],
+            epoch,
+            steps=self.steps_per_epoch,
+            start_step=start_step,
+            part=(jax.process_index(), jax.process_count()),
+            on_bad_image=on_bad_image,
+            num_workers=num_workers,
+            cache=self._cache,
+        )
+        yield from one_ahead(
+            Batch(*map(self._devices.shard_batch, (batch.images, batch.labels, batch.valid)))
+            for batch in batches
+        )
+
+    def params(self) -> Crisalad:
+        """Gather the whole model as it is now, in float32; all processes call it together."""
+        return self._merged(self._devices.gather(self.state.trainable))
+
+    def _merged(self, trainable: PyTree) -> Crisalad:
+        return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self.config.model)
+
+    def next_batch(self, batches: Iterator[Batch]) -> Batch | None:
+        """Wait for the next batch of an epoch; return None after the last."""
+        begin = time.monotonic()
+        batch = next(batches, None)
+        self._waited = time.monotonic() - begin
+        return batch
+
+    def take_step(self, batch: Batch) -> str | None:
+        """Start a step; then finish the one before while the devices compute.
+
+        Returns:
+            What `finish_step` returns of the step before.
+
+        Raises:
+            InputError: what `finish_step` raises.
+        """
+        before = self._pending
+        proceed = self._all_is_well if before is None else before.metrics.updated
+        self.state, metrics = train_step(
+            self.state, self._frozen_there, *batch, self._step_key, self._step_config, proceed
+        )
+        self._pending = _Pending(metrics, len(batch.images), self._waited)
+        return self._finish(before)
+
+    def finish_step(self) -> str | None:
+        """Wait for the step that was started last, if any, and log it.
+
+        Returns:
+            How it went, in a few words; None where all steps are finished.
+
+        Raises:
+            InputError: no image was readable, or the loss is not finite; the state before that step
+                is saved.
+        """
+        pending, self._pending = self._pending, None
+        return self._finish(pending)
+
+    def _finish(self, pending: _Pending | None) -> str | None:
+        if pending is None:
+            return None
+        metrics, size = _numbers(pending.metrics), pending.images
+        skipped = size - int(metrics.pop("images"))
+        if not metrics.pop("updated"):
+            self._pending = None  # the step after it was skipped as well
+            self._refuse(metrics, size, skipped)
+        now = time.monotonic()
+        seconds, self._stepped_at = now - self._stepped_at, now
+        self.record.skipped_images += skipped
+        self.step += 1
+        if self._files is not None:
+            self._files.log_step(
+                {
+                    "step": self.step,
+                    "epoch": (self.step - 1) // self.steps_per_epoch + 1,
+                    # The shares of a transport plan without mass are NaN, which JSON lacks.
+                    **{name: value for name, value in metrics.items() if math.isfinite(value)},
+                    "images_per_second": round(size / seconds, 2),
+                    "waited_for_images": round(min(pending.waited / seconds, 1), 4),
+                    "skipped_images": skipped,
+                }
+            )
+        note = f"loss {metrics['loss']:.3f}  "
+        if "accuracy" in metrics:
+            note += f"accuracy {metrics['accuracy']:.2f}"
+        else:
+            note += f"easy anchors {metrics['easy_anchor_fraction']:.2f}"
+        note += f"  {size / seconds:.0f} images/s"
+        if self.record.best:
+            note += f"  best R@5 {100 * self.record.best[0][0]:.1f}"
+        return note
+
+    def _refuse(self, metrics: Mapping[str, int | float], size: int, skipped: int) -> None:
+        """Raise the error of a step that was not taken."""
+        if skipped == size:
+            raise InputError(
+                f"training: found none of the {size} images of step {self.step + 1} readable, "
+                "expected at least one"
+            )
+        self.save()
+        numbers = ", ".join(f"{name} {metrics[name]:.4g}" for name in ("loss", "gradient_norm"))
+        raise InputError(
+            f"training: found {numbers} at step {self.step + 1}, expected finite numbers; the "
+            f"state after step {self.step} is kept in {self.out}"
+        )
+
+    def validate(self, signals: SignalState) -> str:
+        """Log the recalls, keep the best weights, and decide on an early stop.
+
+        The primary process evaluates, and the others wait.
+
+        Returns:
+            The recalls in words.
+        """
+        trainable = self._devices.gather(self.state.trainable)
+
+        def validated() -> tuple[str, dict[str, Any]]:
+            words = self._validate(self._merged(trainable), signals)
+            return words, dataclasses.asdict(self.record)
+
+        words, record = distributed.run_on_primary(validated)
+        self.record = RunRecord(**record)
+        self._stepped_at = time.monotonic()
+        return words
+
+    def _validate(self, params: Crisalad, signals: SignalState) -> str:
+        assert self._validation is not None
+        assert self._files is not None
+        record, benchmark = self.record, self._validation
+        with signals.at_once():
+            (result,) = evaluate(
+                params,
+                self.config.model,
+                benchmark,
+                groupings=("single",),
+                cache=self._cache,
+                quiet=True,
+            )
+            watched = self._watch_transport(params, benchmark)
+        epoch = self.step // self.steps_per_epoch
+        recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
+        line = {"step": self.step, "epoch": epoch, **recalls, **watched}
+        self._files.log_step(line, of=benchmark.name)
+        newest, keep = [result.recalls[5], self.step], self.config.keep_best
+        # Of equal recalls the first counts as the best.
+        record.best = sorted([*record.best, newest], key=lambda best: (-best[0], best[1]))[:keep]
+        record.without_gain = 0 if record.best[0] == newest else record.without_gain + 1
+        self._files.keep_if_best(self.step, record, params)
+        patience = self.config.patience
+        record.stopped_early = patience is not None and record.without_gain >= patience
+        record.validated = self.step
+        words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
+        return f"epoch {epoch}, step {self.step}: {words}"
+
+    def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:
+        """Compute statistics of the transport on the first queries, without dropout."""
+        model = self.config.model
+        paths = benchmark.queries[:WATCHED_QUERIES]
+        batches = image_batches(
+            paths, image_size=model.image_size, batch_size=len(paths), cache=self._cache
+        )
+        transport = extract_tokens(params, next(iter(batches)).images, model).transport
+        return {} if transport is None else _numbers(jax.tree.map(jnp.mean, transport))
+
+    def save_is_due(self) -> bool:
+        """Return whether the last saved state is old, by the primary process's clock."""
+        return self._files is not None and time.monotonic() - self._saved_at > SAVE_SECONDS
+
+    def save(self) -> None:
+        """Write the weights and the state to resume from; the state while training goes on.
+
+        Raises:
+            InputError: what `finish_step` raises, or a file cannot be written.
+        """
+        self.finish_step()
+        state = self._devices.gather(self.state)
+        if self._files is not None:
+            params = functools.partial(self._merged, state.trainable)
+            self._files.save(self.step, self.record, state, params)
+        self._saved_at = self._stepped_at = time.monotonic()
+
+    def close(self) -> None:
+        """Wait for files that are being written, and close them."""
+        if self._files is not None:
+            self._files.close()
+
+
+@jax.jit
+def _copied(tree: PyTree) -> PyTree:
+    return jax.tree.map(jnp.copy, tree)
+
+
+def _devices(config: TrainConfig) -> Devices:
+    """Choose the devices of a step: all that share its images, or one for each process."""
+    spread = shards_batch(config.trainable)
+    images = config.places_per_batch * config.images_per_place
+    if images % jax.process_count():
+        raise InputError(
+            f"processes: found {jax.process_count()}, expected a divisor of {images} images"
+        )
+    return devices_for(images if spread else jax.process_count(), processes=True)
+
+
+def _numbers(metrics: Metrics | TransportStatistics) -> dict[str, float]:
+    """Fetch metrics by name, those of the transport among them."""
+    numbers: dict[str, float] = {}
+    for name, value in jax.device_get(metrics)._asdict().items():
+        if isinstance(value, TransportStatistics):
+            numbers |= _numbers(value)
+        elif value is not None:
+            numbers[name] = float(value)
+    return numbers

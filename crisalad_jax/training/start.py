@@ -1,0 +1,93 @@
+"""The parameters that a run starts from: a whole model, a backbone, or random numbers."""
+
+import dataclasses
+import os
+
+import jax
+
+from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.places import Places
+from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
+from crisalad_jax.utils import distributed
+from crisalad_jax.utils.errors import InputError
+
+
+def read_start(
+    config: TrainConfig,
+    *,
+    weights: str | os.PathLike[str] | None = None,
+    backbone: str | os.PathLike[str] | None = None,
+) -> Crisalad | None:
+    """Read the parameters that a run starts from.
+
+    Args:
+        config: the run's.
+        weights: a whole model of this package.
+        backbone: a checkpoint of which the backbone alone is taken, public or of this package.
+
+    Returns:
+        All parameters; None for random ones, with neither file.
+
+    Raises:
+        InputError: both are given, or a file cannot be read or does not fit the model.
+    """
+    if weights is not None:
+        if backbone is not None:
+            raise InputError("--backbone: found beside --weights, expected only one of the two")
+        params, _ = load_weights(weights, expected=config.model)
+        return params
+    if backbone is None:
+        return None
+    fresh = init_crisalad(jax.random.key(config.seed), config.model)
+    pretrained = read_backbone(backbone, config.model.backbone, fresh.backbone)
+    return dataclasses.replace(fresh, backbone=pretrained)
+
+
+def with_vocabulary_of(
+    initial: Crisalad | None,
+    config: TrainConfig,
+    places: Places,
+    *,
+    on_bad_image: OnBadImage = "stop",
+    quiet: bool = False,
+) -> Crisalad | None:
+    """Fit an aggregator's centroids to the training images, if it starts from centroids.
+
+    The same start always gets the same centroids, so that runs can resume. All processes call it
+    together, and each gets the centroids of the primary process.
+
+    Args:
+        initial: the parameters; None for random ones, by the run's seed.
+        config: the run's.
+        places: the training images.
+        on_bad_image: "stop", or "skip" to leave unreadable images out.
+        quiet: no progress bar.
+
+    Returns:
+        The parameters; as they are where the aggregator has no centroids.
+
+    Raises:
+        InputError: what `with_vocabulary` raises.
+    """
+    if not needs_vocabulary(config.model):
+        return initial
+    if initial is None:
+        initial = init_crisalad(jax.random.key(config.seed), config.model)
+    start = initial
+    paths = [places.path(image) for image in range(len(places.files))]
+
+    def build() -> Crisalad:
+        return with_vocabulary(
+            start,
+            config.model,
+            paths,
+            seed=config.seed,
+            on_bad_image=on_bad_image,
+            quiet=quiet or not distributed.is_primary(),
+        )
+
+    return distributed.broadcast(distributed.raise_together(build))

@@ -1,0 +1,351 @@
+"""One compiled step of training: the loss, its gradient, and the optimiser (paper section 4.2)."""
+
+import dataclasses
+import functools
+import re
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
+
+from crisalad_jax.losses import LossConfig, LossResult, LossValue, metric_loss
+from crisalad_jax.losses.base import call_loss, check_value
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.layers import split_key
+from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens, valid_mask
+from crisalad_jax.nn.tokens import TransportStatistics
+from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
+from crisalad_jax.training.trainable import split_params
+from crisalad_jax.utils import compiler, devices
+from crisalad_jax.utils.pytree import named_leaves
+
+_ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
+"""Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
+LossFunction = Callable[..., Float[Array, ""]]
+"""Takes descriptors, labels and, if it has a third argument, which images are valid."""
+
+
+class TrainState(NamedTuple):
+    """State that changes from step to step; `trainable` has None where a parameter is frozen."""
+
+    step: Int[Array, ""]
+    trainable: PyTree
+    optimiser: PyTree
+    classifiers: Classifiers | None = None
+    """Parameters of the loss, if it has any."""
+
+
+class Metrics(NamedTuple):
+    """Scalars of one step."""
+
+    loss: Float[Array, ""]
+    easy_anchor_fraction: Float[Array, ""]
+    """Share of the anchors whose positives are all easy."""
+    accuracy: Float[Array, ""] | None
+    """Share of the images that are nearest to their own class; None without classification."""
+    gradient_norm: Float[Array, ""]
+    """Norm of the whole gradient, that of a classifier included."""
+    learning_rate: Float[Array, ""] | None
+    """Learning rate of this step; None for an optimiser that was passed in."""
+    images: Int[Array, ""]
+    """Number of valid images."""
+    transport: TransportStatistics | None
+    """Means over the valid images, with dropout; None if the aggregator has no transport."""
+    updated: Bool[Array, ""]
+    """Whether the step was taken, and not skipped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StepConfig:
+    """The static argument of a compiled step."""
+
+    model: ModelConfig
+    loss: LossConfig | LossFunction
+    optimiser: OptimiserConfig | optax.GradientTransformation
+    steps: int = 1
+    """Number of steps of the run, by which a linear schedule falls."""
+    steps_per_epoch: int = 1
+    """Number of steps of an epoch, for a learning rate that falls every few epochs."""
+    micro_batch: int | None = None
+    """See `nn.model.extract_tokens`."""
+    shard_over: Mesh | None = None
+    """Devices to shard the state over, as `devices.shard_spec` says; None replicates it.
+
+    The gradient is taken of replicated parameters, the optimiser's step of shards (the first stage
+    of ZeRO, Rajbhandari et al. 2020)."""
+    classes: tuple[int, ...] = ()
+    """Number of classes of each group, where the loss classifies; an epoch trains one group."""
+
+    def learning_rate(self, step: Int[Array, ""]) -> Float[Array, ""] | None:
+        """Compute the learning rate of a step, from 0; None if the optimiser is passed in."""
+        if not isinstance(self.optimiser, OptimiserConfig):
+            return None
+        schedule = learning_rate_schedule(self.optimiser, self.steps, self.steps_per_epoch)
+        return jnp.asarray(schedule(step))
+
+    def make_optimiser(self) -> optax.GradientTransformation:
+        """Make the optimiser of a run of so many steps."""
+        if not isinstance(self.optimiser, OptimiserConfig):
+            return self.optimiser
+        return make_optimiser(self.optimiser, self.steps, self.steps_per_epoch)
+
+    @property
+    def compute_dtype(self) -> str:
+        """Type of the model's matrix products."""
+        return self.model.compute_dtype
+
+
+def init_train_state(
+    params: Crisalad,
+    trainable: str,
+    config: StepConfig,
+    *,
+    key: PRNGKeyArray | None = None,
+) -> tuple[TrainState, PyTree]:
+    """Make the state before the first step, and the frozen parameters, which no step changes.
+
+    Args:
+        params: the model to start from.
+        trainable: see `split_params`.
+        config: the step's.
+        key: draws the parameters of a loss that has some.
+
+    Returns:
+        (state, frozen).
+
+    Raises:
+        InputError: what `split_params` raises.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import init_crisalad, recipe, step_config
+        >>> config = recipe("tiny")
+        >>> params = init_crisalad(jax.random.key(0), config.model)
+        >>> static = step_config(config, steps=10)
+        >>> state, frozen = init_train_state(params, config.trainable, static)
+        >>> int(state.step)
+        0
+    """
+    chosen, frozen = split_params(params, config.model, trainable)
+    optimiser = config.make_optimiser().init(chosen)
+    classifiers = None
+    if isinstance(config.loss, LossConfig) and key is not None:
+        classes, dim = config.classes or (0,), config.model.descriptor_dim
+        classifiers = init_classifiers(key, config.loss.kind, classes, dim)
+    return TrainState(jnp.zeros((), jnp.int32), chosen, optimiser, classifiers), frozen
+
+
+def cast_frozen(frozen: PyTree, config: ModelConfig) -> PyTree:
+    """Cast frozen weights of the backbone's linear layers to the type of their products.
+
+    A step's results stay the same to the bit; in bfloat16 the weights take half the memory.
+    """
+    dtype = jnp.dtype(config.compute_dtype)
+    names = iter(named_leaves(frozen))
+
+    def cast(leaf: Any) -> Any:
+        return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
+
+    return jax.tree.map(cast, frozen)
+
+
+def step_config(
+    config: TrainConfig,
+    *,
+    steps: int,
+    steps_per_epoch: int = 1,
+    optimiser: optax.GradientTransformation | None = None,
+    loss: LossFunction | None = None,
+) -> StepConfig:
+    """Make the part of a run's configuration that its compiled step depends on.
+
+    Args:
+        config: the run's.
+        steps: number of steps of the run.
+        steps_per_epoch: number of steps of an epoch.
+        optimiser: any optimiser of optax, in place of the configuration's.
+        loss: any function of (descriptors, labels) or (descriptors, labels, valid) that returns a
+            number, in place of the configuration's.
+
+    Returns:
+        A static argument of `train_step`.
+
+    Example:
+        >>> from crisalad_jax import recipe
+        >>> step_config(recipe("tiny"), steps=100).steps
+        100
+    """
+    return StepConfig(
+        model=config.model,
+        loss=config.loss if loss is None else loss,
+        optimiser=config.optimiser if optimiser is None else optimiser,
+        steps=steps,
+        steps_per_epoch=steps_per_epoch,
+        micro_batch=config.micro_batch,
+    )
+
+
+def make_train_step(
+    config: TrainConfig,
+    *,
+    steps: int,
+    steps_per_epoch: int = 1,
+    optimiser: optax.GradientTransformation | None = None,
+    loss: LossFunction | None = None,
+) -> Callable[..., tuple[TrainState, Metrics]]:
+    """Make a compiled step of training.
+
+    Args:
+        config: the run's.
+        steps: see `step_config`.
+        steps_per_epoch: see `step_config`.
+        optimiser: see `step_config`.
+        loss: see `step_config`.
+
+    Returns:
+        `step(state, frozen, images, labels, key, valid=None) -> (state, metrics)`; see
+        `train_step`. The state that goes in is used up.
+
+    Example:
+        >>> import jax, numpy as np, optax
+        >>> from crisalad_jax import init_crisalad, init_train_state, recipe, step_config
+        >>> config = recipe("tiny")
+        >>> options = {"steps": 10, "optimiser": optax.sgd(0.1)}
+        >>> step = make_train_step(config, **options)
+        >>> params = init_crisalad(jax.random.key(0), config.model)
+        >>> state, frozen = init_train_state(params, "head", step_config(config, **options))
+        >>> images, labels = np.zeros((4, 98, 98, 3), np.uint8), np.array([0, 0, 1, 1])
+        >>> state, metrics = step(state, frozen, images, labels, jax.random.key(1))
+        >>> int(state.step), metrics.loss.shape
+        (1, ())
+    """
+    static = step_config(
+        config, steps=steps, steps_per_epoch=steps_per_epoch, optimiser=optimiser, loss=loss
+    )
+
+    def step(
+        state: TrainState,
+        frozen: PyTree,
+        images: UInt8[Array | np.ndarray, "image height width 3"],
+        labels: Int[Array | np.ndarray, " image"],
+        key: PRNGKeyArray,
+        valid: Bool[Array | np.ndarray, " image"] | None = None,
+    ) -> tuple[TrainState, Metrics]:
+        mask = jnp.ones(len(labels), bool) if valid is None else jnp.asarray(valid)
+        return train_step(
+            state, frozen, jnp.asarray(images), jnp.asarray(labels), mask, key, static
+        )
+
+    return step
+
+
+@functools.partial(compiler.jit, runs_long=True, static_argnames="config", donate_argnames="state")
+def train_step(
+    state: TrainState,
+    frozen: PyTree,
+    images: UInt8[Array, "image height width 3"],
+    labels: Int[Array, " image"],
+    valid: Bool[Array, " image"],
+    key: PRNGKeyArray,
+    config: StepConfig,
+    proceed: Bool[Array, ""] | bool = True,
+) -> tuple[TrainState, Metrics]:
+    """Take one step of the optimiser on the loss of a batch.
+
+    The gradient is taken of the trainable parameters, and of the loss's own for the epoch's group.
+    If the loss classifies, labels are that group's classes. Dropout is drawn from `key` and the
+    step's number, so that a resumed run repeats an uninterrupted one.
+
+    If the loss or the gradient is not finite, or no image is valid, the state is returned as it was
+    and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
+    a loop may read metrics one step late, and still have the state before the failed step.
+    """
+    tokens_key, cross_key = split_key(jax.random.fold_in(key, state.step), 2)
+    group = state.step // config.steps_per_epoch % max(len(config.classes), 1)
+    classifier = None
+    if state.classifiers is not None:
+        classifier = jax.tree.map(lambda leaf: leaf[group], state.classifiers.weights)
+
+    def loss_of(trained: tuple[PyTree, Any]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
+        trainable, classifier = trained
+        params = eqx.combine(trainable, frozen)
+        # The two halves of `describe`, because the tokens carry the transport's statistics.
+        tokens = extract_tokens(
+            params, images, config.model, key=tokens_key, micro_batch=config.micro_batch
+        )
+        descriptors = attend_across_images(
+            params, tokens, config.model, mask=valid_mask(valid), key=cross_key
+        )
+        result = _loss(descriptors, labels, valid, classifier, group, config)
+        return result.loss, (result, tokens.transport)
+
+    def placed(tree: PyTree, *, whole: bool = False) -> PyTree:
+        mesh = config.shard_over
+        if mesh is None:
+            return tree
+
+        def place(leaf: Array) -> Array:
+            where = (
+                NamedSharding(mesh, PartitionSpec())
+                if whole
+                else devices.shard_spec(mesh, leaf.shape)
+            )
+            return jax.lax.with_sharding_constraint(leaf, where)
+
+        return jax.tree.map(place, tree)
+
+    (loss, (result, transport)), (gradient, classifier_gradient) = jax.value_and_grad(
+        loss_of, has_aux=True
+    )((placed(state.trainable, whole=True), placed(classifier, whole=True)))
+    transport = jax.tree.map(lambda each: jnp.where(valid, each, 0).sum() / valid.sum(), transport)
+    norm = optax.tree.norm((gradient, classifier_gradient))
+    learning_rate = config.learning_rate(state.step)
+    optimiser = config.make_optimiser()
+    updates, new_optimiser = optimiser.update(gradient, state.optimiser, state.trainable)
+    classifiers = state.classifiers
+    if classifiers is not None:
+        assert isinstance(config.loss, LossConfig)
+        rate = config.loss.kind.learning_rate
+        classifiers = update_classifiers(classifiers, group, classifier_gradient, rate)
+    trainable = optax.apply_updates(state.trainable, updates)
+    new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
+    updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & valid.any()
+    state = jax.tree.map(lambda after, before: jnp.where(updated, after, before), new, state)
+    return placed(state), Metrics(
+        loss=loss,
+        easy_anchor_fraction=result.easy_anchor_fraction,
+        accuracy=result.accuracy,
+        gradient_norm=norm,
+        learning_rate=learning_rate,
+        images=valid.sum(),
+        transport=transport,
+        updated=updated,
+    )
+
+
+def _loss(
+    descriptors: Float[Array, "image descriptor"],
+    labels: Int[Array, " image"],
+    valid: Bool[Array, " image"],
+    classifier: PyTree,
+    group: Int[Array, ""],
+    config: StepConfig,
+) -> LossResult:
+    """Compute the loss of a batch, by the configuration or by a function that was passed in."""
+    if isinstance(config.loss, LossConfig):
+        classes = jnp.asarray(config.classes)[group] if config.classes else None
+        return metric_loss(
+            descriptors, labels, config.loss, valid=valid, params=classifier, classes=classes
+        )
+    easy = metric_loss(descriptors, labels, valid=valid).easy_anchor_fraction
+    value = call_loss(config.loss, descriptors, labels, valid)
+    check_value(LossValue(value), getattr(config.loss, "__name__", "given"))
+    return LossResult(value, easy)

@@ -1,0 +1,133 @@
+"""The parts of a model: parameters, what trains, multiply-accumulates an image."""
+
+from typing import Any, NamedTuple
+
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
+from crisalad_jax.training.config import has_adapters
+from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD, count_trainable
+from crisalad_jax.utils.errors import InputError
+
+
+class AdapterSummary(NamedTuple):
+    """One of a model's adapters."""
+
+    parameters: int
+    macs: int
+    """Multiply-accumulates an image, with linears at every token."""
+    paper_macs: int
+    """Multiply-accumulates as the paper counts: each linear once, convolutions at every patch."""
+
+
+class ModelSummary(NamedTuple):
+    """Counts of a model's parameters and multiply-accumulates."""
+
+    image_size: tuple[int, int]
+    """Height and width in pixels."""
+    descriptor: int
+    """Length of a descriptor."""
+    trainable: str
+    """What trains, as `split_params` takes it."""
+    trainable_parameters: int
+    frozen_parameters: int
+    parts: list[PartCost]
+    """A row for each part."""
+    one_adapter: AdapterSummary | None
+    """Counts of one adapter; None where there are no adapters."""
+
+
+def model_summary(
+    config: ModelConfig, trainable: str | None = None, *, images: int = 16
+) -> ModelSummary:
+    """Count a model's parameters and multiply-accumulates, without computing anything.
+
+    Args:
+        config: the model.
+        trainable: what trains, as `split_params` takes it. None is the adapters and the head, or
+            the head alone where there are no adapters.
+        images: number of images that look at each other in the cross-image encoder.
+
+    Returns:
+        The numbers.
+
+    Raises:
+        InputError: what `split_params` raises; or `images` below 1.
+
+    Example:
+        >>> from crisalad_jax import PRESETS
+        >>> model_summary(PRESETS["b14"]).descriptor
+        8448
+    """
+    if images < 1:
+        raise InputError(f"batch size: found {images}, expected at least 1")
+    if trainable is None:
+        trainable = ADAPTERS_AND_HEAD if has_adapters(config) else HEAD
+    trained = count_trainable(config, trainable)
+    parts = part_costs(config, images=images)
+    adapter = None
+    if has_adapters(config):
+        total = sum(cost.parameters for cost in parts if cost.part == "adapters")
+        count = total // config.backbone.depth
+        adapter = AdapterSummary(count, adapter_macs(config), paper_adapter_macs(config))
+    return ModelSummary(
+        config.image_size,
+        config.descriptor_dim,
+        trainable,
+        trained,
+        sum(cost.parameters for cost in parts) - trained,
+        parts,
+        adapter,
+    )
+
+
+def model_words(config: ModelConfig) -> str:
+    """Describe a model's parts and its descriptor in a line.
+
+    Args:
+        config: the model.
+
+    Returns:
+        Clauses without a full stop.
+
+    Example:
+        >>> from crisalad_jax import PRESETS
+        >>> model_words(PRESETS["b14"]).partition(";")[0]
+        'backbone of width 768, 12 blocks, 0 registers, adapter depthwise'
+    """
+    backbone = config.backbone
+    words = f"backbone of width {backbone.dim}, {backbone.depth} blocks"
+    if isinstance(backbone, ViTConfig):
+        words += f", {backbone.registers} registers, adapter {backbone.adapter.kind}"
+    return (
+        f"{words}; aggregator {config.aggregator.part_name}; {config.cross_image.layers} "
+        f"cross-image layers; descriptor of {config.descriptor_dim} numbers"
+    )
+
+
+def summary_json(summary: ModelSummary, name: str) -> dict[str, Any]:
+    """Put a summary into JSON values; `name` is the model's."""
+    values: dict[str, Any] = {"model": name} | summary._asdict()
+    values["image_size"] = list(summary.image_size)
+    values["parts"] = [cost._asdict() for cost in summary.parts]
+    adapter: AdapterSummary | None = values.pop("one_adapter")
+    return values if adapter is None else values | {"one_adapter": adapter._asdict()}
+
+
+def summary_lines(summary: ModelSummary) -> list[str]:
+    """Format the rest of a summary as lines for the terminal."""
+    lines = [
+        f"descriptor            {summary.descriptor:>13,} numbers",
+        f"trainable             {summary.trainable_parameters:>13,} parameters "
+        f"({summary.trainable})",
+        f"frozen                {summary.frozen_parameters:>13,} parameters",
+    ]
+    if summary.one_adapter is not None:
+        parameters, macs, paper_macs = summary.one_adapter
+        lines += [
+            f"one adapter           {parameters:>13,} parameters",
+            f"  multiply-accumulates{macs:>13,} an image, linears at every token",
+            f"  as the paper counts {paper_macs:>13,} (Table 3: each linear once, convolutions at "
+            "every patch)",
+        ]
+    return lines

@@ -1,0 +1,315 @@
+"""The vocabularies of NetVLAD and AnyLoc: k-means centroids of the features of images.
+
+It is Euclidean k-means of unit features, as in VLAD (Jegou et al. 2010) and at NetVLAD's start. A
+centroid is the mean of the features nearest to it, and no unit vector. AnyLoc's public code
+compares by the angle instead, which differs by the centroids' lengths.
+"""
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Float32
+
+from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.data.images import list_images
+from crisalad_jax.data.loader import OnBadImage, image_batches
+from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
+from crisalad_jax.nn.backbones import FeatureRequest
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, init_crisalad, unit_features
+from crisalad_jax.retrieval.chunks import sample
+from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils.devices import devices_for
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_target
+from crisalad_jax.utils.progress import progress_bar
+
+IMAGES = 500
+"""Largest number of images that are read: with 100 patches of each, public NetVLAD's 50,000
+features."""
+PATCHES = 100
+"""Largest number of patches that are taken of an image."""
+_ROUNDS = 100
+"""Number of rounds of k-means, which converges earlier."""
+
+
+def needs_vocabulary(config: ModelConfig) -> bool:
+    """Return whether a model needs centroids before it is of use, or trains."""
+    return config.aggregator.starts_from_centroids
+
+
+def with_vocabulary(
+    params: Crisalad,
+    config: ModelConfig,
+    paths: Sequence[pathlib.Path],
+    *,
+    images: int | None = IMAGES,
+    seed: int = 0,
+    batch_size: int = 16,
+    on_bad_image: OnBadImage = "stop",
+    quiet: bool = True,
+) -> Crisalad:
+    """Fit a model's centroids to the features that its own backbone finds in images.
+
+    The same arguments give the same bits on the same machine. NetVLAD's scores start from the
+    centroids too (`netvlad.from_centroids`). AnyLoc's vocabulary is bound to its backbone: loading
+    it with another one raises an error.
+
+    Args:
+        params: a model, whose backbone is as it will be used, or as training starts from it.
+        config: NetVLAD's or AnyLoc's.
+        paths: images; not those that are evaluated on.
+        images: at most so many of them, drawn at random; None for all, whose features are in memory
+            together.
+        seed: draws the images, `PATCHES` patches of each, and the first centroids.
+        batch_size: images described at a time.
+        on_bad_image: "stop", or "skip" to leave unreadable images out.
+        quiet: no progress bar.
+
+    Raises:
+        InputError: a model without a vocabulary; an argument out of range; an image that cannot be
+            read, or none that can; fewer features than clusters, or features that are not finite
+            or all alike.
+    """
+    _check_vocabulary(config, "aggregator: found")
+    clusters = config.aggregator.count_centroids(config.backbone.dim)
+    _check_counts(config, clusters, len(paths), images, seed)
+    if images is not None and images < len(paths):
+        paths = [paths[i] for i in sample(len(paths), images, seed)]
+    features = _read_features(
+        params, config, paths, seed, batch_size, on_bad_image=on_bad_image, quiet=quiet
+    )
+    if len(features) < clusters:
+        raise InputError(
+            f"images: found {len(features)} features in those that can be read, expected at least "
+            f"{clusters}, one for each cluster"
+        )
+    if not np.isfinite(features).all():
+        raise InputError("features: found NaN or infinity, expected a backbone's finite numbers")
+    centroids = jnp.asarray(_k_means(features, clusters, seed))
+    aggregator = config.aggregator.from_centroids(centroids, jnp.asarray(features))
+    aggregator = config.aggregator.bind(aggregator, params.backbone)
+    return dataclasses.replace(params, aggregator=aggregator)
+
+
+class Vocabulary(NamedTuple):
+    """A model whose vocabulary was built."""
+
+    params: Crisalad
+    """The model's parameters, the vocabulary among them."""
+    words: int
+    """Number of centroids."""
+    images: int
+    """Number of images that were asked for features."""
+
+
+def start_vocabulary(
+    aggregator: str = "anyloc",
+    preset: str = "b14",
+    *,
+    backbone: str | os.PathLike[str] | None = None,
+    fields: Mapping[str, Any] | None = None,
+    image_size: tuple[int, int] | None = None,
+    seed: int = 0,
+) -> tuple[Crisalad, ModelConfig]:
+    """Make a model that lacks only its vocabulary.
+
+    Args:
+        aggregator: a registered aggregator that starts from centroids, or a recipe with one.
+        preset: the size of the model.
+        backbone: a checkpoint of which the backbone is taken; None is a random one.
+        fields: settings of the aggregator that are other than the preset's, by name.
+        image_size: height and width in pixels; None is the preset's.
+        seed: draws what is random.
+
+    Returns:
+        (params, config).
+
+    Raises:
+        InputError: no such preset or aggregator, or one without a vocabulary; a field that it does
+            not have; or a checkpoint that cannot be read or is of another size.
+    """
+    config = recipe(preset, aggregator).model
+    part = config.aggregator
+    _check_vocabulary(config, "--aggregator: found")
+    known = [field.name for field in dataclasses.fields(part)]
+    for name in fields or {}:
+        if name not in known:
+            raise InputError(
+                f"--{name}: found with --aggregator {part.part_name}, which has no such setting, "
+                f"expected one of {', '.join(known) or 'none'}"
+            )
+    part = dataclasses.replace(part, **(fields or {}))
+    config = dataclasses.replace(config, aggregator=part).resized(image_size)
+    params = init_crisalad(jax.random.key(seed), config)
+    if backbone is not None:
+        pretrained = read_backbone(backbone, config.backbone, params.backbone)
+        params = dataclasses.replace(params, backbone=pretrained)
+    return params, config
+
+
+def build_vocabulary(
+    params: Crisalad,
+    config: ModelConfig,
+    images: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    max_images: int = IMAGES,
+    seed: int = 0,
+    batch_size: int = 16,
+    on_bad_image: OnBadImage = "stop",
+    quiet: bool = False,
+) -> Vocabulary:
+    """Build the vocabulary of a model from a folder of images, and write the model.
+
+    Args:
+        params: a model's parameters; its backbone is as it will be used.
+        config: the model, whose aggregator starts from centroids.
+        images: the folder, searched with its subfolders; not of images that are evaluated on.
+        out: the .safetensors file to write.
+        max_images: number of images that are read at most, drawn at random.
+        seed: as `with_vocabulary` takes it, and so are the others.
+        batch_size: number of images described at a time.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        The model, and what its vocabulary was built of.
+
+    Raises:
+        InputError: what `with_vocabulary` raises; no image; or a file that cannot be written.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, CrossImageConfig, init_crisalad, with_aggregator
+        >>> alone = CrossImageConfig(layers=0)
+        >>> config = with_aggregator(PRESETS["tiny"], "anyloc", "tiny", cross_image=alone)
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> out = folder / "anyloc.safetensors"
+        >>> built = build_vocabulary(params, config, pictures, out, quiet=True)
+        >>> out.exists()
+        True
+    """
+    check_target(out, ".safetensors")
+    paths = list_images(images)
+    params = with_vocabulary(
+        params,
+        config,
+        paths,
+        images=max_images,
+        seed=seed,
+        batch_size=batch_size,
+        on_bad_image=on_bad_image,
+        quiet=quiet,
+    )
+    save_weights(out, params, config)
+    words = config.aggregator.count_centroids(config.backbone.dim)
+    return Vocabulary(params, words, min(max_images, len(paths)))
+
+
+def vocabulary_words(config: ModelConfig) -> str:
+    """Name an aggregator, and the features of its vocabulary if they are not the last.
+
+    Args:
+        config: the model.
+
+    Returns:
+        A few words.
+
+    Example:
+        >>> from crisalad_jax import recipe
+        >>> vocabulary_words(recipe("b14", "anyloc").model)
+        'anyloc (value of block 3)'
+    """
+    name, request = config.aggregator.part_name, config.aggregator.features(config.backbone.depth)
+    if request.levels is None:
+        return name if request == FeatureRequest() else f"{name} ({request.facet})"
+    blocks = ", ".join(str(level - 1) for level in request.levels)
+    return f"{name} ({request.facet} of block {blocks})"
+
+
+def _check_vocabulary(config: ModelConfig, prefix: str) -> None:
+    if not needs_vocabulary(config):
+        base = Aggregator.from_centroids
+        fit = [n for n in AGGREGATORS if AGGREGATORS.find(n).from_centroids is not base]
+        raise InputError(
+            f"{prefix} {config.aggregator.part_name}, which has no vocabulary, expected one that "
+            f"starts from centroids: {', '.join(fit)}"
+        )
+
+
+def _check_counts(
+    config: ModelConfig, clusters: int, available: int, images: int | None, seed: int
+) -> None:
+    """Check the numbers of images and features before an image is read."""
+    if seed < 0:
+        raise InputError(f"seed: found {seed}, expected at least 0")
+    if images is not None and images < 1:
+        raise InputError(f"images: found {images}, expected at least 1")
+    used = available if images is None else min(images, available)
+    most = used * _taken(config)
+    if most < clusters:
+        raise InputError(
+            f"images: found {used}, which is {most} features, expected at least {clusters}, one "
+            "for each cluster"
+        )
+
+
+def _taken(config: ModelConfig) -> int:
+    """Count the features that are taken of an image."""
+    return min(PATCHES, config.patches)
+
+
+def _read_features(
+    params: Crisalad,
+    config: ModelConfig,
+    paths: Sequence[pathlib.Path],
+    seed: int,
+    batch_size: int,
+    *,
+    on_bad_image: OnBadImage,
+    quiet: bool,
+) -> Float32[np.ndarray, "feature dim"]:
+    batches = image_batches(
+        paths, image_size=config.image_size, batch_size=batch_size, on_bad_image=on_bad_image
+    )
+    devices = devices_for(batch_size)
+    params = devices.replicate(params)
+    generator = np.random.default_rng(seed)
+    parts: list[np.ndarray] = []
+    with progress_bar("vocabulary", len(paths), "images", quiet=quiet) as bar:
+        for batch in batches:
+            features = jax.device_get(
+                unit_features(params, devices.shard_batch(batch.images), config)
+            )
+            for image in features[batch.valid]:
+                chosen = np.sort(generator.permutation(len(image))[:PATCHES])
+                parts.append(image[chosen].astype(np.float32))
+            bar.advance(int((batch.indices >= 0).sum()))
+    return np.concatenate(parts) if parts else np.empty((0, config.backbone.dim), np.float32)
+
+
+def _k_means(
+    features: Float[np.ndarray, "feature dim"], clusters: int, seed: int
+) -> Float32[np.ndarray, "cluster dim"]:
+    import faiss as _faiss  # imported here: `needs_vocabulary` does without it
+
+    faiss: Any = _faiss
+    kmeans = faiss.Kmeans(
+        features.shape[1],
+        clusters,
+        niter=_ROUNDS,
+        seed=seed % 2**31,
+        # All features are used, whatever their number.
+        min_points_per_centroid=1,
+        max_points_per_centroid=len(features),
+    )
+    kmeans.train(np.ascontiguousarray(features))
+    return kmeans.centroids

@@ -1,0 +1,1 @@
+"""Entropic transport; `crisalad_jax.sinkhorn` is its public interface."""

@@ -1,0 +1,89 @@
+"""Configure how a transport problem is solved: the step, the stopping rule and the gradient."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+from jaxtyping import Array, Bool, Int
+
+from crisalad_jax.config.checks import require, require_choice, require_positive
+from crisalad_jax.config.parts import OrName, Part, Registry, part_field, resolve_names
+from crisalad_jax.transport.problem import Potentials, Problem
+from crisalad_jax.transport.steps import STEPS, Step
+
+
+class Solution(NamedTuple):
+    """The result of the iterations."""
+
+    potentials: Potentials
+    iterations: Int[Array, "*batch"]
+    met: Bool[Array, "*batch"]
+    """Whether the tolerance was met; False where there is none."""
+
+
+Solve = Callable[[Problem], Solution]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gradient(Part):
+    """A gradient of the potentials, through which JAX differentiates the plan."""
+
+    def check(self, config: "SinkhornConfig") -> None:
+        """Raise InputError where this gradient does not go with a configuration."""
+
+    def solve(
+        self, problem: Problem, config: "SinkhornConfig", params: Any, init: Potentials
+    ) -> Solution:
+        """Return the solution, with this gradient."""
+        raise NotImplementedError
+
+
+GRADIENTS = Registry("gradient", Gradient)
+
+
+@dataclasses.dataclass(frozen=True)
+class SinkhornConfig:
+    """The solver of transport problems, by default SALAD's published one. See `docs/sinkhorn.md`.
+
+    Example:
+        >>> config = SinkhornConfig(tolerance=1e-4, iterations=100, gradient="implicit")
+        >>> config.gradient.part_name
+        'implicit'
+    """
+
+    step: OrName[Step] = part_field(STEPS, "sinkhorn")
+    """One iteration; a registered step, or its name."""
+    iterations: int = 3
+    """Number of iterations; with a tolerance, at most this number."""
+    tolerance: float | None = None
+    """Largest error of a step at which iterations stop. For plain steps it is the relative marginal
+    error before the last step. float32 may never get below 1e-5."""
+    throw: bool = False
+    """Whether to raise where the tolerance is not met; else the result says so."""
+    domain: Literal["scaling", "log"] = "scaling"
+    """Domain of the sums. Scaling computes exponentials once; problems whose scores are too far
+    apart for it are solved again in the log domain."""
+    anderson_memory: int = 0
+    """Number of past iterations for Anderson acceleration; 0 for none."""
+    gradient: OrName[Gradient] = part_field(GRADIENTS, "unrolled")
+    """Gradient of the potentials: unrolled (through the iterations), implicit (closed form of the
+    optimality conditions), optimistix (fixed point and adjoint of that library), or stop
+    (potentials are constants)."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges, and that the parts go together."""
+        resolve_names(self)
+        require_choice(self, "domain")
+        require_positive(self, "iterations")
+        if self.tolerance is not None:
+            require_positive(self, "tolerance")
+        memory = self.anderson_memory
+        require(
+            isinstance(memory, int) and (memory == 0 or memory > 1),
+            f"SinkhornConfig.anderson_memory: found {memory}, expected 0 or a whole number from 2",
+        )
+        require(
+            not self.throw or self.tolerance is not None,
+            "SinkhornConfig.throw: found no tolerance to converge to",
+        )
+        self.gradient.check(self)

@@ -1,0 +1,194 @@
+"""Measure a plan's marginal errors, and check the inputs and steps of a problem."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from crisalad_jax.transport.config import SinkhornConfig
+from crisalad_jax.transport.problem import Potentials, Problem
+from crisalad_jax.utils.errors import InputError
+
+
+def marginal_error(
+    log_plan: Float[Array, "*batch rows columns"],
+    log_mu: Float[Array, "*#batch rows"],
+    log_nu: Float[Array, "*#batch columns"],
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """Compute the largest relative error of the row masses and of the column masses of a plan.
+
+    Args:
+        log_plan: logarithms of the masses.
+        log_mu: logarithms of the rows' marginals.
+        log_nu: logarithms of the columns' marginals.
+
+    Returns:
+        The largest |mass / marginal - 1| of the rows, and of the columns.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> log_plan, log_nu = jnp.log(jnp.eye(2)), jnp.log(jnp.full(2, 0.5))
+        >>> rows, columns = marginal_error(log_plan, jnp.zeros(2), log_nu)
+        >>> float(rows), float(columns)
+        (0.0, 1.0)
+    """
+    rows = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-1) - log_mu)
+    columns = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-2) - log_nu)
+    return jnp.abs(rows).max(axis=-1), jnp.abs(columns).max(axis=-1)
+
+
+def wide_dtype(scores: Array) -> jnp.dtype:
+    """Return the type to compute in: float32, or the scores' type if it is wider."""
+    return jnp.promote_types(scores.dtype, jnp.float32)
+
+
+def check_inputs(
+    scores: Array,
+    log_mu: Array,
+    log_nu: Array,
+    epsilon: float | Array,
+    *,
+    equal_totals: bool,
+) -> None:
+    """Check the shapes of a problem, and its values where they are known (outside of `jit`).
+
+    Raises:
+        InputError: naming the argument, what was found and what was expected.
+    """
+    for name, marginal, axis, side in (
+        ("log_mu", log_mu, -2, "rows"),
+        ("log_nu", log_nu, -1, "columns"),
+    ):
+        target = (*scores.shape[:-2], *scores.shape[axis:][:1])
+        if scores.ndim < 2 or 0 in scores.shape[-2:] or not _spreads(marginal.shape, target):
+            raise InputError(
+                f"sinkhorn: found scores of shape {scores.shape} and {name} of {marginal.shape}, "
+                f"expected (..., rows, columns) and (..., {side})"
+            )
+    if jnp.ndim(epsilon):
+        raise InputError(
+            f"sinkhorn: epsilon found of shape {jnp.shape(epsilon)}, expected a single number"
+        )
+    for name, value in (("scores", scores), ("log_mu", log_mu), ("log_nu", log_nu)):
+        if jnp.iscomplexobj(value):
+            raise InputError(f"sinkhorn: {name} found of {value.dtype}, expected real numbers")
+        if not isinstance(value, Tracer) and not _is_finite(value):
+            raise InputError(
+                f"sinkhorn: {name} found with NaN or infinity, expected finite numbers"
+            )
+    if not isinstance(epsilon, Tracer):
+        _check_epsilon(scores, float(epsilon))
+    if equal_totals and not isinstance(log_mu, Tracer) and not isinstance(log_nu, Tracer):
+        _check_totals(log_mu, log_nu)
+
+
+def _is_finite(value: Array) -> bool:
+    # Concrete values stay concrete under tracing. Only a flag is copied to the host.
+    with jax.ensure_compile_time_eval():
+        return bool(jnp.isfinite(value).all())
+
+
+def _largest(value: Array) -> float:
+    with jax.ensure_compile_time_eval():
+        return float(jnp.abs(value).max())
+
+
+def _check_epsilon(scores: Array, epsilon: float) -> None:
+    if not epsilon > 0:
+        raise InputError(f"sinkhorn: epsilon found {epsilon}, expected more than 0")
+    known = scores.size and not isinstance(scores, Tracer)
+    largest = _largest(scores) / epsilon if known else 0.0
+    if largest > float(jnp.finfo(wide_dtype(scores)).max):
+        raise InputError(
+            f"sinkhorn: epsilon found {epsilon}, with which scores over it are up to "
+            f"{largest:.1e}, expected numbers that {wide_dtype(scores)} can hold"
+        )
+
+
+def _check_totals(log_mu: Array, log_nu: Array) -> None:
+    totals = [np.exp(np.asarray(x, np.float64)).sum(axis=-1) for x in (log_mu, log_nu)]
+    # The tolerance allows for rounding of float32 logarithms.
+    unlike = ~np.isclose(*totals, rtol=1e-4)
+    if unlike.any():
+        worst = [np.broadcast_to(total, unlike.shape)[unlike][0] for total in totals]
+        sums = " and ".join(f"{total:.6g}" for total in worst)
+        raise InputError(
+            f"sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to {sums}, expected the "
+            "same"
+        )
+
+
+def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
+    """Check that a step returns potentials of the problem's shapes and keeps its state's shapes.
+
+    Raises:
+        InputError: it does not, or its parameters are missing; the message names the step.
+    """
+    step, name = config.step, config.step.part_name
+    learns = jax.eval_shape(step.init_params, jax.random.key(0))
+    if params is None and learns is not None:
+        raise InputError(
+            f"step {name}: found no step_params, expected those of its init_params, "
+            f"{_words(learns)}"
+        )
+    prepared = jax.eval_shape(step.prepare, problem, params)
+    if not isinstance(prepared, Problem) or _kinds(prepared) != _kinds(problem):
+        raise InputError(
+            f"step {name}: found to prepare {_words(prepared)}, expected a Problem of the same "
+            "shapes"
+        )
+
+    def once(problem: Problem, params: Any) -> tuple[Any, Any, Any]:
+        problem = step.prepare(problem, params)
+        state = step.init(problem, params)
+        return (
+            problem.zeros(),
+            state,
+            step.step(problem, problem.zeros(), state, jnp.zeros((), jnp.int32)),
+        )
+
+    potentials, state, out = jax.eval_shape(once, problem, params)
+    if not (isinstance(out, tuple) and len(out) == 2) or isinstance(out, Potentials):
+        raise InputError(
+            f"step {name}: found to return {_words(out)}, expected (Potentials, state)"
+        )
+    for what, output, expected in (("", out[0], potentials), ("a state of ", out[1], state)):
+        if _kinds(output) != _kinds(expected):
+            raise InputError(
+                f"step {name}: found to return {what}{_words(output)}, expected {_words(expected)}"
+            )
+    if not isinstance(out[0], Potentials):
+        raise InputError(f"step {name}: found to return {_words(out[0])}, expected Potentials")
+
+    def plan(problem: Problem, potentials: Potentials) -> Any:
+        return step.log_plan(problem, step.finish(problem, potentials))
+
+    log_plan = jax.eval_shape(plan, problem, potentials)
+    if _kinds(log_plan) != _kinds(problem.kernel):
+        raise InputError(
+            f"step {name}: found a log_plan of {_words(log_plan)}, expected one of shape "
+            f"{problem.kernel.shape} and {problem.kernel.dtype}"
+        )
+
+
+def _kinds(tree: Any) -> tuple[Any, ...]:
+    """Return a tree's structure, and its leaves' shapes and types."""
+    leaves = [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
+    return jax.tree.structure(tree), leaves
+
+
+def _words(tree: Any) -> str:
+    return " ".join(str(tree).split())
+
+
+def _spreads(shape: tuple[int, ...], target: tuple[int, ...]) -> bool:
+    """Return whether `shape` broadcasts to `target` with an equal last axis."""
+    leading = zip(reversed(shape[:-1]), reversed(target[:-1]), strict=False)
+    return (
+        shape[-1:] == target[-1:]
+        and len(shape) <= len(target)
+        and all(size in (1, wanted) for size, wanted in leading)
+    )

@@ -1,0 +1,226 @@
+"""Gradients of a solution: through the iterations, by the optimality conditions, or none."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
+from crisalad_jax.transport.iterate import iterate
+from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem, product
+from crisalad_jax.transport.steps import solve_columns
+
+PARTS = 2
+"""Number of parts of a batch that choose a domain, one after the other: the memory for a choice's
+gradient is allocated whatever is chosen."""
+
+
+def solve_in_domain(
+    problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
+) -> Solution:
+    """Iterate in the configured domain; scores too far apart for scaling use the log domain."""
+    if config.domain == "log":
+        return iterate(problem, config, params, init)
+    scaled = ScalingProblem.scaled(problem)
+    solution = iterate(scaled, config, params, init)
+    batch = solution.met.shape
+    count = math.prod(batch)
+    if not count:
+        return solution
+
+    def solve_in_log(problem: Problem, init: Potentials, params: Any) -> Solution:
+        # Solve the problems one by one, so that this branch needs little memory.
+        def solve_one(inputs: tuple[Problem, Potentials]) -> Solution:
+            return iterate(inputs[0], config, params, inputs[1])
+
+        return jax.lax.map(jax.checkpoint(solve_one), (problem, init))
+
+    # Keep the scaling domain's iterations outside of `cond`: a branch would copy out all residuals
+    # of its gradient, and zeros for those of the other branch.
+    @jax.checkpoint
+    def choose(problem: Problem, init: Potentials, solution: Solution, params: Any) -> Solution:
+        return jax.lax.cond(
+            scaled.in_range,
+            lambda problem, init, solution, params: solution,
+            lambda problem, init, solution, params: solve_in_log(problem, init, params),
+            *(problem, init, solution, params),
+        )
+
+    parts = PARTS if count % PARTS == 0 else 1
+    # Parts are interleaved, so that each device of a sharded batch has a share of every part.
+    split = jax.tree.map(
+        lambda x: x.reshape(count // parts, parts, *x.shape[len(batch) :]),
+        (problem, init, solution),
+    )
+    chosen = [choose(*jax.tree.map(lambda x, i=i: x[:, i], split), params) for i in range(parts)]
+    return jax.tree.map(lambda *x: jnp.stack(x, axis=1).reshape(*batch, *x[0].shape[1:]), *chosen)
+
+
+@GRADIENTS.register("unrolled")
+@dataclasses.dataclass(frozen=True)
+class Unrolled(Gradient):
+    """Differentiate through the iterations: the exact gradient of their number."""
+
+    def check(self, config: SinkhornConfig) -> None:
+        """Refuse a tolerance."""
+        require(
+            config.tolerance is None,
+            "SinkhornConfig.gradient: found 'unrolled' with a tolerance, expected 'implicit', "
+            "'optimistix' or 'stop': a loop of unknown length cannot be unrolled",
+        )
+
+    def solve(
+        self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
+    ) -> Solution:
+        """Solve by plain JAX operations, which have all derivatives in any mode."""
+        return solve_in_domain(problem, config, params, init)
+
+
+@GRADIENTS.register("stop")
+@dataclasses.dataclass(frozen=True)
+class Stop(Gradient):
+    """Treat the potentials as constants."""
+
+    def solve(
+        self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
+    ) -> Solution:
+        """Solve without a gradient."""
+        fixed = jax.lax.stop_gradient((problem, params, init))
+        return solve_in_domain(fixed[0], config, fixed[1], fixed[2])
+
+
+def _require_tolerance(name: str, config: SinkhornConfig) -> None:
+    require(
+        config.tolerance is not None,
+        f"SinkhornConfig.gradient: found {name!r} with a fixed number of iterations, expected a "
+        "tolerance: it is the gradient of the converged plan",
+    )
+
+
+@GRADIENTS.register("implicit")
+@dataclasses.dataclass(frozen=True)
+class Implicit(Gradient):
+    """Differentiate the optimality conditions in closed form, without storing iterations."""
+
+    def check(self, config: SinkhornConfig) -> None:
+        """Require a tolerance, and a step whose fixed point is the entropic plan."""
+        _require_tolerance("implicit", config)
+        require(
+            config.step.entropic,
+            f"SinkhornConfig.gradient: found 'implicit' with step {config.step.part_name!r}, "
+            "which does not say that it solves the entropic problem (Step.entropic), expected "
+            "'unrolled', 'optimistix' or 'stop'",
+        )
+
+    def solve(
+        self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
+    ) -> Solution:
+        """Solve, with the derivative of the solution."""
+        fixed = jax.lax.stop_gradient((problem, params, init))
+        solution = solve_in_domain(fixed[0], config, fixed[1], fixed[2])
+        return solution._replace(potentials=_at_solution(problem, solution.potentials))
+
+
+@jax.custom_jvp
+def _at_solution(problem: Problem, potentials: Potentials) -> Potentials:
+    """Return the given potentials, with the derivative of the solution that they are."""
+    return potentials
+
+
+@_at_solution.defjvp
+def _at_solution_jvp(primals: Any, tangents: Any) -> tuple[Potentials, Potentials]:
+    """Solve the linearised conditions (see docs/sinkhorn.md, "Implicit gradient")."""
+    problem, potentials = primals
+    change = tangents[0]
+    # Use the rule itself, so that the derivative can be differentiated again.
+    potentials = _at_solution(problem, potentials)
+    log_plan = problem.log_plan(potentials)
+    # Divide all masses by the largest, which cancels in the result: relaxed masses may overflow.
+    top = jax.lax.stop_gradient(log_plan.max(axis=(-2, -1), keepdims=True))
+    plan, shares = jnp.exp(log_plan - top), jax.nn.softmax(log_plan, axis=-1)
+    masses = plan.sum(axis=-2)
+
+    def row_change(column: Array) -> Array:
+        moved = (shares * change.kernel).sum(axis=-1) + product("...nk,...k->...n", shares, column)
+        return problem.row_tau * (change.log_mu - moved)
+
+    still = row_change(jnp.zeros_like(potentials.column))
+    target = masses * change.log_nu - (plan * (change.kernel + still[..., None])).sum(axis=-2)
+    if problem.balanced:
+        # Where only the masses' totals change, rows are met and columns follow, as in iterations.
+        total = target.sum(axis=-1, keepdims=True) / masses.sum(axis=-1, keepdims=True)
+        target = target - masses * total
+    column = solve_columns(plan, shares, target, problem.row_tau, problem.column_tau)
+    return potentials, Potentials(row_change(column), column)
+
+
+@GRADIENTS.register("optimistix")
+@dataclasses.dataclass(frozen=True)
+class Optimistix(Gradient):
+    """Find the fixed point with a solver of optimistix, and differentiate with its adjoint.
+
+    Every step gets the state of `Step.init` and the iteration number 0. `Step.finish` is not
+    called.
+    """
+
+    def check(self, config: SinkhornConfig) -> None:
+        """Require a tolerance, and refuse acceleration."""
+        _require_tolerance("optimistix", config)
+        require(
+            not config.anderson_memory,
+            "SinkhornConfig.anderson_memory: found with gradient 'optimistix', expected 0: give "
+            "`solve` a solver that accelerates",
+        )
+
+    def solve(
+        self,
+        problem: Problem,
+        config: SinkhornConfig,
+        params: Any,
+        init: Potentials,
+        solver: Any = None,
+    ) -> Solution:
+        """Solve with `solver`, or with optimistix's plain fixed-point iteration."""
+        import lineax
+        import optimistix
+
+        if solver is None:
+            solver = optimistix.FixedPointIteration(rtol=0.0, atol=config.tolerance or 0.0)
+
+        def solve_one(problem: Problem, init: Potentials) -> Solution:
+            def again(at: Potentials, inputs: tuple[Problem, Any]) -> Potentials:
+                problem, params = inputs
+                moved, _ = config.step.step(
+                    problem, at, config.step.init(problem, params), jnp.zeros((), jnp.int32)
+                )
+                # Centre the potentials to make the fixed point unique.
+                return centred(moved) if problem.balanced else moved
+
+            fixed_point = optimistix.fixed_point(
+                again,
+                solver,
+                init,
+                args=(problem, params),
+                max_steps=config.iterations,
+                adjoint=optimistix.ImplicitAdjoint(lineax.AutoLinearSolver(well_posed=True)),
+                throw=False,
+            )
+            return Solution(
+                fixed_point.value,
+                jnp.asarray(fixed_point.stats["num_steps"], jnp.int32),
+                fixed_point.result == optimistix.RESULTS.successful,
+            )
+
+        for _ in problem.kernel.shape[:-2]:
+            solve_one = jax.vmap(solve_one)
+        return solve_one(problem, init)
+
+
+def centred(potentials: Potentials) -> Potentials:
+    """Shift the potentials to a column mean of 0, which leaves the plan the same."""
+    shift = potentials.column.mean(axis=-1, keepdims=True)
+    return Potentials(potentials.row + shift, potentials.column - shift)

@@ -1,0 +1,234 @@
+"""Dustbins, which take the patches that belong to no cluster, and their marginals."""
+
+import dataclasses
+import math
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.transport.diagnose import wide_dtype
+from crisalad_jax.utils.errors import InputError
+
+
+class Marginals(NamedTuple):
+    """Scores that include the dustbin, and the masses of rows and columns."""
+
+    scores: Float[Array, "*batch rows columns"]
+    log_mu: Float[Array, "*#batch rows"]
+    log_nu: Float[Array, "*#batch columns"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Dustbin(Part):
+    """Base class of dustbins, which take the patches that belong to no cluster.
+
+    The plan's first rows are the patches, and its first columns the clusters. A dustbin appends its
+    row or column after them.
+    """
+
+    scores: ClassVar[int] = 0
+    """Number of dustbin scores that the score network gives each patch, after the clusters'."""
+    takes_difference: ClassVar[bool] = False
+    """Whether its mass is the number of patches minus that of clusters, which must be positive."""
+
+    def init(self, key: PRNGKeyArray, dim: int) -> Any:
+        """Return the initial parameters, a pytree of arrays; by default None.
+
+        Args:
+            key: draws it.
+            dim: width of a patch's features.
+        """
+        return None
+
+    def marginals(
+        self,
+        params: Any,
+        scores: Float[Array, "*batch patches clusters"],
+        patches: Float[Array, "*batch patches dim"] | None,
+    ) -> Marginals:
+        """Return the scores that include the dustbin, and all masses.
+
+        Args:
+            params: the learnt parameters, or an array of the shape that the dustbin asks for.
+            scores: of each patch for each cluster, in float32 at least.
+            patches: the patches' features; None outside of a model.
+        """
+        raise NotImplementedError
+
+
+DUSTBINS = Registry("dustbin", Dustbin)
+
+
+def _check_shape(params: Any, expected: tuple[int, ...] | None, name: str) -> None:
+    shape = None if params is None else jnp.shape(params)
+    if shape != expected:
+        raise InputError(f"dustbin: found shape {shape}, expected {expected} for {name!r}")
+
+
+@DUSTBINS.register("none")
+@dataclasses.dataclass(frozen=True)
+class NoDustbin(Dustbin):
+    """No dustbin: the clusters share the patches' mass equally."""
+
+    def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
+        """Return the scores as they are."""
+        _check_shape(params, None, "none")
+        rows, clusters = scores.shape[-2:]
+        each = math.log(rows / clusters)
+        return Marginals(
+            scores, jnp.zeros(rows, scores.dtype), jnp.full(clusters, each, scores.dtype)
+        )
+
+
+@DUSTBINS.register("column")
+@dataclasses.dataclass(frozen=True)
+class ColumnDustbin(Dustbin):
+    """A column of one learnt score, as published; plain iterations do not depend on the score."""
+
+    takes_difference: ClassVar[bool] = True
+
+    def init(self, key: PRNGKeyArray, dim: int) -> Array:
+        """Start at a score of 1, as the public implementation."""
+        return jnp.ones(())
+
+    def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
+        """Append a column of the score."""
+        _check_shape(params, (), "column")
+        return _with_column(scores, jnp.asarray(params))
+
+
+@DUSTBINS.register("row and column")
+@dataclasses.dataclass(frozen=True)
+class RowAndColumnDustbin(Dustbin):
+    """A row and a column of one learnt score, as SuperGlue has them (Sarlin et al., CVPR 2020)."""
+
+    def init(self, key: PRNGKeyArray, dim: int) -> Array:
+        """Start at a score of 1."""
+        return jnp.ones(())
+
+    def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
+        """Append the column, then the row."""
+        _check_shape(params, (), "row and column")
+        rows, clusters = scores.shape[-2:]
+        score = jnp.asarray(params).astype(scores.dtype)
+        full = append_dustbin(scores, score)
+        last = jnp.broadcast_to(score, (*full.shape[:-2], 1, clusters + 1))
+        log_mu = jnp.append(jnp.zeros(rows, full.dtype), math.log(clusters))
+        log_nu = jnp.zeros(clusters + 1, full.dtype).at[-1].set(math.log(rows))
+        return Marginals(jnp.concatenate([full, last], axis=-2), log_mu, log_nu)
+
+
+@DUSTBINS.register("token")
+@dataclasses.dataclass(frozen=True)
+class TokenDustbin(Dustbin):
+    """A score that the score network gives each patch."""
+
+    scores: ClassVar[int] = 1
+    takes_difference: ClassVar[bool] = True
+
+    def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
+        """Use each patch's last score as the dustbin's, or `params` of one score a patch."""
+        if params is None:
+            scores, params = scores[..., :-1], scores[..., -1]
+        _check_shape(params, scores.shape[:-1], "token")
+        return _with_column(scores, jnp.asarray(params))
+
+
+@DUSTBINS.register("mass")
+@dataclasses.dataclass(frozen=True)
+class MassDustbin(Dustbin):
+    """A column of learnt mass, as the logit of its share; clusters share the rest equally."""
+
+    def init(self, key: PRNGKeyArray, dim: int) -> Array:
+        """Start at a logit of 1, a share of 0.73; the published one at 224 x 224 is 0.75."""
+        return jnp.ones(())
+
+    def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
+        """Append a column of zero scores."""
+        _check_shape(params, (), "mass")
+        rows, clusters = scores.shape[-2:]
+        logit = jnp.asarray(params)
+        share = jax.nn.log_sigmoid(jnp.stack([-logit, logit])).astype(scores.dtype) + math.log(rows)
+        log_nu = jnp.append(jnp.broadcast_to(share[0] - math.log(clusters), clusters), share[1])
+        full = append_dustbin(scores, jnp.zeros_like(logit))
+        return Marginals(full, jnp.zeros(rows, scores.dtype), log_nu)
+
+
+def _with_column(scores: Array, column: Array) -> Marginals:
+    log_mu, log_nu = log_marginals(*scores.shape[-2:], dtype=scores.dtype)
+    return Marginals(append_dustbin(scores, column), log_mu, log_nu)
+
+
+def append_dustbin(
+    scores: Float[Array, "*batch rows clusters"],
+    dustbin: float | Float[Array, ""] | Float[Array, "*batch rows"],
+) -> Float[Array, "*batch rows clusters+1"]:
+    """Append a column of the dustbin's score to the scores (paper Eq. 4).
+
+    Args:
+        scores: of each row for each cluster.
+        dustbin: one score for all rows, or one a row.
+
+    Returns:
+        The scores with one column more.
+
+    Raises:
+        InputError: the dustbin is neither a number nor as many as there are rows.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> append_dustbin(jnp.zeros((2, 1)), 1.0).tolist()
+        [[0.0, 1.0], [0.0, 1.0]]
+    """
+    column = jnp.asarray(dustbin).astype(scores.dtype)
+    if column.shape not in ((), scores.shape[:-1]):
+        raise InputError(f"dustbin: found shape {column.shape}, expected () or {scores.shape[:-1]}")
+    column = jnp.broadcast_to(column[..., None] if column.ndim else column, (*scores.shape[:-1], 1))
+    return jnp.concatenate([scores, column], axis=-1)
+
+
+def log_marginals(
+    rows: int, clusters: int, dtype: jnp.dtype | type = jnp.float32
+) -> tuple[Float[Array, " {rows}"], Float[Array, " {clusters}+1"]]:
+    """Compute SALAD's marginals: each row has mass 1, each cluster 1, the dustbin the rest.
+
+    Args:
+        rows: number of patches.
+        clusters: number of clusters, without the dustbin.
+        dtype: of the result.
+
+    Returns:
+        Logarithms of the rows' masses, and of the columns', the dustbin last.
+
+    Raises:
+        InputError: the dustbin's mass, `rows - clusters`, is not positive.
+
+    Example:
+        >>> [x.tolist() for x in log_marginals(3, 2)]
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    """
+    if rows <= clusters:
+        raise InputError(
+            f"transport: found {rows} patches for {clusters} clusters, expected more patches than "
+            "clusters: the dustbin's mass is their difference"
+        )
+    log_mu = jnp.zeros(rows, dtype)
+    log_nu = jnp.zeros(clusters + 1, dtype).at[-1].set(math.log(rows - clusters))
+    return log_mu, log_nu
+
+
+def widened(scores: Float[Array, "*batch patches clusters"]) -> Array:
+    """Convert scores of patches to float32 at least.
+
+    Raises:
+        InputError: they have not two axes, or one is empty.
+    """
+    if scores.ndim < 2 or 0 in scores.shape[-2:]:
+        raise InputError(
+            f"assign_with_dustbin: found scores of shape {scores.shape}, expected (..., patches, "
+            "clusters)"
+        )
+    return scores.astype(wide_dtype(scores))

@@ -1,0 +1,165 @@
+"""The entropic transport problem that a step is given, in the log or the scaling domain."""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from crisalad_jax.utils.pytree import pytree_dataclass, static_field
+
+SCALING_RANGE = 60
+"""Largest difference of two scores of a row, over epsilon, that the scaling domain is exact for.
+
+Within it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
+exp(-87), is no part of such a sum's last place."""
+
+
+class Potentials(NamedTuple):
+    """Dual variables over epsilon: the plan is exp(kernel + row + column)."""
+
+    row: Float[Array, "*batch rows"]
+    column: Float[Array, "*batch columns"]
+
+
+@pytree_dataclass
+class Problem:
+    """Scores and marginals of entropic transport, with sums taken in the log domain.
+
+    The last column is stored apart, because it is mostly an appended dustbin. The compiler then
+    need not write out the joined matrix, and the other columns keep a power of two.
+
+    Attributes:
+        clusters: all columns but the last of the scores over epsilon.
+        last: the last column.
+        log_mu: logarithms of the rows' masses.
+        log_nu: logarithms of the columns' masses.
+        row_tau: 1 where rows meet their marginals exactly; below 1 a Kullback-Leibler penalty of
+            weight epsilon * tau / (1 - tau) draws them there (Chizat et al., Math. Comp. 2018).
+        column_tau: the same for columns.
+
+    Example:
+        >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
+        >>> problem.over_rows(jnp.zeros(2)).shape
+        (2,)
+    """
+
+    clusters: Float[Array, "*batch rows clusters"]
+    last: Float[Array, "*batch rows"]
+    log_mu: Float[Array, "*batch rows"]
+    log_nu: Float[Array, "*batch clusters+1"]
+    row_tau: float = static_field(default=1.0)
+    column_tau: float = static_field(default=1.0)
+
+    @classmethod
+    def of(
+        cls,
+        kernel: Float[Array, "*batch rows columns"],
+        log_mu: Float[Array, "*batch rows"],
+        log_nu: Float[Array, "*batch columns"],
+        row_tau: float = 1.0,
+        column_tau: float = 1.0,
+    ) -> "Problem":
+        """Make a problem of the scores over epsilon and the logarithms of the masses."""
+        # Split, not two slices: their gradients would be two zero-padded matrices to add up.
+        clusters, last = jax.lax.split(kernel, (kernel.shape[-1] - 1, 1), axis=kernel.ndim - 1)
+        return Problem(clusters, last[..., 0], log_mu, log_nu, row_tau, column_tau)
+
+    @property
+    def kernel(self) -> Float[Array, "*batch rows columns"]:
+        """Scores divided by epsilon."""
+        return _joined(self.clusters, self.last)
+
+    @property
+    def balanced(self) -> bool:
+        """Whether both sides meet their marginals exactly at convergence."""
+        return self.row_tau == self.column_tau == 1
+
+    def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
+        """Return the logarithm of each row's sum of exp(kernel + column)."""
+        return jax.nn.logsumexp(self.kernel + column[..., None, :], axis=-1)
+
+    def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
+        """Return the logarithm of each column's sum of exp(kernel + row)."""
+        return jax.nn.logsumexp(self.kernel + row[..., :, None], axis=-2)
+
+    def log_plan(self, potentials: Potentials) -> Float[Array, "*batch rows columns"]:
+        """Return the logarithm of the plan that the potentials make."""
+        row, column = potentials
+        clusters = self.clusters + row[..., :, None] + column[..., None, :-1]
+        return _joined(clusters, self.last + row + column[..., -1:])
+
+    def zeros(self) -> Potentials:
+        """Return zero potentials."""
+        return zero_potentials(self.kernel)
+
+
+@pytree_dataclass
+class ScalingProblem(Problem):
+    """A problem with sums in the scaling domain: exponentials once, then matrix products.
+
+    Attributes:
+        row_max: each row's largest score.
+        gibbs: exp(clusters - row_max).
+        gibbs_last: exp(last - row_max).
+        in_range: whether the scores are close enough for the sums to be exact. Elsewhere all sums
+            are finite but wrong.
+    """
+
+    row_max: Float[Array, "*batch rows"] = dataclasses.field(kw_only=True)
+    gibbs: Float[Array, "*batch rows clusters"] = dataclasses.field(kw_only=True)
+    gibbs_last: Float[Array, "*batch rows"] = dataclasses.field(kw_only=True)
+    in_range: Bool[Array, ""] = dataclasses.field(kw_only=True)
+
+    @classmethod
+    def scaled(cls, problem: Problem) -> "ScalingProblem":
+        """Convert a problem to the scaling domain."""
+        clusters, last = jax.lax.stop_gradient((problem.clusters, problem.last))
+        row_max = jnp.maximum(clusters.max(axis=-1, initial=-jnp.inf), last)
+        row_min = jnp.minimum(clusters.min(axis=-1, initial=jnp.inf), last)
+        return cls(
+            **{field.name: getattr(problem, field.name) for field in dataclasses.fields(Problem)},
+            row_max=row_max,
+            gibbs=jnp.exp(problem.clusters - row_max[..., None]),
+            gibbs_last=jnp.exp(problem.last - row_max),
+            in_range=(row_max - row_min).max(initial=0) < SCALING_RANGE,
+        )
+
+    def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
+        """Return the logarithm of each row's sum of exp(kernel + column)."""
+        scaled, top = _exponentials(column)
+        sums = product("...nk,...k->...n", self.gibbs, scaled[..., :-1])
+        return self.row_max + self._log(sums + self.gibbs_last * scaled[..., -1:]) + top
+
+    def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
+        """Return the logarithm of each column's sum of exp(kernel + row)."""
+        scaled, top = _exponentials(row + self.row_max)
+        sums = product("...nk,...n->...k", self.gibbs, scaled)
+        last = (self.gibbs_last * scaled).sum(axis=-1, keepdims=True)
+        return self._log(jnp.concatenate([sums, last], axis=-1)) + top
+
+    def _log(self, sums: Array) -> Array:
+        return jnp.log(jnp.where(self.in_range, sums, 1))
+
+
+# HIGHEST: with the tensor cores' default of 10 bits the iteration does not converge.
+product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+
+
+def zero_potentials(kernel: Float[Array, "*batch rows columns"]) -> Potentials:
+    """Return zero potentials for scores of this shape."""
+    # Derive them from the kernel, so that under `shard_map` they vary over devices as it does.
+    row = 0 * jax.lax.stop_gradient(kernel)[..., 0]
+    return Potentials(row, jnp.repeat(row[..., :1], kernel.shape[-1], axis=-1))
+
+
+def _joined(clusters: Array, last: Array) -> Array:
+    return jnp.concatenate([clusters, last[..., None]], axis=-1)
+
+
+def _exponentials(potential: Array) -> tuple[Array, Array]:
+    """Return the exponentials of a potential minus its largest entry, and that entry."""
+    top = jax.lax.stop_gradient(potential.max(axis=-1, keepdims=True))
+    return jnp.exp(potential - top), top

@@ -1,0 +1,226 @@
+"""Solve a transport problem, or assign patches to clusters by solving one."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.transport.config import SinkhornConfig
+from crisalad_jax.transport.diagnose import check_inputs, check_step, marginal_error, wide_dtype
+from crisalad_jax.transport.differentiate import Optimistix, centred
+from crisalad_jax.transport.dustbin import DUSTBINS, Dustbin, widened
+from crisalad_jax.transport.problem import Potentials, Problem, zero_potentials
+from crisalad_jax.utils.errors import InputError
+
+
+class SinkhornResult(NamedTuple):
+    """A transport plan and how well it meets its marginals."""
+
+    log_plan: Float[Array, "*batch rows columns"]
+    potentials: Potentials
+    """Potentials, in balanced transport unique up to a constant: the columns' mean is 0."""
+    row_error: Float[Array, "*batch"]
+    """Largest difference between a row's mass and its marginal, relative to the marginal."""
+    column_error: Float[Array, "*batch"]
+    """Largest relative error of a column's mass. Rows are updated last, so iterations lower it."""
+    iterations: Int[Array, "*batch"]
+    """Number of iterations that were taken."""
+    converged: Bool[Array, "*batch"]
+    """Whether there is a tolerance and it was met. Both errors of a balanced entropic problem are
+    then within it, too. False without a tolerance, where nothing is known of convergence."""
+    finite: Bool[Array, "*batch"]
+    """Whether the potentials are finite."""
+
+
+def solve(
+    scores: Float[Array, "*batch rows columns"],
+    log_mu: Float[Array, "*#batch rows"],
+    log_nu: Float[Array, "*#batch columns"],
+    *,
+    epsilon: float | Float[Array, ""] = 1.0,
+    row_tau: float = 1.0,
+    column_tau: float = 1.0,
+    config: SinkhornConfig = SinkhornConfig(),
+    init: Potentials | None = None,
+    step_params: Any = None,
+    solver: Any = None,
+) -> SinkhornResult:
+    """Solve the entropic transport problem.
+
+    The plan is that of the largest <plan, scores> + epsilon * entropy for the given marginals
+    (paper Eq. 5). By default the algorithm is the published one: three times the two projections,
+    columns first and rows last, from zero potentials. Scores of half precision are widened to
+    float32. For finite scores the result is finite and does not depend on the domain: scores too
+    far apart for the scaling domain are solved again in the log domain.
+
+    Every gradient but "optimistix" works in forward and reverse mode, and has higher derivatives.
+    Under `vmap` every problem is solved in both domains: put a batch in the leading axes instead.
+
+    Args:
+        scores: finite; the gain of moving mass from a row to a column.
+        log_mu: logarithms of the rows' masses.
+        log_nu: logarithms of the columns' masses; where the step is `entropic` and neither
+            tau below 1 they sum to the same.
+        epsilon: entropic regularisation, above 0. It may be traced or learnt.
+        row_tau: 1 for rows that meet their marginals; below 1 a Kullback-Leibler penalty of
+            epsilon * row_tau / (1 - row_tau) draws them there. Static.
+        column_tau: the same for columns. Static.
+        config: step, stopping and gradient. Static.
+        init: potentials to start from, such as an earlier result's; by default zeros.
+        step_params: learnt parameters of the step (`Step.init_params`).
+        solver: an optimistix solver, where the gradient is "optimistix".
+
+    Returns:
+        The plan's logarithm, the potentials, and how well the plan meets its marginals.
+
+    Raises:
+        InputError: shapes that do not fit, numbers that are not real, a tau out of range, a solver
+            without its gradient, a step that returns anything but such potentials; and where values
+            are known (outside of `jit` and `grad`): scores that are not finite, masses that sum to
+            different totals, an epsilon of 0 or less or too small; or `config.throw`, and a
+            tolerance that was not met. Inside of `jit` the last is a RuntimeError of the compiled
+            program, and only if it uses a value of the result.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> log_mu, log_nu = jnp.log(jnp.array([0.5, 0.5])), jnp.log(jnp.array([0.7, 0.3]))
+        >>> result = solve(jnp.eye(2), log_mu, log_nu, epsilon=0.5)
+        >>> jnp.exp(result.log_plan).sum(axis=1).round(3).tolist()
+        [0.5, 0.5]
+    """
+    scores, log_mu, log_nu = jnp.asarray(scores), jnp.asarray(log_mu), jnp.asarray(log_nu)
+    for name, tau in (("row_tau", row_tau), ("column_tau", column_tau)):
+        require(0 < tau <= 1, f"sinkhorn: {name} found {tau}, expected more than 0 and at most 1")
+    # Totals may differ for a step of another problem, such as one with column capacities.
+    equal = row_tau == column_tau == 1 and config.step.entropic
+    check_inputs(scores, log_mu, log_nu, epsilon, equal_totals=equal)
+    if solver is not None and not isinstance(config.gradient, Optimistix):
+        raise InputError(
+            f"sinkhorn: found a solver beside gradient {config.gradient.part_name!r}, expected "
+            "'optimistix'"
+        )
+    arguments = scores, log_mu, log_nu, epsilon, init, step_params, row_tau, column_tau, config
+    # A solver need not be hashable, so it cannot be a static argument.
+    result = _compiled(*arguments) if solver is None else _solve(*arguments, solver)
+    return _require_converged(result, config) if config.throw else result
+
+
+def _solve(
+    scores: Array,
+    log_mu: Array,
+    log_nu: Array,
+    epsilon: float | Array,
+    init: Potentials | None,
+    step_params: Any,
+    row_tau: float,
+    column_tau: float,
+    config: SinkhornConfig,
+    solver: Any = None,
+) -> SinkhornResult:
+    wide = wide_dtype(scores)
+    kernel = scores.astype(wide) / jnp.asarray(epsilon, wide)
+    zeros = zero_potentials(kernel)
+    # Broadcast by the kernel, they vary over devices as it does.
+    log_mu, log_nu = log_mu.astype(wide) + zeros.row, log_nu.astype(wide) + zeros.column
+    problem = Problem.of(kernel, log_mu, log_nu, row_tau, column_tau)
+    check_step(config, problem, step_params)
+    problem = config.step.prepare(problem, step_params)
+    start = zeros
+    if init is not None:
+        start = Potentials(*(a.astype(wide) + b for a, b in zip(init, zeros, strict=True)))
+    options = {} if solver is None else {"solver": solver}
+    solution = config.gradient.solve(problem, config, step_params, start, **options)
+    potentials, step = solution.potentials, config.step
+    log_plan = step.log_plan(problem, potentials)
+    errors = marginal_error(log_plan, problem.log_mu, problem.log_nu)
+    finite = jnp.isfinite(potentials.row).all(axis=-1) & jnp.isfinite(potentials.column).all(
+        axis=-1
+    )
+    converged = jax.lax.stop_gradient(solution.met) & finite
+    if problem.balanced and config.tolerance is not None and step.entropic:
+        # The tolerance is on logarithms, whose rounding error is a few machine epsilons.
+        most = math.expm1(config.tolerance) + 16 * jnp.finfo(wide).eps
+        converged &= jnp.maximum(*errors) <= most
+    if problem.balanced and step.entropic:
+        potentials = centred(potentials)
+    return SinkhornResult(log_plan, potentials, *errors, solution.iterations, converged, finite)
+
+
+_compiled = jax.jit(_solve, static_argnames=("row_tau", "column_tau", "config"))
+
+
+def _require_converged(result: SinkhornResult, config: SinkhornConfig) -> SinkhornResult:
+    message = (
+        f"sinkhorn: found no convergence to {config.tolerance} in {config.iterations} iterations"
+    )
+    if isinstance(result.converged, Tracer):
+        import equinox
+
+        return equinox.error_if(result, ~result.converged.all(), message)
+    missed = int((~result.converged).sum())
+    if missed:
+        raise InputError(f"{message} for {missed} of {result.converged.size} problems")
+    return result
+
+
+def assign_with_dustbin(
+    scores: Float[Array, "*batch patches clusters"],
+    params: Any,
+    dustbin: Dustbin | str = "column",
+    *,
+    patches: Float[Array, "*batch patches dim"] | None = None,
+    epsilon: float | Float[Array, ""] = 1.0,
+    row_tau: float = 1.0,
+    column_tau: float = 1.0,
+    config: SinkhornConfig = SinkhornConfig(),
+    step_params: Any = None,
+) -> SinkhornResult:
+    """Assign patches to clusters by transport, with a dustbin for patches of no cluster.
+
+    Args:
+        scores: of each patch for each cluster.
+        params: learnt parameters of the dustbin. "column" and "row and column": its one score;
+            "token": a score a patch; "mass": the logit of the dustbin's share of all mass, the rest
+            being shared by the clusters alike; "none": None.
+        dustbin: a registered dustbin, or its name.
+        patches: features of the patches, for dustbins that look at them.
+        epsilon: see `solve`.
+        row_tau: see `solve`.
+        column_tau: see `solve`.
+        config: see `solve`.
+        step_params: see `solve`.
+
+    Returns:
+        The result of `solve`; rows of the plan are the patches, columns the clusters and then the
+        dustbin.
+
+    Raises:
+        InputError: what `solve` raises; no more patches than clusters where the dustbin's mass is
+            their difference; or parameters of another shape than the dustbin's.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> result = assign_with_dustbin(jnp.zeros((3, 2)), 1.0)
+        >>> result.log_plan.shape
+        (3, 3)
+    """
+    scores = widened(jnp.asarray(scores))
+    if isinstance(dustbin, str):
+        dustbin = DUSTBINS.make(dustbin)
+    full, log_mu, log_nu = dustbin.marginals(params, scores, patches)
+    result = solve(
+        full,
+        log_mu,
+        log_nu,
+        epsilon=epsilon,
+        row_tau=row_tau,
+        column_tau=column_tau,
+        config=config,
+        step_params=step_params,
+    )
+    # Drop the dustbin's own row.
+    return result._replace(log_plan=result.log_plan[..., : scores.shape[-2], :])

@@ -1,0 +1,276 @@
+"""Steps of a transport solver: the interface, the built-in steps and their registry."""
+
+import abc
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.transport.problem import Potentials, Problem, product
+
+
+@dataclasses.dataclass(frozen=True)
+class Step(Part, abc.ABC):
+    """One iteration of a transport solver: a frozen dataclass whose fields are its settings.
+
+    `step` alone is required. Stopping, acceleration and gradients use the methods and attributes of
+    a step, never its name.
+
+    Example:
+        >>> from crisalad_jax.sinkhorn import SinkhornConfig, register_step, solve
+        >>> @register_step("columns-alone")
+        ... def columns_alone(problem, potentials):
+        ...     column = problem.log_nu - problem.over_rows(potentials.row)
+        ...     return Potentials(potentials.row, column)
+        >>> zeros = jnp.zeros(2)
+        >>> config = SinkhornConfig(step="columns-alone", iterations=1)
+        >>> float(solve(jnp.eye(2), zeros, zeros, config=config).column_error)
+        0.0
+    """
+
+    entropic: ClassVar[bool] = False
+    """Whether the fixed point is the entropic plan of the problem. The closed-form gradient
+    requires it, and such a step counts as converged only if its marginals are met."""
+
+    def init_params(self, key: PRNGKeyArray) -> Any:
+        """Return the step's initial parameters, a pytree of arrays; by default None."""
+        return None
+
+    def prepare(self, problem: Problem, params: Any) -> Problem:
+        """Return the problem to solve, of the same shapes; by default the one that is given.
+
+        Apply learnt changes of the problem itself, such as of epsilon, here: every gradient and the
+        plan then depend on them.
+        """
+        return problem
+
+    def init(self, problem: Problem, params: Any) -> Any:
+        """Return the state before the first iteration, a pytree; by default the parameters."""
+        return params
+
+    @abc.abstractmethod
+    def step(
+        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
+    ) -> tuple[Potentials, Any]:
+        """Return the next potentials and state; `iteration` counts from 0."""
+
+    def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
+        """Return the error to compare with the tolerance: by default the largest change.
+
+        In a balanced problem a constant that moves between rows and columns does not count. The
+        rest is, to first order, the relative marginal error that the step corrected.
+        """
+        row, column = new.row - old.row, new.column - old.column
+        if problem.balanced:
+            # Weight by masses: where the rows are met, this constant is 0 to first order.
+            shift = (jax.nn.softmax(problem.log_nu) * column).sum(axis=-1, keepdims=True)
+            row, column = row + shift, column - shift
+        return jnp.maximum(jnp.abs(row).max(axis=-1), jnp.abs(column).max(axis=-1))
+
+    def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
+        """Return the potentials of the plan, after the last iteration."""
+        return potentials
+
+    def log_plan(
+        self, problem: Problem, potentials: Potentials
+    ) -> Float[Array, "*batch rows columns"]:
+        """Return the logarithm of the plan; by default kernel + row + column."""
+        return problem.log_plan(potentials)
+
+
+def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the methods of a step that is a function of (problem, potentials[, iteration])."""
+    count = len(inspect.signature(function).parameters)
+
+    def step(
+        self: Step, problem: Problem, potentials: Potentials, state: Any, iteration: Array
+    ) -> tuple[Potentials, Any]:
+        arguments = (problem, potentials, iteration)[:count]
+        return function(*arguments), state
+
+    return {"step": step}
+
+
+STEPS = Registry("step", Step, of_function=_of_function)
+
+
+@STEPS.register("sinkhorn")
+@dataclasses.dataclass(frozen=True)
+class SinkhornStep(Step):
+    """Meet the columns' marginals, then the rows' (paper Eq. 5).
+
+    A `relaxation` of w makes each half step w times as long, in every entry where the dual
+    objective does not decrease (Thibault et al., Algorithms 2021, with one w for all entries).
+    """
+
+    entropic: ClassVar[bool] = True
+    relaxation: float = 1.0
+    """Factor of the length of each half step, from 1 to less than 2."""
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        require(
+            1 <= self.relaxation < 2,
+            f"SinkhornStep.relaxation: found {self.relaxation}, expected from 1 to less than 2",
+        )
+
+    def step(
+        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
+    ) -> tuple[Potentials, Any]:
+        """Take both half steps."""
+        column = problem.column_tau * (problem.log_nu - problem.over_rows(potentials.row))
+        column = self._further(potentials.column, column, problem.column_tau)
+        row = problem.row_tau * (problem.log_mu - problem.over_columns(column))
+        return Potentials(self._further(potentials.row, row, problem.row_tau), column), state
+
+    def _further(self, old: Array, new: Array, tau: float) -> Array:
+        if self.relaxation == 1:
+            return new
+        change = new - old
+        beyond = (self.relaxation - 1) * change
+        # The dual's gain by this entry, divided by its mass at `new`.
+        gain = jnp.exp(-change) - jnp.exp(beyond)
+        if tau == 1:
+            gain += self.relaxation * change
+        else:
+            penalty = tau / (1 - tau)
+            gain += penalty * (jnp.exp(change / penalty) - jnp.exp(-beyond / penalty))
+        # Infinity minus infinity counts as no gain, too.
+        return jnp.where(gain >= 0, new + beyond, new)
+
+    def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
+        """Project onto the rows' marginals, which a relaxed step may have left.
+
+        Without the projection the rows' masses could overflow.
+        """
+        if self.relaxation == 1:
+            return potentials
+        row = problem.row_tau * (problem.log_mu - problem.over_columns(potentials.column))
+        return Potentials(row, potentials.column)
+
+
+@STEPS.register("newton")
+@dataclasses.dataclass(frozen=True)
+class NewtonStep(Step):
+    """Newton's method on the semi-dual, a concave function of the column potentials alone.
+
+    The rows' marginals are always met (Brauer et al., 2017), and the Hessian is a weighted graph
+    Laplacian between columns. Candidates are full and shortened Newton steps and Sinkhorn's step.
+    The one with the smallest relative marginal error is taken, so that the error never grows.
+    Problems must be balanced.
+    """
+
+    entropic: ClassVar[bool] = True
+
+    def step(
+        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
+    ) -> tuple[Potentials, Any]:
+        """Take the best of five steps.
+
+        Raises:
+            InputError: the problem's marginals are relaxed.
+        """
+        require(
+            problem.balanced,
+            f"step newton: found row_tau {problem.row_tau} and column_tau {problem.column_tau}, "
+            "expected 1: it is for balanced problems",
+        )
+        column = potentials.column
+        row = problem.log_mu - problem.over_columns(column)
+        log_plan = problem.log_plan(Potentials(row, column))
+        over_rows = problem.over_rows(row)
+        gradient = jnp.exp(problem.log_nu) - jnp.exp(over_rows + column)
+        shares = jnp.exp(log_plan - problem.log_mu[..., None])
+        change = solve_columns(jnp.exp(log_plan), shares, gradient, 1.0, 1.0)
+        lengths = jnp.array([1.0, 0.5, 0.25, 0.0625], change.dtype)
+        tries = column + lengths.reshape(-1, *[1] * change.ndim) * change
+        tries = jnp.concatenate([tries, (problem.log_nu - over_rows)[None]])
+
+        def left(column: Array) -> Array:
+            row = problem.log_mu - problem.over_columns(column)
+            return column_error(problem, Potentials(row, column))
+
+        errors = jax.lax.map(left, tries)
+        best = jnp.argmin(jnp.where(jnp.isnan(errors), jnp.inf, errors), axis=0)
+        column = jnp.take_along_axis(tries, best[None, ..., None], axis=0)[0]
+        return Potentials(problem.log_mu - problem.over_columns(column), column), state
+
+    def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
+        """Return the remaining marginal error: far from the solution a step may be small."""
+        return column_error(problem, new)
+
+
+@STEPS.register("softmax")
+@dataclasses.dataclass(frozen=True)
+class SoftmaxStep(Step):
+    """Distribute every row by a softmax: a baseline without transport."""
+
+    def step(
+        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
+    ) -> tuple[Potentials, Any]:
+        """Meet the rows' marginals, and ignore the columns'."""
+        column = problem.zeros().column
+        return Potentials(problem.log_mu - problem.over_columns(column), column), state
+
+
+@STEPS.register("dual-softmax")
+@dataclasses.dataclass(frozen=True)
+class DualSoftmaxStep(Step):
+    """Multiply a softmax of the rows by one of the columns: a baseline without transport."""
+
+    def step(
+        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
+    ) -> tuple[Potentials, Any]:
+        """Normalise rows and columns, independently of each other."""
+        row, column = problem.zeros()
+        return Potentials(-problem.over_columns(column), -problem.over_rows(row)), state
+
+    def log_plan(
+        self, problem: Problem, potentials: Potentials
+    ) -> Float[Array, "*batch rows columns"]:
+        """Return the sum of both log-softmaxes."""
+        return problem.kernel + problem.log_plan(potentials)
+
+
+def column_error(problem: Problem, potentials: Potentials) -> Float[Array, "*batch"]:
+    """Return the largest difference of the logarithms of a column's mass and of its marginal."""
+    masses = problem.over_rows(potentials.row) + potentials.column
+    return jnp.abs(masses - problem.log_nu).max(axis=-1)
+
+
+def solve_columns(
+    plan: Float[Array, "*batch rows columns"],
+    shares: Float[Array, "*batch rows columns"],
+    target: Float[Array, "*batch columns"],
+    row_tau: float,
+    column_tau: float,
+) -> Float[Array, "*batch columns"]:
+    """Solve the columns' part of the linearised optimality conditions.
+
+    The matrix is diag(masses / column_tau) - row_tau * shares^T plan. It is written as a Laplacian,
+    which avoids cancellation. Where both sides are balanced the last column's unknown is 0.
+
+    Args:
+        plan: masses.
+        shares: each row's masses divided by their sum.
+        target: the right-hand side.
+        row_tau: see `Problem`.
+        column_tau: see `Problem`.
+    """
+    # The floor handles columns so far from all rows that their masses are 0.
+    masses = jnp.maximum(plan.sum(axis=-2), jnp.finfo(plan.dtype).tiny ** 0.5)
+    identity = jnp.eye(masses.shape[-1], dtype=plan.dtype)
+    weights = row_tau * product("...nk,...nl->...kl", shares, plan) * (1 - identity)
+    # The epsilons prevent a division by zero for clusters that share no row.
+    slack = 1 / column_tau - row_tau + 8 * jnp.finfo(plan.dtype).eps
+    diagonal = weights.sum(axis=-1) + masses * slack
+    if row_tau == column_tau == 1:
+        diagonal = diagonal.at[..., -1].add(masses[..., -1])
+    factor = jax.scipy.linalg.cho_factor(diagonal[..., None] * identity - weights)
+    return jax.scipy.linalg.cho_solve(factor, target[..., None])[..., 0]

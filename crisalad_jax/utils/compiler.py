@@ -1,0 +1,169 @@
+"""Platform settings: compiler options, virtual devices of a CPU, and the compile cache."""
+
+import contextlib
+import contextvars
+import functools
+import os
+import pathlib
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from crisalad_jax.utils.host import usable_cores
+
+_FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
+_LIBRARIES: dict[str, dict[str, bool | str]] = {
+    # By default jaxlib compiles a whole attention to the library YNN, which is slower than single
+    # products by Eigen. For a single product both are equally fast (docs/performance.md).
+    "Eigen": {_FUSIONS: ""},
+    # A few percent faster than Eigen for large matrices, and slower for small ones. A program with
+    # its products cannot be stored in the compile cache.
+    "oneDNN": {
+        _FUSIONS: "",
+        "xla_cpu_use_onednn": True,
+        "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
+    },
+    # The only library that uses a processor's bfloat16 instructions.
+    "YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"},
+}
+# By default XLA copies all weights of a layer out of their stack before the layer runs, which takes
+# up to a third more memory.
+_LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
+_SMALL = 2**23
+"""Number of parameters of a large model: `tiny` has an eighth of it, `s14` three times as many."""
+_PORTABLE = contextvars.ContextVar("portable", default=False)
+
+
+@functools.cache
+def compiler_options(library: str, *, least_memory: bool = False) -> dict[str, bool | str]:
+    """Return the XLA options that give a CPU's matrix products to "Eigen", "oneDNN" or "YNN".
+
+    `least_memory` schedules operations for the least memory. A training step gets slower by it,
+    and no smaller. Options that this jaxlib does not know are left out, and all on other platforms.
+    """
+    if jax.default_backend() != "cpu":
+        return {}
+    known = {}
+    wanted = _LIBRARIES[library] | (_LEAST_MEMORY if least_memory else {})
+    for name, value in wanted.items():
+        try:
+            jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
+        except Exception:  # jaxlib's own class, which differs by version
+            continue
+        known[name] = value
+    return known
+
+
+@contextlib.contextmanager
+def portable() -> Iterator[None]:
+    """Trace for any platform while the block runs: make no choice by the platform that traces."""
+    token = _PORTABLE.set(True)
+    try:
+        yield
+    finally:
+        _PORTABLE.reset(token)
+
+
+def has_fused_attention() -> bool:
+    """Return whether cuDNN's attention, which never writes scores to memory, compiles here."""
+    return not _PORTABLE.get() and _compiles_fused_attention()
+
+
+@functools.cache
+def _compiles_fused_attention() -> bool:
+    if jax.default_backend() != "gpu":
+        return False
+    token = jax.ShapeDtypeStruct((1, 64, 1, 64), jnp.bfloat16)
+    attention = functools.partial(jax.nn.dot_product_attention, implementation="cudnn")
+    try:
+        jax.jit(attention).lower(token, token, token).compile()
+    except Exception:  # a missing or old cuDNN and an old GPU raise different errors
+        return False
+    return True
+
+
+def product_dtype(dtype: Any) -> Any:
+    """Return the fastest output type for a product of matrices of `dtype`, before rounding to it.
+
+    A CPU uses its bfloat16 units only for products with float32 outputs. A GPU rounds as it writes,
+    at no cost.
+    """
+    widens = _PORTABLE.get() or jax.default_backend() == "cpu"
+    return jnp.promote_types(dtype, jnp.float32) if widens else dtype
+
+
+def jit(
+    function: Callable[..., Any], *, runs_long: bool = False, **options: Any
+) -> Callable[..., Any]:
+    """Wrap a function in `jax.jit` with `compiler_options`, outside of other transformations.
+
+    Inside another transformation the outermost `jit` decides, because JAX takes no other options.
+    Eigen computes the products. oneDNN computes those of a large model that `runs_long`, which the
+    compile cache does not store. YNN computes those where the `compute_dtype` of a configuration
+    among the arguments is bfloat16. Nothing else decides, so results have the same bits with and
+    without a compile cache. A function that does not run long is scheduled for the least memory.
+    The returned function has `lower` too.
+    """
+    inner = jax.jit(function, **options)
+
+    @functools.cache
+    def with_products_of(library: str) -> Any:
+        chosen = compiler_options(library, least_memory=not runs_long)
+        return jax.jit(function, compiler_options=chosen, **options)
+
+    def outermost(leaves: Sequence[Any]) -> Any:
+        if any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves):
+            return with_products_of("YNN")
+        large = runs_long and _numbers(leaves) >= _SMALL
+        return with_products_of("oneDNN" if large else "Eigen")
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        leaves = jax.tree.leaves((args, kwargs))
+        # Arrays made inside a trace are traced, even if no argument is.
+        traced = any(isinstance(leaf, Tracer) for leaf in (*leaves, jax.lax.full((), 0)))
+        if traced and _PORTABLE.get():
+            return function(*args, **kwargs)  # `inner` may have a cached trace that is not portable
+        return (inner if traced else outermost(leaves))(*args, **kwargs)
+
+    def lower(*args: Any, **kwargs: Any) -> Any:
+        return outermost(jax.tree.leaves((args, kwargs))).lower(*args, **kwargs)
+
+    call.__dict__["lower"] = lower
+    return call
+
+
+def _numbers(leaves: Sequence[Any]) -> int:
+    """Count the floating-point numbers of arrays: a model's parameters, not 8-bit images."""
+    arrays = (leaf for leaf in leaves if hasattr(leaf, "dtype"))
+    return sum(leaf.size for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.floating))
+
+
+def set_up() -> None:
+    """Set up virtual devices and the compile cache of a program, before it uses JAX.
+
+    The CPU becomes one device for each core, so that a batch can be sharded over them
+    (`devices_for`). That is faster than using all cores for every product. Compiled programs are
+    stored in `~/.cache/crisalad-jax` (or under XDG_CACHE_HOME), if it is writable. The environment
+    variables JAX_NUM_CPU_DEVICES, XLA_FLAGS and JAX_COMPILATION_CACHE_DIR take precedence.
+    """
+    told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get(
+        "XLA_FLAGS", ""
+    )
+    if not told and jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
+        with contextlib.suppress(RuntimeError):  # JAX has been used already
+            jax.config.update("jax_num_cpu_devices", usable_cores())
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore
+        with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
+            cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+            cache /= "crisalad-jax"
+            cache.mkdir(parents=True, exist_ok=True)
+            if os.access(cache, os.W_OK):
+                jax.config.update("jax_compilation_cache_dir", str(cache))
+        # Programs that compile faster than this take as long to load from the cache.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    warnings.filterwarnings("ignore", "Error writing .* onednn-fusion")  # see `jit`

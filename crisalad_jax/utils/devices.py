@@ -1,0 +1,104 @@
+"""Devices that share a batch of images."""
+
+import math
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from crisalad_jax.utils.errors import InputError
+
+SHARD_FROM = 2**14
+"""Smallest number of elements of a sharded array: a gather of smaller ones costs too much."""
+
+
+_Tree = TypeVar("_Tree")
+
+
+class Devices(NamedTuple):
+    """The mesh of devices that a batch of images is sharded over; see `devices_for`."""
+
+    mesh: Mesh
+
+    def shard_batch(self, rows: np.ndarray) -> jax.Array:
+        """Shard a batch over the devices, with equally many rows on each.
+
+        Each process gives the rows of its own devices, in the order of the processes.
+        """
+        sharding = NamedSharding(self.mesh, PartitionSpec("image"))
+        return jax.make_array_from_process_local_data(sharding, rows)
+
+    def replicate(self, tree: _Tree) -> _Tree:
+        """Replicate arrays on all devices; every process must give the same arrays.
+
+        The virtual devices of a CPU share one buffer with a numpy array, which must not be changed.
+        """
+        here = Mesh(np.array(self.mesh.local_devices), ("image",))
+
+        def put(leaf: Any) -> jax.Array:
+            host = np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
+            alike = NamedSharding(here, PartitionSpec())
+            array = jax.device_put(host, alike, may_alias=True)
+            if here == self.mesh:
+                return array
+            everywhere = NamedSharding(self.mesh, PartitionSpec())
+            parts = [shard.data for shard in array.addressable_shards]
+            return jax.make_array_from_single_device_arrays(array.shape, everywhere, parts)
+
+        return jax.tree.map(put, tree)
+
+    def shard(self, tree: _Tree) -> _Tree:
+        """Shard arrays over the devices by `shard_spec`; all processes give the same whole ones."""
+
+        def put(leaf: Any) -> jax.Array:
+            host = np.array(leaf)
+            return jax.make_array_from_callback(
+                host.shape, shard_spec(self.mesh, host.shape), host.__getitem__
+            )
+
+        return jax.tree.map(put, tree)
+
+    def gather(self, tree: _Tree) -> _Tree:
+        """Gather arrays: replicated ones on one device, sharded ones whole on the host.
+
+        Arrays are gathered one after the other, so that no device holds all of them. All processes
+        must call it if any array is sharded.
+        """
+        alike = NamedSharding(self.mesh, PartitionSpec())
+
+        def gather(leaf: jax.Array) -> Any:
+            if leaf.is_fully_replicated:
+                return leaf.addressable_data(0)
+            return np.asarray(jax.device_put(leaf, alike).addressable_data(0))
+
+        return jax.tree.map(gather, tree)
+
+
+def shard_spec(mesh: Mesh, shape: tuple[int, ...]) -> NamedSharding:
+    """Return the sharding of an array: along its longest axis that the devices divide.
+
+    Small arrays, and arrays without such an axis, are replicated.
+    """
+    lengths = [size if size % mesh.size == 0 else 0 for size in shape]
+    if math.prod(shape) < SHARD_FROM or not any(lengths):
+        return NamedSharding(mesh, PartitionSpec())
+    longest = lengths.index(max(lengths))
+    return NamedSharding(mesh, PartitionSpec(*[None] * longest, mesh.axis_names[0]))
+
+
+def devices_for(count: int, *, processes: bool = False) -> Devices:
+    """Choose the most devices that divide `count` images, of this process or equally of all.
+
+    Raises:
+        InputError: the processes cannot share them.
+    """
+    groups = [jax.local_devices()]
+    if processes:
+        groups = [jax.local_devices(process_index=i) for i in range(jax.process_count())]
+    if count % len(groups):
+        raise InputError(f"processes: found {len(groups)}, expected a divisor of {count} images")
+    each = count // len(groups)
+    fewest = min(map(len, groups))
+    most = max(n for n in range(1, fewest + 1) if each % n == 0)
+    return Devices(Mesh(np.array([group[:most] for group in groups]).ravel(), ("image",)))

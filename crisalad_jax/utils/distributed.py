@@ -1,0 +1,160 @@
+"""Coordinate one training run in several processes, on one host or many (`jax.distributed`).
+
+All processes run the same program. Process 0 is the primary: it alone reads and writes the run's
+folder.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from crisalad_jax.utils.errors import InputError, Stopped
+
+_MESSAGE = 2**16
+"""Number of bytes that `run_on_primary` broadcasts: fixed, because JAX compiles for each size."""
+ANOTHER_FAILED = "processes: another one failed; see what it says"
+_T = TypeVar("_T")
+
+
+def join_processes(coordinator: str, count: int | None, index: int | None) -> None:
+    """Join a group of processes, before JAX is used for anything else.
+
+    On CPUs each process has one device. With several, whose threads wait for other processes, the
+    group could deadlock.
+
+    Args:
+        coordinator: HOST:PORT of process 0, where all can reach it; or "auto" under what JAX knows
+            to ask (Slurm, Open MPI, Kubernetes, Cloud TPU), for the other two as well.
+        count: how many there are.
+        index: which this is, from 0.
+
+    Raises:
+        InputError: the three do not fit each other, or the others cannot be met.
+    """
+    if coordinator == "auto":
+        if (count, index) != (None, None):
+            raise InputError("processes: found auto and a number, expected auto alone")
+        given: dict[str, Any] = {}
+    elif (
+        count is None
+        or index is None
+        or not 0 <= index < count
+        or not re.fullmatch(r".+:\d+", coordinator)
+    ):
+        raise InputError(
+            f"processes: found process {index} of {count} with {coordinator}, expected "
+            "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, from 0 and "
+            "below the count"
+        )
+    else:
+        given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
+        # Otherwise JAX would ask the scheduler which devices this process has.
+        given["cluster_detection_method"] = "deactivate"
+    jax.config.update("jax_num_cpu_devices", 1)
+    # JAX's own handler of SIGTERM would hide the signal from this program.
+    jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(**given)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"processes: cannot meet the others: {error}") from error
+
+
+def is_primary() -> bool:
+    """Return whether this process is the one that reads and writes the run's folder."""
+    return jax.process_index() == 0
+
+
+def run_on_primary(work: Callable[[], _T]) -> _T:
+    """Run `work` in the primary process alone; return its value, a JSON value, in every process.
+
+    Raises:
+        InputError, Stopped: in every process, where `work` raises it.
+    """
+    if jax.process_count() == 1:
+        return work()
+    message: dict[str, Any] = {"error": "it failed"}
+    value = None
+    try:
+        if is_primary():
+            value = work()
+            message = {"value": value}
+    except Stopped as stopped:
+        message = {"stopped": stopped.number}
+        raise
+    except (InputError, OSError) as error:
+        message = {"error": str(error)}
+        raise
+    finally:
+        received = _broadcast_json(message)
+    if is_primary():
+        return value  # pyright: ignore[reportReturnType]
+    if "stopped" in received:
+        raise Stopped(received["stopped"])
+    if "error" in received:
+        raise InputError(f"process 0: {received['error']}")
+    return received["value"]
+
+
+def _broadcast_json(value: dict[str, Any]) -> dict[str, Any]:
+    """Return the primary process's value in every process."""
+    text = json.dumps(value).encode()
+    if len(text) > _MESSAGE:
+        raise ValueError(f"found a message of {len(text)} bytes, expected at most {_MESSAGE}")
+    padded = np.frombuffer(text.ljust(_MESSAGE), np.uint8)
+    received = np.asarray(multihost_utils.broadcast_one_to_all(padded), np.uint8)
+    return json.loads(received.tobytes())
+
+
+def broadcast(tree: _T) -> _T:
+    """Return the primary process's arrays in every process; all give arrays of the same shapes."""
+    return tree if jax.process_count() == 1 else multihost_utils.broadcast_one_to_all(tree)
+
+
+def all_max(*numbers: int) -> tuple[int, ...]:
+    """Return the largest number of all processes in each place; below 2**32, from 0."""
+    return tuple(_gather(*numbers).max(axis=0).tolist())
+
+
+def check_same(name: str, number: int) -> None:
+    """Check that all processes give the same number for `name`.
+
+    Raises:
+        InputError: they do not, in every process.
+    """
+    numbers = _gather(number)[:, 0]
+    others = np.flatnonzero(numbers != numbers[0])
+    if others.size:
+        raise InputError(
+            f"processes: found other {name} in process {others[0]} than in 0, expected the same"
+        )
+
+
+def _gather(*numbers: int) -> np.ndarray:
+    mine = np.asarray(numbers, np.uint32)
+    if jax.process_count() == 1:
+        return mine[None]
+    return np.asarray(multihost_utils.process_allgather(mine))
+
+
+def raise_together(work: Callable[[], _T]) -> _T:
+    """Run `work` in every process and return its value; raise in all if it fails in one.
+
+    Raises:
+        InputError: it failed in another process. In that one, its own error.
+    """
+    error, value = None, None
+    try:
+        value = work()
+    except Exception as raised:
+        error = raised
+    (failed,) = all_max(error is not None)
+    if error is not None:
+        raise error
+    if failed:
+        raise InputError(ANOTHER_FAILED)
+    return value  # pyright: ignore[reportReturnType]

@@ -1,0 +1,31 @@
+"""Messages about optional dependencies (extras) that are not installed."""
+
+from collections.abc import Mapping
+
+_CLI = ("tyro", "rich")
+EXTRAS: Mapping[str, tuple[str, ...]] = {
+    "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
+    "maps": ("faiss", "h5py", *_CLI),
+    "report": ("jinja2", "matplotlib", *_CLI),
+    "export": ("flatbuffers", *_CLI),
+    "milvus": ("pymilvus", "milvus_lite"),
+    "convert": ("torch", *_CLI),
+}
+"""Modules of each extra, by its name."""
+
+
+def missing_extra(error: ModuleNotFoundError, what: str) -> str:
+    """Return a message that names the extra of a missing module, and how to install it.
+
+    Raises:
+        ModuleNotFoundError: the error itself, where the module is of no extra.
+    """
+    name = (error.name or "").partition(".")[0]
+    extra = next((extra for extra, modules in EXTRAS.items() if name in modules), None)
+    if extra is None:
+        raise error
+    others = "" if extra in ("milvus", "convert") else " (or [all])"
+    return (
+        f"{what}: found no module {name}, expected it with the extra {extra}: "
+        f"pip install 'crisalad-jax[{extra}]'{others}"
+    )

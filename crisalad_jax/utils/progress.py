@@ -1,0 +1,71 @@
+"""Progress on the terminal: a bar with rate and time left, on stderr, silent when asked."""
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+
+class Bar:
+    """A progress bar, or only its messages where no bar is drawn."""
+
+    def __init__(self, progress: Any = None, task: Any = None) -> None:
+        """Wrap a task of rich's `progress`; without it nothing is drawn. See `progress_bar`."""
+        self._progress, self._task = progress, task
+
+    def advance(self, count: int, note: str = "") -> None:
+        """Advance by `count` units, and show a short note behind the bar."""
+        if self._progress is not None:
+            self._progress.update(self._task, advance=count, note=note)
+
+    def say(self, line: str) -> None:
+        """Print a line that stays, above the bar."""
+        if self._progress is not None:
+            self._progress.console.print(line, soft_wrap=True, highlight=False)
+
+
+class _Lines(Bar):
+    """The messages alone, for installations without rich (every extra installs it)."""
+
+    def say(self, line: str) -> None:
+        print(line, file=sys.stderr)
+
+
+@contextlib.contextmanager
+def progress_bar(label: str, total: int, unit: str, *, quiet: bool, done: int = 0) -> Iterator[Bar]:
+    """Show the progress of long work while the block runs; without rich, only its messages.
+
+    Args:
+        label: what the work is.
+        total: number of units.
+        unit: what is counted, for the rate.
+        quiet: show nothing.
+        done: units that were done before, which do not count for the rate.
+    """
+    if quiet:
+        yield Bar()
+        return
+    try:
+        import rich.console
+        import rich.progress as parts
+    except ModuleNotFoundError:
+        yield _Lines()
+        return
+
+    class Rate(parts.ProgressColumn):
+        def render(self, task: parts.Task) -> str:
+            speed = task.finished_speed or task.speed
+            return "" if speed is None else f"{speed:.1f} {unit}/s"
+
+    progress = parts.Progress(
+        parts.TextColumn("{task.description}"),
+        parts.BarColumn(bar_width=28),
+        parts.TaskProgressColumn(),
+        parts.TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        Rate(),
+        parts.TimeRemainingColumn(elapsed_when_finished=True),
+        parts.TextColumn("{task.fields[note]}"),
+        console=rich.console.Console(stderr=True),
+    )
+    with progress:
+        yield Bar(progress, progress.add_task(label, total=total, completed=done, note=""))

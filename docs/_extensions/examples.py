@@ -1,0 +1,19 @@
+"""Make docstrings fit for griffe and Markdown.
+
+griffe knows the section `Examples:` alone, and Markdown takes <a, b> for a tag.
+"""
+
+import re
+from typing import Any
+
+import griffe
+
+
+class ExampleSections(griffe.Extension):
+    """Change every docstring before it is parsed."""
+
+    def on_instance(self, *, obj: griffe.Object, **kwargs: Any) -> None:
+        """Change one docstring."""
+        if obj.docstring is not None:
+            text = re.sub(r"^Example:$", "Examples:", obj.docstring.value, flags=re.MULTILINE)
+            obj.docstring.value = re.sub(r"<(\w+, \w+)>", r"&lt;\1&gt;", text)

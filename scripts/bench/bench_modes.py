@@ -1,0 +1,184 @@
+"""What bfloat16 gains and loses beside float32, and why there is no int8, in one run.
+
+    python scripts/bench/bench_modes.py [--out docs/performance] [--page docs/performance.md]
+        [--presets s14 b14] [--batch 8] [--weights demo/run/last.safetensors --data demo/city/test]
+
+Three tables. One product of matrices, of the size of `b14`'s widest: its rate by type and by the
+library that XLA gives it to. Descriptors of a batch, images spread over the devices: times as fast
+as float32, and the cosine of each to its own in float32; parameters are those of the parity checks,
+random. And a trained model, by default the demo's, if it is there: cosines, and Recall@K in both.
+`timing.py` says how contenders are timed.
+"""
+
+import argparse
+import dataclasses
+import functools
+import itertools
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from tables import Study, Table, bars, count, flags, leave, read
+from timing import measured, race, ratio, times
+
+# After timing, which says how many devices there are.
+import jax  # isort: skip
+import jax.numpy as jnp  # isort: skip
+
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.model import Crisalad, describe
+from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.utils import compiler
+from crisalad_jax.utils.devices import devices_for
+from parity.cases.case import build, convert, random
+
+TYPES = {"float32": "float32", "bfloat16": "float32", "int8": "int32"}
+"""What is multiplied, and in what it is added up."""
+DEFAULT = "jaxlib's choice"
+LIBRARIES = (DEFAULT, "Eigen", "oneDNN", "YNN")
+ROWS, WIDTH, HIDDEN = 2056, 768, 3072
+"""Tokens of eight images through `b14`'s first feed-forward layer."""
+
+
+def product(dtype: str, library: str) -> Callable[[], Any]:
+    generator = np.random.default_rng(0)
+    a, b = (
+        jnp.asarray(generator.integers(-100, 100, shape), dtype)
+        for shape in ((ROWS, WIDTH), (WIDTH, HIDDEN))
+    )
+    multiply = functools.partial(jnp.matmul, preferred_element_type=TYPES[dtype])
+    chosen = {} if library == DEFAULT else compiler.compiler_options(library)
+    compiled = jax.jit(multiply, compiler_options=chosen)
+    return lambda: jax.block_until_ready(compiled(a, b))
+
+
+def products(arguments: argparse.Namespace) -> Study:
+    libraries = LIBRARIES if jax.default_backend() == "cpu" else (DEFAULT,)
+    calls = {
+        f"{dtype}, {library}": product(dtype, library) for dtype in TYPES for library in libraries
+    }
+    timed = race(calls, arguments.rounds, 5)
+    values, rows = [], []
+    for (dtype, sums), library in itertools.product(TYPES.items(), libraries):
+        faster = ratio(timed[f"float32, {DEFAULT}"], timed[f"{dtype}, {library}"])
+        values.append({"type": dtype, "contender": library, "faster": faster})
+        rows.append((dtype, sums, library, times(faster)))
+    size = f"{ROWS} x {WIDTH} by {WIDTH} x {HIDDEN}"
+    caption = f"One product, {size}, {measured(arguments.rounds)}."
+    header = ("type", "sums", "library", f"times as fast as float32, {DEFAULT}")
+    figure = bars(values, lambda value: value["type"], "faster", "times float32")
+    return Study(Table(header, rows, caption, 3), values, figure)
+
+
+def cosines(narrow: np.ndarray, wide: np.ndarray) -> np.ndarray:
+    """Of unit vectors."""
+    return np.sum(narrow.astype(np.float64) * wide, axis=-1)
+
+
+def in_type(config: ModelConfig, dtype: str) -> ModelConfig:
+    return dataclasses.replace(config, compute_dtype=dtype)
+
+
+def described(params: Crisalad, config: ModelConfig, images: np.ndarray) -> Callable[[], Any]:
+    devices = devices_for(len(images))
+    everywhere, spread = devices.replicate(params), devices.shard_batch(images)
+    return lambda: jax.block_until_ready(describe(everywhere, spread, config))
+
+
+def speed(arguments: argparse.Namespace) -> Study:
+    values, rows = [], []
+    for preset in arguments.presets:
+        model = build(PRESETS[preset], "float32", random(preset, 0))
+        params, config = convert(model)[0], model.config
+        shape = (arguments.batch, *config.image_size, 3)
+        images = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+        calls = {
+            dtype: described(params, in_type(config, dtype), images)
+            for dtype in ("float32", "bfloat16")
+        }
+        wide, narrow = (np.asarray(call(), np.float32) for call in calls.values())
+        timed = race(calls, arguments.rounds, arguments.calls)
+        faster, alike = ratio(timed["float32"], timed["bfloat16"]), cosines(narrow, wide)
+        values.append({"model": preset, "contender": "bfloat16", "faster": faster})
+        values[-1]["cosine"] = alike.tolist()
+        rows.append((preset, times(faster), f"{alike.mean():.5f}", f"{alike.min():.5f}"))
+    caption = (
+        f"Descriptors of {arguments.batch} images in bfloat16, {measured(arguments.rounds)}. "
+        "Cosine: to the same in float32."
+    )
+    header = ("model", "times as fast as float32", "mean cosine", "least cosine")
+    figure = bars(values, lambda v: v["model"], "faster", "times float32's speed")
+    return Study(Table(header, rows, caption, 1), values, figure)
+
+
+def recall(arguments: argparse.Namespace) -> Study:
+    params, config = load_weights(arguments.weights)
+    benchmark = open_benchmark(arguments.data)
+    values, rows, descriptors = [], [], {}
+    for dtype in ("float32", "bfloat16"):
+        typed = in_type(config, dtype)
+        tokens = read_tokens(
+            params, typed, benchmark.queries, batch_size=16, label=dtype, on_bad_image="stop"
+        )
+        descriptors[dtype] = group(params, typed, tokens, "single", batch_size=16)
+        alike = cosines(descriptors[dtype], descriptors["float32"])
+        results = evaluate(
+            params,
+            typed,
+            benchmark,
+            groupings=("single", "shuffled", "sequential"),
+            batch_size=16,
+            seeds=1,
+            quiet=True,
+        )
+        for result in results:
+            values.append(
+                {
+                    "contender": dtype,
+                    "grouping": result.grouping,
+                    "recalls": result.recalls,
+                    "R@1": (result.recalls[1],),
+                    "cosine": [alike.mean(), alike.min()],
+                }
+            )
+            found = (f"{100 * result.recalls[k]:.1f}" for k in (1, 5, 10))
+            rows.append(
+                (dtype, result.grouping, *found, f"{alike.mean():.5f}", f"{alike.min():.5f}")
+            )
+    caption = (
+        f"Recall@K of a trained model on {benchmark.name}, {len(benchmark.queries)} queries; the "
+        "cosine of the queries' descriptors (single) to the same in float32."
+    )
+    header = ("type", "grouping", "R@1", "R@5", "R@10", "mean cosine", "least cosine")
+    figure = bars(values, lambda v: v["grouping"], "R@1", "Recall@1")
+    return Study(Table(header, rows, caption, 2), values, figure)
+
+
+def main() -> None:
+    parser = flags(__doc__ or "", "docs/performance")
+    parser.add_argument("--presets", nargs="+", default=["s14", "b14"], choices=PRESETS)
+    parser.add_argument("--batch", type=count, default=8)
+    parser.add_argument("--rounds", type=count, default=5)
+    parser.add_argument("--calls", type=count, default=2)
+    parser.add_argument(
+        "--weights", type=pathlib.Path, default=pathlib.Path("demo/run/last.safetensors")
+    )
+    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("demo/city/test"))
+    arguments = read(parser, "bench_products", "bench_bfloat16", "bench_recall")
+    studies = {"bench_products": products, "bench_bfloat16": speed}
+    if arguments.weights.exists():
+        if not arguments.data.is_dir():
+            parser.error(f"{arguments.data}: found no folder, expected an evaluation set")
+        studies["bench_recall"] = recall
+    else:
+        print(f"{arguments.weights}: not there, so no recall is compared; scripts/demo.sh makes it")
+    for name, study in studies.items():
+        leave(name, study(arguments), arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Train `tiny` from scratch on small real photographs, and tabulate what encoder and adapter bring.
+
+    python scripts/bench/study_photographs.py --data DIR --out OUT
+
+DIR holds `sped_train` (GSV-Cities layout), `sped_val` (@UTM layout) and `corridor` (VPR-Bench
+layout). Runs that OUT already holds are gone on with. The tables are written to OUT/photographs.md.
+"""
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import time
+
+import jax
+
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.places import read_places
+from crisalad_jax.evaluation.evaluate import KS, evaluate
+from crisalad_jax.evaluation.metrics import recalls
+from crisalad_jax.experiments.baselines import hog_descriptors
+from crisalad_jax.experiments.report import RecallRow, recall_markdown
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.retrieval.search import search
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils.files import atomic_path, write_json
+
+TESTS = ("sped_val", "corridor")
+
+
+def variants() -> dict[str, TrainConfig]:
+    """The whole model, and two with one field changed."""
+    whole = recipe("tiny")
+    model = whole.model
+    no_encoder = dataclasses.replace(
+        model, cross_image=dataclasses.replace(model.cross_image, layers=0)
+    )
+    backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
+    no_adapter = dataclasses.replace(model, backbone=backbone)
+    return {
+        "whole": whole,
+        "cross_image.layers 0": dataclasses.replace(whole, model=no_encoder),
+        "adapter.kind none": dataclasses.replace(whole, model=no_adapter),
+    }
+
+
+def train(
+    name: str, config: TrainConfig, data: pathlib.Path, out: pathlib.Path
+) -> tuple[Crisalad, float]:
+    """The trained model, and how long its training took; a finished run is read, not repeated."""
+    folder = out / f"{name.replace(' ', '_')}_seed{config.seed}"
+    timing = out / f"{folder.name}.json"
+    started = time.monotonic()
+    places = read_places(data / "sped_train", min_images=config.min_images)
+    params = fit(config, places, folder).params
+    if not timing.exists():
+        write_json(timing, {"seconds": round(time.monotonic() - started, 1)})
+    return params, json.loads(timing.read_text())["seconds"]
+
+
+def hog_recalls(benchmark: Benchmark) -> dict[int, float]:
+    sides = [
+        hog_descriptors([read_image(path) for path in paths])
+        for paths in (benchmark.database, benchmark.queries)
+    ]
+    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Train and tabulate; see the top.")
+    parser.add_argument("--data", type=pathlib.Path, required=True)
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="of the whole model")
+    parser.add_argument(
+        "--ablation-seeds", type=int, nargs="*", default=[0], help="of those with one field changed"
+    )
+    arguments = parser.parse_args()
+    benchmarks = [open_benchmark(arguments.data / name) for name in TESTS]
+    rows = [RecallRow(b.name, "HOG, no learning", "any", hog_recalls(b)) for b in benchmarks]
+
+    def measure(model_name: str, params: Crisalad, config: TrainConfig) -> None:
+        for benchmark in benchmarks:
+            results = evaluate(
+                params,
+                config.model,
+                benchmark,
+                groupings=("single", "shuffled", "sequential"),
+                seed=config.seed,
+                seeds=1,
+                quiet=True,
+            )
+            for result in results:
+                rows.append(RecallRow(benchmark.name, model_name, result.grouping, result.recalls))
+
+    timings = []
+    for name, start in variants().items():
+        for seed in arguments.seeds if name == "whole" else arguments.ablation_seeds:
+            config = dataclasses.replace(start, seed=seed)
+            if name == "whole":
+                untrained = init_crisalad(jax.random.key(seed), config.model)
+                measure(f"untrained, seed {seed}", untrained, config)
+            params, seconds = train(name, config, arguments.data, arguments.out)
+            timings.append(f"| {name} | {seed} | {seconds / 60:.1f} |\n")
+            measure(f"{name}, seed {seed}", params, config)
+    order = {benchmark.name: i for i, benchmark in enumerate(benchmarks)}
+    rows.sort(key=lambda row: order[row.benchmark])
+    with atomic_path(arguments.out / "photographs.md") as temporary:
+        temporary.write_text(
+            recall_markdown(rows)
+            + "\n| model | seed | training, minutes |\n| --- | ---: | ---: |\n"
+            + "".join(timings),
+            encoding="utf-8",
+        )
+    print(recall_markdown(rows))
+
+
+if __name__ == "__main__":
+    main()

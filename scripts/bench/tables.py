@@ -1,0 +1,171 @@
+"""What a study leaves: a table in Markdown, its numbers, a picture; and the page that shows it."""
+
+import argparse
+import pathlib
+from collections.abc import Callable, Collection, Iterable
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import around, atomic_path, check_target, write_json
+
+INK, GREY, PALE = "#222222", "#757575", "#e4e4e4"
+# Okabe and Ito's: told apart by the colour-blind.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222")
+
+
+class Table(NamedTuple):
+    """One table: the first `labels` columns are words, the others numbers."""
+
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    caption: str
+    labels: int = 1
+
+
+class Study(NamedTuple):
+    table: Table
+    values: Any
+    """The same unrounded, for JSON."""
+    figure: Figure | None = None
+
+
+def number(value: float) -> str:
+    """Two significant digits."""
+    value = float(value)
+    return f"{value:.1e}" if value and not 1e-3 <= abs(value) < 1e4 else f"{value:.2g}"
+
+
+def markdown(table: Table) -> str:
+    rule = ["---"] * table.labels + ["---:"] * (len(table.header) - table.labels)
+    lines = [f"| {' | '.join(cells)} |" for cells in (table.header, rule, *table.rows)]
+    return table.caption + "\n\n" + "\n".join(lines) + "\n"
+
+
+def files_of(name: str, out: pathlib.Path) -> list[pathlib.Path]:
+    """What a study is saved in: its table, its numbers, its picture if it has one."""
+    return [out / f"{name}{suffix}" for suffix in (".md", ".json", ".png")]
+
+
+def save(name: str, study: Study, out: pathlib.Path) -> None:
+    """Write NAME.md, NAME.json and, with a figure, NAME.png."""
+    text, numbers, picture = files_of(name, out)
+    with atomic_path(text) as temporary:
+        temporary.write_text(markdown(study.table), encoding="utf-8")
+    write_json(numbers, study.values)
+    if study.figure is not None:
+        with atomic_path(picture) as temporary:
+            study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
+
+
+def splice(page: pathlib.Path, name: str, table: Table) -> None:
+    """Put the table in the page, between its two comments that name the study.
+
+    Raises:
+        InputError: the page has no such comments.
+    """
+    before, after = around(page, name)
+    with atomic_path(page) as temporary:
+        temporary.write_text(before + markdown(table) + after, encoding="utf-8")
+
+
+def flags(description: str, out: str) -> argparse.ArgumentParser:
+    """A parser of where what a study leaves goes: folder `out` by default, and a page if asked."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(out))
+    parser.add_argument("--page", type=pathlib.Path, help="also put what is tabled into this page")
+    return parser
+
+
+def count(text: str) -> int:
+    """An argument that is a whole number from 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number from 1")
+    return int(text)
+
+
+def read(parser: argparse.ArgumentParser, *names: str) -> argparse.Namespace:
+    """The arguments of `flags`, once it is known that the studies of these names have a place."""
+    arguments = parser.parse_args()
+    _check_places(parser, arguments, names)
+    return arguments
+
+
+def read_some(parser: argparse.ArgumentParser, names: Collection[str]) -> argparse.Namespace:
+    """As `read`, of those of these studies that are asked for, or of all: its `studies`."""
+    words = ", ".join(names)
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {words}")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.studies) - set(names):
+        parser.error(f"found {', '.join(sorted(unknown))}, expected of {words}")
+    arguments.studies = arguments.studies or list(names)
+    _check_places(parser, arguments, arguments.studies)
+    return arguments
+
+
+def _check_places(
+    parser: argparse.ArgumentParser, arguments: argparse.Namespace, names: Iterable[str]
+) -> None:
+    """End the program in one line if a study cannot be left where the arguments say, before it."""
+    try:
+        for name in names:
+            for path in files_of(name, arguments.out):
+                check_target(path)
+            if arguments.page is not None:
+                around(arguments.page, name)
+    except (InputError, OSError) as error:
+        parser.error(str(error))
+
+
+def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:
+    """Put a study where the arguments of `flags` say, and on the terminal."""
+    save(name, study, arguments.out)
+    if arguments.page is not None:
+        splice(arguments.page, name, study.table)
+    print(markdown(study.table), flush=True)
+
+
+def panels(
+    count: int, titles: tuple[str, ...], *, width: float = 4.0, height: float = 3.4, sharey=True
+) -> tuple[Figure, list[Axes]]:
+    """A row of panels in the project's plain style."""
+    figure = Figure(figsize=(width * count, height), layout="constrained")
+    axes = list(figure.subplots(1, count, squeeze=False, sharey=sharey)[0])
+    for one, title in zip(axes, titles, strict=True):
+        one.set_title(title, fontsize=10, color=INK, loc="left")
+        one.spines[["top", "right"]].set_visible(False)
+        one.spines[["left", "bottom"]].set_color(GREY)
+        one.tick_params(colors=GREY, labelcolor=INK, labelsize=9)
+        one.grid(axis="y", color=PALE, linewidth=0.8)
+        one.set_axisbelow(True)
+    return figure, axes
+
+
+def bars(
+    values: list[dict[str, Any]],
+    title: Callable[[dict[str, Any]], str],
+    length: str,
+    label: str,
+) -> Figure:
+    """A panel for each title, in it a bar for each contender, as long as the first of `length`."""
+    titles = tuple(dict.fromkeys(map(title, values)))
+    names = list(dict.fromkeys(value["contender"] for value in values))
+    figure, axes = panels(len(titles), titles, width=3.4, height=2.8, sharey=False)
+    for one, name in zip(axes, titles, strict=True):
+        chosen = [value for value in values if title(value) == name]
+        lengths = [value[length][0] for value in chosen]
+        places = range(len(chosen))
+        one.barh(
+            places, lengths, color=[COLOURS[names.index(value["contender"])] for value in chosen]
+        )
+        for place, end in zip(places, lengths, strict=True):
+            one.annotate(f" {end:.2f}", (end, place), va="center", fontsize=8)
+        one.axvline(1, color=GREY, linewidth=0.8)
+        one.set_yticks(places, [value["contender"] for value in chosen], fontsize=8)
+        one.invert_yaxis()
+        one.set_xlim(0, 1.25 * max(lengths))
+        one.grid(visible=False)
+        one.set_xlabel(label, fontsize=9)
+    return figure

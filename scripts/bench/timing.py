@@ -1,0 +1,143 @@
+"""Programs timed side by side in one run, and a measure of what the machine can do.
+
+Fairness. The contenders take turns, `rounds` times: a pause of a quarter of a second, in which the
+threads of the one before stop spinning (OpenMP's do so after each call), as long again of calls
+that do not count, so that cores and caches are as warm for the quick as for the slow, then as long
+again, and `calls` at least, of calls that do. A ratio is that of two medians of the same round; of
+the ratios the median over rounds is shown, and the range. All use as many threads as they like.
+"""
+
+import itertools
+import os
+import pathlib
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from crisalad_jax.utils.host import usable_cores
+
+# On a GPU jax would take most of the memory at once, and leave torch too little.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+# As the command line does, where all cores may be used.
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
+
+import jax
+import jax.numpy as jnp
+import torch
+
+# First calls are from nothing, whatever ran before.
+_KERNELS = tempfile.TemporaryDirectory(prefix="inductor-")
+os.environ["TORCHINDUCTOR_CACHE_DIR"] = _KERNELS.name
+
+if torch.cuda.is_available():
+    # There jax would by itself round what it multiplies to 10 bits (TF32), and torch would not.
+    jax.config.update("jax_default_matmul_precision", "highest")
+
+PAUSE = 0.25
+GEMM = 4096
+"""Side of the square matrices whose product tells the machine's rate."""
+
+
+class Timed(NamedTuple):
+    rounds: list[float]
+    """The median of each round, in ms: on a CPU absolute times stay in the JSON file."""
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.rounds)
+
+
+def race(contenders: Mapping[str, Callable[[], Any]], rounds: int, calls: int) -> dict[str, Timed]:
+    """The contenders' times by their names; each does the whole of the work and waits for it."""
+    timed = {name: Timed([]) for name in contenders}
+    for _ in range(rounds):
+        for name, call in contenders.items():
+            time.sleep(PAUSE)
+            warm = time.perf_counter() + PAUSE
+            while time.perf_counter() < warm:
+                call()
+            times, end = [], time.perf_counter() + PAUSE
+            while len(times) < calls or time.perf_counter() < end:
+                started = time.perf_counter()
+                call()
+                times.append(1e3 * (time.perf_counter() - started))
+            timed[name].rounds.append(statistics.median(times))
+    return timed
+
+
+def ratio(slow: Timed, fast: Timed) -> tuple[float, float, float]:
+    """How many times faster: median over the rounds, least, most."""
+    found = [a / b for a, b in zip(slow.rounds, fast.rounds, strict=True)]
+    return statistics.median(found), min(found), max(found)
+
+
+def times(value: tuple[float, float, float]) -> str:
+    return f"{value[0]:.2f} ({value[1]:.2f} to {value[2]:.2f})"
+
+
+def megabytes(size: float) -> str:
+    return f"{size / 1e6:.1f}"
+
+
+def torch_memory(call: Callable[[], Any]) -> int:
+    """Bytes that a call of torch's needs at once, what it returns included.
+
+    The peak of the allocations less the releases that the profiler sees; on a GPU, of the
+    allocator's counter.
+    """
+    if torch.cuda.is_available():
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        call()
+        return torch.cuda.max_memory_allocated() - before
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
+        kept = call()
+    events: list[Any] = profile.profiler.kineto_results.events()  # pyright: ignore
+    events = [event for event in events if event.name() == "[memory]"]
+    sizes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
+    del kept
+    return max(itertools.accumulate(sizes), default=0)
+
+
+def wait() -> None:
+    """For what torch has begun on a GPU."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def measured(rounds: int) -> str:
+    """On what, and how: for the caption of a table of `ratio`s."""
+    return f"{machine()}; medians and ranges of {rounds} rounds"
+
+
+def product_rate(dtype: str) -> float:
+    """Floating-point operations a second of the better library's square matrix product."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    a = torch.randn(GEMM, GEMM, device=device).to(getattr(torch, dtype))
+    b = jnp.asarray(a.cpu().float().numpy(), dtype)
+    product = jax.jit(jnp.matmul)
+
+    def by_torch() -> None:
+        torch.matmul(a, a)
+        wait()
+
+    def by_jax() -> None:
+        jax.block_until_ready(product(b, b))
+
+    timed = race({"torch": by_torch, "jax": by_jax}, rounds=3, calls=3)
+    return 2 * GEMM**3 / min(1e-3 * min(one.rounds) for one in timed.values())
+
+
+def machine() -> str:
+    """What the figures were measured on."""
+    device = jax.devices()[0]
+    name = device.device_kind
+    if device.platform == "cpu":
+        info = pathlib.Path("/proc/cpuinfo")
+        lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
+        models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+        name = f"{models[0] if models else 'CPU'}, {usable_cores()} cores"
+    return f"{name}, jax {jax.__version__}, torch {torch.__version__}"

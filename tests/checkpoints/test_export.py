@@ -1,0 +1,293 @@
+"""Exported programs against the model, and run where the package cannot be imported."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import pathlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+import safetensors.numpy
+from jax import export
+
+from crisalad_jax.checkpoints.export import (
+    ExportConfig,
+    check_exportable,
+    export_model,
+    write_export,
+)
+from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
+from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.utils import compiler
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import BATCH, MODEL, write_picture
+
+SCRIPT = pathlib.Path(__file__).parents[2] / "scripts" / "run_exported.py"
+# The same operations, which another order of the compiler's rounds otherwise: numbers of a unit
+# descriptor are below 1, and float32 keeps 1e-7 of them. test_cli has the same.
+TOLERANCE = 2e-6
+
+
+def pictures(count: int) -> np.ndarray:
+    generator = np.random.default_rng(7)
+    return generator.integers(0, 256, (count, *MODEL.image_size, 3), np.uint8)
+
+
+def run_script(*arguments: object, cwd: pathlib.Path) -> subprocess.CompletedProcess[str]:
+    """Run the script by an interpreter that refuses to import this package."""
+    program = (
+        "import runpy, sys\n"
+        "class Refuse:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] == 'crisalad_jax':\n"
+        "            raise ImportError('refused: ' + name)\n"
+        "sys.meta_path.insert(0, Refuse())\n"
+        "try:\n"
+        "    import crisalad_jax\n"
+        "except ImportError:\n"
+        "    sys.argv = sys.argv[1:]\n"
+        "    runpy.run_path(sys.argv[0], run_name='__main__')\n"
+    )
+    return subprocess.run(
+        [sys.executable, "-I", "-c", program, str(SCRIPT), *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _symbolic_shapes() -> Iterator[None]:
+    """The check of annotations while tests run cannot broadcast symbolic dimensions."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="module")
+def beside(params: Crisalad, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """An export of any number of images, each alone, weights beside it."""
+    out = tmp_path_factory.mktemp("exports") / "beside"
+    write_export(out, params, MODEL)
+    return out
+
+
+def test_the_program_gives_our_descriptors_for_any_number_of_images(
+    beside: pathlib.Path, params: Crisalad
+):
+    program = export.deserialize(bytearray((beside / "describe.jax_export").read_bytes()))
+    weights = safetensors.numpy.load_file(beside / "weights.safetensors")
+    for count in (1, BATCH):
+        images = pictures(count)
+        found = program.call(weights, images)
+        expected = describe(params, images, MODEL, mask=self_mask(count))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-6)
+    assert program.platforms == ("cpu", "cuda")
+
+
+def test_a_batch_of_one_size_with_the_weights_inside(params: Crisalad, tmp_path: pathlib.Path):
+    how = ExportConfig("batch", batch_size=BATCH, weights_inside=True, platforms=("cpu",))
+    manifest = write_export(tmp_path / "inside", params, MODEL, how)
+    program = export.deserialize(
+        bytearray((tmp_path / "inside" / "describe.jax_export").read_bytes())
+    )
+    images = pictures(BATCH)
+    found = program.call(images)
+    expected = describe(params, images, MODEL)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE)
+    # Who looks at whom matters: another grouping would not pass.
+    assert np.abs(describe(params, images, MODEL, mask=self_mask(BATCH)) - found).max() > 1e-3
+    assert manifest["weights"] is None
+    assert manifest["images"]["shape"] == [BATCH, *MODEL.image_size, 3]
+    assert sorted(p.name for p in (tmp_path / "inside").iterdir()) == [
+        "describe.jax_export",
+        "manifest.json",
+    ]
+    with pytest.raises(ValueError, match="shape"):
+        program.call(images[:1])
+
+
+def test_the_manifest_tells_what_lies_there(beside: pathlib.Path, params: Crisalad):
+    manifest = json.loads((beside / "manifest.json").read_text())
+    for part in ("program", "weights"):
+        data = (beside / manifest[part]["file"]).read_bytes()
+        assert manifest[part]["bytes"] == len(data)
+        assert manifest[part]["sha256"] == hashlib.sha256(data).hexdigest()
+    assert manifest["images"]["shape"] == ["batch", 42, 56, 3]
+    assert manifest["images"]["dtype"] == "uint8"
+    assert manifest["descriptors"]["shape"] == ["batch", MODEL.descriptor_dim]
+    assert manifest["descriptors"]["dtype"] == "float32"
+    assert manifest["grouping"] == "single"
+    assert manifest["platforms"] == ["cpu", "cuda"]
+    assert manifest["jax_version"] == jax.__version__
+    assert manifest["model_sha256"] == model_hash(params, MODEL)
+
+
+def test_a_script_without_this_package(
+    beside: pathlib.Path, params: Crisalad, tmp_path: pathlib.Path
+):
+    """Pictures of the model's size, read without loss: the same pixels, so the same numbers."""
+    folder = tmp_path / "pictures"
+    (folder / "deep").mkdir(parents=True)
+    images = pictures(BATCH + 1)
+    names = ["a.png", "b.PNG", "c.png", "deep/a.png", "deep/b.png"]
+    for name, image in zip(names, images, strict=True):
+        assert cv2.imwrite(str(folder / name), image[..., ::-1])
+    done = run_script(
+        beside,
+        *("--images", folder, "--out", "found.npy", "--batch-size", BATCH),
+        cwd=tmp_path,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "found.names.txt").read_text().splitlines() == names
+    expected = describe(params, images, MODEL, mask=self_mask(len(images)))
+    np.testing.assert_allclose(np.load(tmp_path / "found.npy"), expected, rtol=0, atol=TOLERANCE)
+
+
+def test_a_script_resizes_as_we_do(scripts: Any, tmp_path: pathlib.Path):
+    for name, seed in (("a.jpg", 1), ("b.png", 2)):
+        write_picture(tmp_path / name, seed, noise=30.0)
+    for path in list_images(tmp_path):
+        found = scripts("run_exported").read_image(path, *MODEL.image_size)
+        expected = resize_image(read_image(path), MODEL.image_size)
+        # A level where Pillow rounds the rows before the columns, one more where decoders differ.
+        assert np.abs(found.astype(int) - expected).max() <= 2
+
+
+def test_a_script_fills_the_last_batch_or_refuses(
+    params: Crisalad, tmp_path: pathlib.Path, scripts: Any
+):
+    script = scripts("run_exported")
+    for name in "abc":
+        write_picture(tmp_path / f"{name}.png", ord(name))
+    paths = list_images(tmp_path)
+    manifest = {"images": {"shape": [2, 42, 56, 3]}, "grouping": "single"}
+    (first, two), (last, one) = script.batches(paths, manifest, 16)
+    assert (first.shape, two, last.shape, one) == ((2, 42, 56, 3), 2, (2, 42, 56, 3), 1)
+    np.testing.assert_array_equal(last[0], script.read_image(paths[2], 42, 56))
+    with pytest.raises(SystemExit, match="found 3 images, expected a multiple of 2"):
+        list(script.batches(paths, manifest | {"grouping": "batch"}, 16))
+
+
+def test_a_script_refuses_a_file_that_was_changed(
+    beside: pathlib.Path, tmp_path: pathlib.Path, scripts: Any
+):
+    manifest = json.loads((beside / "manifest.json").read_text())
+    manifest["program"]["sha256"] = "0" * 64
+    with pytest.raises(SystemExit, match=r"found other bytes than manifest\.json says"):
+        scripts("run_exported").load(beside, manifest)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "config",
+    [
+        dataclasses.replace(MODEL, compute_dtype="bfloat16"),
+        dataclasses.replace(MODEL, aggregator="gem-pyramid"),
+        dataclasses.replace(
+            MODEL,
+            aggregator=dataclasses.replace(
+                MODEL.aggregator,
+                sinkhorn=SinkhornConfig(
+                    step="newton", tolerance=1e-4, iterations=20, gradient="stop"
+                ),
+            ),
+        ),
+        dataclasses.replace(MODEL, aggregator="gem"),
+        dataclasses.replace(MODEL, aggregator=ConvApConfig(channels=16)),
+        dataclasses.replace(MODEL, aggregator=CosPlaceConfig(dim=16)),
+        dataclasses.replace(MODEL, aggregator=MixVprConfig(16, 2, 2)),
+        dataclasses.replace(MODEL, aggregator=BoqConfig(16, 3, 2, 5)),
+    ],
+    ids=["bfloat16", "pyramid", "newton", "GeM", "Conv-AP", "CosPlace", "MixVPR", "BoQ"],
+)
+def test_other_models_for_all_platforms(config: ModelConfig):
+    """Newton's steps solve linear systems, by another library on every platform."""
+    params = init_crisalad(jax.random.key(0), config)
+    exported = export_model(params, config, ExportConfig(platforms=("cpu", "cuda", "rocm", "tpu")))
+    program = export.deserialize(exported.serialize(vjp_order=0))
+    images = pictures(BATCH)
+    found = program.call(named_leaves(params), images)
+    expected = describe(params, images, config, mask=self_mask(BATCH))
+    # bfloat16 keeps 8 bits, and libraries of products round at different places.
+    tolerance = 0.02 if config.compute_dtype == "bfloat16" else TOLERANCE
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+
+
+def test_nothing_is_chosen_by_the_platform_that_exports(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(compiler, "_compiles_fused_attention", lambda: True)
+    traced = []
+
+    @compiler.jit
+    def choices(x: jax.Array) -> jax.Array:
+        traced.append((compiler.has_fused_attention(), compiler.product_dtype(x.dtype)))
+        return x
+
+    x = jnp.ones(3, jnp.bfloat16)
+    jax.make_jaxpr(lambda x: choices(x))(x)
+    with compiler.portable():
+        jax.make_jaxpr(lambda x: choices(x))(x)
+    jax.make_jaxpr(lambda x: choices(x))(x)
+    # The second would else find the first's trace, as the third does.
+    assert traced == [(True, jnp.bfloat16), (False, jnp.float32)]
+    assert compiler.has_fused_attention()
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"platforms": ("cpu", "metal")}, "platform: found 'metal', expected one of cpu, cuda"),
+        ({"platforms": ()}, "platforms: found none, expected some of cpu, cuda, rocm, tpu"),
+        ({"batch_size": 0}, "batch size: found 0, expected at least 1"),
+        ({"grouping": "shuffled"}, "grouping: found 'shuffled', expected one of batch, single"),
+    ],
+)
+def test_what_cannot_be_asked_for(fields: dict[str, Any], words: str):
+    with pytest.raises(InputError) as caught:
+        ExportConfig(**fields)
+    assert words in str(caught.value)
+
+
+def test_weights_that_are_too_many_to_be_inside():
+    config = PRESETS["g14"]
+    shapes = jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+    check_exportable(shapes, config, ExportConfig())
+    with pytest.raises(InputError, match=r"^weights inside: found 4\.\d GiB of parameters, exp"):
+        check_exportable(shapes, config, ExportConfig(weights_inside=True))
+
+
+def test_a_transport_that_must_converge(params: Crisalad):
+    sinkhorn = SinkhornConfig(throw=True, tolerance=1e-3, gradient="stop")
+    config = dataclasses.replace(
+        MODEL, aggregator=dataclasses.replace(MODEL.aggregator, sinkhorn=sinkhorn)
+    )
+    with pytest.raises(InputError, match=r"^SinkhornConfig.throw: found True"):
+        export_model(params, config, ExportConfig())
+
+
+def test_a_folder_in_use_is_left_as_it_is(params: Crisalad, tmp_path: pathlib.Path):
+    write_json(tmp_path / "out" / "other.json", {})
+    with pytest.raises(InputError, match=f"^{tmp_path}/out: found a folder with files in it"):
+        write_export(tmp_path / "out", params, MODEL)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["other.json"]

@@ -1,0 +1,315 @@
+"""The tables of names against the stored layouts of the public checkpoints."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.layouts import (
+    LAYOUTS,
+    check_holds,
+    infer,
+    public_shapes,
+    table,
+    to_params,
+    to_state,
+)
+from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import MODEL, random_params
+from tests.random_checkpoints import LAYOUTS as FOLDER
+from tests.random_checkpoints import UNDER, as_arrays, public_layout, random_state
+
+PUBLIC = sorted(path.stem for path in FOLDER.glob("*.json"))
+BARE = CrossImageConfig(layers=0)
+NO_ADAPTER = AdapterConfig(kind="none")
+
+
+def inner(name: str) -> dict[str, tuple[int, ...]]:
+    """A public layout as tables have it: without the way into the file."""
+    return {
+        key.removeprefix(UNDER).removeprefix("module."): shape
+        for key, shape in public_layout(name).items()
+    }
+
+
+def blank(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+    """Arrays of these shapes that take no memory."""
+    return {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
+
+
+def expected(name: str) -> tuple[str, ModelConfig]:
+    if name == "CricaVPR":
+        adapter = AdapterConfig(kind="multi-resolution")
+        backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=adapter)
+        return "cricavpr", ModelConfig(aggregator="gem-pyramid", backbone=backbone)
+    preset = "b14" if name == "dino_salad" else f"{name.removeprefix('dinov2_vit')[0]}14"
+    backbone = dataclasses.replace(
+        PRESETS[preset].backbone, adapter=NO_ADAPTER, registers=4 if "reg4" in name else 0
+    )
+    if name == "dino_salad":
+        return "dino-salad", ModelConfig(image_size=(322, 322), backbone=backbone, cross_image=BARE)
+    return "dinov2", ModelConfig(aggregator="class-token", backbone=backbone, cross_image=BARE)
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_a_public_layout_is_read_to_the_name_and_its_model_inferred(name: str) -> None:
+    shapes = inner(name)
+    layout, config = infer(blank(shapes), source=name)
+    assert (layout, config) == expected(name)
+    assert list(public_shapes(config, layout).items()) == list(shapes.items())
+
+
+def test_all_layouts_are_there() -> None:
+    assert len(PUBLIC) == 10
+
+
+MODELS = {
+    "crisalad": MODEL,
+    "registers, SwiGLU, MLP adapter": dataclasses.replace(
+        MODEL,
+        backbone=dataclasses.replace(
+            MODEL.backbone, registers=3, ffn="swiglu", adapter=AdapterConfig(kind="mlp")
+        ),
+    ),
+    "netvlad": dataclasses.replace(MODEL, aggregator="netvlad"),
+    "anyloc": dataclasses.replace(
+        MODEL,
+        aggregator=AnyLocConfig(layer=0),
+        cross_image=CrossImageConfig(layers=0),
+    ),
+    "multi-resolution, pyramid": dataclasses.replace(
+        MODEL,
+        aggregator="gem-pyramid",
+        backbone=dataclasses.replace(
+            MODEL.backbone, adapter=AdapterConfig(kind="multi-resolution")
+        ),
+    ),
+    "GeM": dataclasses.replace(MODEL, aggregator="gem"),
+    "Conv-AP": dataclasses.replace(MODEL, aggregator=ConvApConfig(16)),
+    "CosPlace": dataclasses.replace(MODEL, aggregator=CosPlaceConfig(16)),
+    "MixVPR": dataclasses.replace(MODEL, aggregator=MixVprConfig(16, 3, 2)),
+    "BoQ": dataclasses.replace(MODEL, aggregator=BoqConfig(16, 3, 2, 5)),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_any_model_survives_the_reference_layout_bit_for_bit(name: str) -> None:
+    config = MODELS[name]
+    params = random_params(config)
+    state = to_state(params, config, "reference", {})
+    assert {key: array.shape for key, array in state.items()} == public_shapes(config, "reference")
+    back, extras = to_params(state, config, "reference", source="state")
+    assert all(not array.any() for array in extras.values())
+    found, wanted = named_leaves(back), named_leaves(params)
+    assert found.keys() == wanted.keys()
+    for key, array in found.items():
+        np.testing.assert_array_equal(array, wanted[key])
+        assert array.dtype == wanted[key].dtype
+
+
+# As they are in the public checkpoints, of torch's modules in the public order.
+PUBLIC_HEADS = {
+    "GeM": {"aggregation.1.p": (1,)},
+    "Conv-AP": {
+        "aggregator.channel_pool.weight": (16, 32, 1, 1),
+        "aggregator.channel_pool.bias": (16,),
+    },
+    "CosPlace": {
+        "aggregation.1.p": (1,),
+        "aggregation.3.weight": (16, 32),
+        "aggregation.3.bias": (16,),
+    },
+    "MixVPR": {
+        **{
+            f"aggregator.mix.{i}.mix.{j}.{leaf}": (12, 12) if j and leaf == "weight" else (12,)
+            for i in (0, 1)
+            for j in (0, 1, 3)
+            for leaf in ("weight", "bias")
+        },
+        "aggregator.channel_proj.weight": (16, 32),
+        "aggregator.channel_proj.bias": (16,),
+        "aggregator.row_proj.weight": (3, 12),
+        "aggregator.row_proj.bias": (3,),
+    },
+}
+
+
+@pytest.mark.parametrize("name", PUBLIC_HEADS)
+def test_heads_have_their_public_names(name: str) -> None:
+    """BoQ's are tested beside torch's modules in tests/nn/aggregators."""
+    shapes = public_shapes(MODELS[name], "reference")
+    head = {key: shape for key, shape in shapes.items() if key.startswith("aggregat")}
+    assert list(head.items()) == list(PUBLIC_HEADS[name].items())
+
+
+def test_parts_that_a_model_does_not_have_go_to_any_layout() -> None:
+    """Version 0.1 said how large every method's parts are, whichever was chosen."""
+    _, published = expected("dinov2_vitb14")
+    plain = to_plain(published) | {
+        "aggregator": "class-token",
+        "boq": {"queries": 8},
+        "salad": {"clusters": 4},
+    }
+    found = from_plain(ModelConfig, plain, source="file")
+    assert found == published
+    check_holds(found, "dinov2")
+
+
+def test_every_number_has_its_own_place() -> None:
+    """Numbered numbers come back as a permutation: nothing is dropped, doubled or made up."""
+    config = MODELS["multi-resolution, pyramid"]
+    shapes = public_shapes(config, "cricavpr")
+    sizes = [int(np.prod(shape)) for shape in shapes.values()]
+    numbers = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    state = {
+        name: part.reshape(shape)
+        for (name, shape), part in zip(shapes.items(), numbers, strict=True)
+    }
+    params, extras = to_params(state, config, "cricavpr", source="state")
+    leaves = [*jax.tree.leaves(params), *extras.values()]
+    together = np.concatenate([np.asarray(leaf).ravel() for leaf in leaves])
+    np.testing.assert_array_equal(np.sort(together), np.arange(sum(sizes)))
+
+
+def small(name: str) -> tuple[dict[str, np.ndarray], ModelConfig]:
+    """DINOv2 of 2 blocks of width 64, by our names for it."""
+    config = ModelConfig(
+        aggregator="class-token",
+        backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=2, adapter=NO_ADAPTER),
+        cross_image=BARE,
+    )
+    return as_arrays(random_state(public_shapes(config, name))), config
+
+
+@pytest.mark.parametrize("layout", ["dinov2", "huggingface"])
+def test_all_that_is_wrong_is_listed_at_once(layout: str) -> None:
+    state, config = small(layout)
+    norm, token = {
+        "dinov2": ("norm.weight", "cls_token"),
+        "huggingface": ("layernorm.weight", "embeddings.cls_token"),
+    }[layout]
+    del state[norm]
+    state[token] = np.zeros((1, 64), np.float32)
+    state |= {"head.weight": np.zeros(1), "blocks.10.x": np.zeros(1), "blocks.9.x": np.zeros(1)}
+    with pytest.raises(InputError) as caught:
+        to_params(state, config, layout, source="file.pth")
+    message = str(caught.value)
+    assert message.startswith(
+        f"file.pth: does not fit the layout {layout} of width 64 and 2 blocks"
+    )
+    for words in (
+        f"{norm} missing",
+        "head.weight unknown",
+        f"{token} found (1, 64), expected (1, 1, 64)",
+        "blocks.9.x unknown; blocks.10.x unknown",
+    ):
+        assert words in message
+    assert "\n" not in message
+
+
+def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
+    return {key: array for key, array in state.items() if key not in names}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: {}, "found no checkpoint that we know .its first names: none"),
+        (lambda s: {"conv1.weight": s["norm.bias"]}, "its first names: conv1.weight"),
+        (lambda s: without(s, "cls_token"), "found no cls_token"),
+        (lambda s: without(s, "pos_embed"), "found no pos_embed"),
+        (
+            lambda s: s | {"cls_token": np.zeros(64)},
+            "cls_token found of shape .64,., expected more",
+        ),
+        (
+            lambda s: s | {"cls_token": np.zeros((1, 1, 48))},
+            "backbone of width 48, expected a multiple of 64",
+        ),
+        (
+            lambda s: s | {"pos_embed": np.zeros((1, 7, 64))},
+            "found 7 position embeddings, expected 1 and a square",
+        ),
+        (
+            lambda s: {k: v for k, v in s.items() if not k.startswith("blocks.0.")},
+            "found no blocks.0.mlp.fc1.weight",
+        ),
+    ],
+)
+def test_what_is_no_model_is_refused(change, words: str) -> None:
+    state, _ = small("dinov2")
+    with pytest.raises(InputError, match=words) as caught:
+        infer(change(state), source="file.pth")
+    assert str(caught.value).startswith("file.pth: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_block_leaves_those_after_it_unknown() -> None:
+    shapes = inner("dinov2_vits14")
+    state = blank({k: s for k, s in shapes.items() if not k.startswith("blocks.5.")})
+    layout, config = infer(state, source="file.pth")
+    assert config.backbone.depth == 5
+    with pytest.raises(InputError, match=r"of 5 blocks|5 blocks: blocks.6.attn.proj.bias unknown"):
+        to_params(state, config, layout, source="file.pth")
+
+
+@pytest.mark.parametrize("layout", ["dinov2", "huggingface", "dino-salad", "cricavpr"])
+def test_a_layout_holds_its_own_models_only(layout: str) -> None:
+    with pytest.raises(InputError, match=f"layout {layout}: found a model of aggregator salad"):
+        table(MODEL, layout)
+    assert table(MODEL, "reference")
+
+
+def test_an_unknown_layout_is_named() -> None:
+    with pytest.raises(InputError, match="layout: found 'timm', expected one of cricavpr, dino"):
+        table(MODEL, "timm")
+    assert set(LAYOUTS) == {"dinov2", "huggingface", "dino-salad", "cricavpr", "reference"}
+
+
+def test_unusual_widths_are_inferred() -> None:
+    config = ModelConfig(
+        backbone=ViTConfig(
+            dim=128,
+            depth=3,
+            heads=2,
+            mlp_ratio=2.5,
+            position_grid=4,
+            adapter=AdapterConfig(kernel_size=5, bottleneck=0.25),
+        ),
+        aggregator=SaladConfig(clusters=5, cluster_dim=32, token_dim=64, hidden=48),
+        cross_image=CrossImageConfig(layers=1, feedforward=40),
+    )
+    state = blank(public_shapes(config, "reference"))
+    assert infer(state, source="state") == ("reference", config)
+
+
+@pytest.mark.parametrize("dustbin", ["token", "mass", "none"])
+def test_other_dustbins_go_to_the_reference_alone(dustbin) -> None:
+    config = dataclasses.replace(
+        MODEL,
+        backbone=dataclasses.replace(MODEL.backbone, dim=64, heads=1, adapter=NO_ADAPTER),
+        aggregator=dataclasses.replace(MODEL.aggregator, dustbin=dustbin),
+        cross_image=BARE,
+    )
+    with pytest.raises(InputError, match=f"layout dino-salad: cannot tell.*dustbin.*{dustbin}"):
+        check_holds(config, "dino-salad")
+    params = random_params(config)
+    state = to_state(params, config, "reference", {})
+    assert ("aggregator.dust_bin" in state) == (dustbin == "mass")
+    again, _ = to_params(state, config, "reference", source="it")
+    wanted = named_leaves(params)
+    for name, leaf in named_leaves(again).items():
+        np.testing.assert_array_equal(leaf, wanted[name])

@@ -1,0 +1,493 @@
+"""Public checkpoint files to ours and back, and files that are none."""
+
+import dataclasses
+import io
+import json
+import os
+import pathlib
+import sys
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+
+from crisalad_jax.checkpoints.layouts import public_shapes, to_state
+from crisalad_jax.checkpoints.torch_io import (
+    convert,
+    read_backbone,
+    read_checkpoint,
+    write_checkpoint,
+)
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import describe, init_crisalad, self_mask
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import MODEL, random_params
+from tests.random_checkpoints import (
+    UNDER,
+    fewer_blocks,
+    narrow,
+    nested,
+    public_layout,
+    random_state,
+    same_bits,
+    save,
+)
+
+SMALL = {
+    name: fewer_blocks(narrow(public_layout(source), by), 2)
+    for name, source, by in (
+        ("dinov2", "dinov2_vitb14", 12),
+        ("registers", "dinov2_vitb14_reg4", 12),
+        ("dino-salad", "dino_salad", 12),
+        ("cricavpr", "CricaVPR", 4),
+    )
+}
+SUFFIX = {"dino-salad": ".ckpt"}
+WIDTHS = {"dinov2": 64, "registers": 64, "dino-salad": 256 + 64 * 128, "cricavpr": 14 * 192}
+HUGGING_FACE = ModelConfig(
+    aggregator="class-token",
+    backbone=ViTConfig(
+        dim=64, depth=2, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
+    ),
+    cross_image=CrossImageConfig(layers=0),
+)
+
+
+def written(folder: pathlib.Path, name: str) -> pathlib.Path:
+    return save(folder / f"public{SUFFIX.get(name, '.pth')}", nested(random_state(SMALL[name])))
+
+
+def files(folder: pathlib.Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def pictures(config: ModelConfig, count: int = 2) -> np.ndarray:
+    generator = np.random.default_rng(0)
+    return generator.integers(0, 256, (count, *config.image_size, 3), dtype=np.uint8)
+
+
+def there_and_back(folder: pathlib.Path, source: pathlib.Path, width: int) -> None:
+    """To our file, describe, and to a public file of the very bytes."""
+    ours, back = folder / "ours.safetensors", folder / f"back{source.suffix}"
+    convert(source, ours)
+    params, config = load_weights(ours)
+    descriptors = describe(params, pictures(config), config, mask=self_mask(2))
+    assert descriptors.shape == (2, width)
+    # float32 rounding of a sum of thousands of squares.
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-5)
+    del params
+    convert(ours, back)
+    if source.stat().st_size < 2**20:  # else the answer would fill the screen
+        assert same_bits(torch.load(back), torch.load(source))
+    assert back.read_bytes() == source.read_bytes()
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_there_and_back_are_the_same_bytes(tmp_path: pathlib.Path, name: str) -> None:
+    there_and_back(tmp_path, written(tmp_path, name), WIDTHS[name])
+
+
+@pytest.mark.parametrize(
+    ("name", "width"),
+    [
+        ("dinov2_vits14_reg4", 384),
+        pytest.param("dino_salad", 8448, marks=pytest.mark.slow),
+        pytest.param("CricaVPR", 10752, marks=pytest.mark.slow),
+        pytest.param("dinov2_vitb14", 768, marks=pytest.mark.slow),
+        pytest.param("dinov2_vitb14_reg4", 768, marks=pytest.mark.slow),
+        pytest.param("dinov2_vitl14", 1024, marks=pytest.mark.slow),
+        pytest.param("dinov2_vitl14_reg4", 1024, marks=pytest.mark.slow),
+    ],
+)
+def test_full_size(tmp_path: pathlib.Path, name: str, width: int) -> None:
+    source = save(tmp_path / "public.pth", nested(random_state(public_layout(name))))
+    there_and_back(tmp_path, source, width)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dinov2_vitg14", "dinov2_vitg14_reg4"])
+def test_full_width_of_the_largest(tmp_path: pathlib.Path, name: str) -> None:
+    """Two of its forty blocks: all of them take 4.5 GB a copy."""
+    shapes = fewer_blocks(public_layout(name), 2)
+    there_and_back(tmp_path, save(tmp_path / "public.pth", random_state(shapes)), 1536)
+
+
+@pytest.mark.parametrize(("registers", "ffn"), [(0, "mlp"), (4, "swiglu")])
+def test_hugging_face_there_and_back(tmp_path: pathlib.Path, registers: int, ffn) -> None:
+    backbone = dataclasses.replace(HUGGING_FACE.backbone, registers=registers, ffn=ffn)
+    config = dataclasses.replace(HUGGING_FACE, backbone=backbone)
+    state = random_state(public_shapes(config, "huggingface"))
+    source = save(tmp_path / "model.safetensors", state)
+    ours, back = tmp_path / "ours.safetensors", tmp_path / "back.safetensors"
+    assert convert(source, ours).config == config
+    convert(ours, back)
+    assert back.read_bytes() == source.read_bytes()
+    assert back.stat().st_mode & 0o777 == 0o644  # the library's own would be 0600
+    found = safetensors.numpy.load_file(back)
+    # By way of the other layout for the same model.
+    convert(ours, tmp_path / "dinov2.pth", "dinov2")
+    again = read_checkpoint(tmp_path / "dinov2.pth")
+    assert again.layout == "dinov2"
+    theirs = to_state(again.params, again.config, "huggingface", again.extras)
+    assert all(theirs[name].tobytes() == found[name].tobytes() for name in found)
+
+
+def test_the_reference_carries_its_configuration(tmp_path: pathlib.Path) -> None:
+    """Two heads of width 16, which no shape tells."""
+    params = random_params(MODEL)
+    write_checkpoint(tmp_path / "reference.pth", params, MODEL, "reference", {})
+    found = read_checkpoint(tmp_path / "reference.pth")
+    assert (found.layout, found.config) == ("reference", MODEL)
+    wanted = named_leaves(params)
+    for name, leaf in named_leaves(found.params).items():
+        np.testing.assert_array_equal(leaf, wanted[name])
+
+
+@pytest.mark.parametrize(
+    ("layout", "changed", "words"),
+    [
+        ("dino-salad", {"aggregator.sinkhorn.iterations": 10}, "iterations: found 3, expected 10"),
+        ("dino-salad", {"normalisation": "local-contrast"}, "normalisation: found imagenet"),
+        ("dinov2", {"backbone.heads": 2}, "backbone.heads: found 1, expected 2"),
+        ("cricavpr", {"backbone.adapter.alpha": 0.5}, "alpha: found 0.2, expected 0.5"),
+        ("cricavpr", {"cross_image.heads": 4}, "cross_image.heads: found 16, expected 4"),
+    ],
+)
+def test_what_a_layout_cannot_tell_goes_to_the_reference(
+    tmp_path: pathlib.Path, layout: str, changed: dict, words: str
+) -> None:
+    """Else the way back would give another model, with other descriptors."""
+    public = read_checkpoint(written(tmp_path, layout))
+    config = public.config
+    for path, value in changed.items():
+        config = replaced(config, path.split("."), value)
+    ours, back = tmp_path / "ours.safetensors", tmp_path / "back.pth"
+    save_weights(ours, public.params, config, extras=public.extras)
+    with pytest.raises(InputError, match=f"^{ours}: layout {layout}: cannot tell .*{words}"):
+        convert(ours, back, layout)
+    assert not back.exists()
+    assert convert(ours, back).target == "reference"
+    assert read_checkpoint(back).config == config
+
+
+def replaced(config, path: list[str], value):
+    """A configuration with one field, deep inside, changed."""
+    head, *rest = path
+    inner = replaced(getattr(config, head), rest, value) if rest else value
+    return dataclasses.replace(config, **{head: inner})
+
+
+def test_what_no_description_depends_on_hinders_no_layout(tmp_path: pathlib.Path) -> None:
+    public = read_checkpoint(written(tmp_path, "dino-salad"))
+    config = replaced(public.config, ["aggregator", "dropout"], 0.1)
+    config = replaced(config, ["image_size"], (224, 224))
+    config = replaced(config, ["compute_dtype"], "bfloat16")
+    config = replaced(config, ["backbone", "layer_scale_init"], 1e-5)
+    ours = tmp_path / "ours.safetensors"
+    save_weights(ours, public.params, config)
+    assert convert(ours, tmp_path / "back.ckpt").target == "dino-salad"
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (np.zeros((3, 3), np.float32), r"found float32 \(3, 3\), expected float32 \(1, 64\)"),
+        (np.zeros((1, 64)), "found float64"),
+        (np.full((1, 64), np.nan, np.float32), "holds NaN"),
+    ],
+)
+def test_extras_that_do_not_fit_are_refused(tmp_path: pathlib.Path, extra, words: str) -> None:
+    public = read_checkpoint(written(tmp_path, "dinov2"))
+    name = next(iter(public.extras))
+    ours = tmp_path / "ours.safetensors"
+    save_weights(ours, public.params, public.config, extras={name: extra})
+    with pytest.raises(InputError, match=f"^{ours}: extra.{name}: {words}"):
+        convert(ours, tmp_path / "back.pth")
+    assert files(tmp_path) == {"public.pth", "ours.safetensors"}
+
+
+def test_the_source_is_never_written_over(tmp_path: pathlib.Path) -> None:
+    state = random_state(public_shapes(HUGGING_FACE, "huggingface"))
+    source = save(tmp_path / "model.safetensors", state)
+    before = source.read_bytes()
+    (tmp_path / "link.safetensors").symlink_to(source)
+    for target in (source, tmp_path / "link.safetensors"):
+        with pytest.raises(InputError, match=f"^{target}: found the source itself"):
+            convert(source, target)
+    assert source.read_bytes() == before
+
+
+@pytest.mark.parametrize("under", [None, "state_dict", "model_state_dict", "model"])
+@pytest.mark.parametrize("prefix", ["", "module."])
+@pytest.mark.parametrize("name", ["dinov2", "cricavpr"])
+def test_any_nesting_and_prefix_is_read(tmp_path: pathlib.Path, name: str, under, prefix) -> None:
+    plain = {
+        key.removeprefix(UNDER).removeprefix("module."): tensor
+        for key, tensor in random_state(SMALL[name]).items()
+    }
+    state = {prefix + key: tensor for key, tensor in plain.items()}
+    content = state if under is None else {under: state, "epoch": 3}
+    found = read_checkpoint(save(tmp_path / "file.pth", content))
+    again = to_state(found.params, found.config, found.layout, found.extras)
+    assert same_bits({k: torch.tensor(v) for k, v in again.items()}, plain)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("kind", ["torch", "safetensors"])
+def test_half_precision_is_widened_exactly(tmp_path: pathlib.Path, dtype, kind: str) -> None:
+    shapes = SMALL["dinov2"] if kind == "torch" else public_shapes(HUGGING_FACE, "huggingface")
+    state = {name: tensor.to(dtype) for name, tensor in random_state(shapes).items()}
+    suffix = ".pth" if kind == "torch" else ".safetensors"
+    found = read_checkpoint(save(tmp_path / f"half{suffix}", state))
+    again = to_state(found.params, found.config, found.layout, found.extras)
+    for name, tensor in state.items():
+        np.testing.assert_array_equal(again[name], tensor.float().numpy())
+        assert again[name].dtype == np.float32
+
+
+def test_the_old_torch_format_is_read(tmp_path: pathlib.Path) -> None:
+    state = random_state(SMALL["dinov2"])
+    torch.save(state, tmp_path / "old.pth", _use_new_zipfile_serialization=False)
+    found = read_checkpoint(tmp_path / "old.pth")
+    again = to_state(found.params, found.config, "dinov2", found.extras)
+    assert same_bits({k: torch.tensor(v) for k, v in again.items()}, state)
+
+
+# A backbone to start from
+
+
+def fresh(adapter: str, **fields) -> tuple[ModelConfig, object]:
+    backbone = dataclasses.replace(
+        HUGGING_FACE.backbone, adapter=AdapterConfig(kind=adapter), **fields
+    )
+    config = ModelConfig(backbone=backbone)
+    return config, init_crisalad(jax.random.key(1), config).backbone
+
+
+@pytest.mark.parametrize("kind", ["dinov2", "huggingface", "dino-salad", "ours"])
+def test_a_backbone_of_any_file(tmp_path: pathlib.Path, kind: str) -> None:
+    if kind == "huggingface":
+        state = random_state(public_shapes(HUGGING_FACE, "huggingface"))
+        source = save(tmp_path / "model.safetensors", state)
+    else:
+        source = written(tmp_path, "dinov2" if kind == "ours" else kind)
+    theirs = read_checkpoint(source)
+    if kind == "ours":
+        source = tmp_path / "ours.safetensors"
+        save_weights(source, theirs.params, theirs.config, extras=theirs.extras)
+    config, start = fresh("depthwise")
+    wanted = named_leaves(theirs.params.backbone)
+    for name, leaf in named_leaves(read_backbone(source, config.backbone, start)).items():
+        adapter = ".adapter." in name
+        np.testing.assert_array_equal(leaf, named_leaves(start)[name] if adapter else wanted[name])
+
+
+@pytest.mark.parametrize("kind", ["multi-resolution", "depthwise"])
+def test_adapters_come_along_where_they_are_the_same(tmp_path: pathlib.Path, kind: str) -> None:
+    source = written(tmp_path, "cricavpr")
+    config, start = fresh(kind, dim=192, heads=3)
+    found = named_leaves(read_backbone(source, config.backbone, start))
+    wanted = named_leaves(read_checkpoint(source).params.backbone)
+    name = "blocks.adapter.down.weight"
+    same = kind == "multi-resolution"
+    np.testing.assert_array_equal(found[name], wanted[name] if same else named_leaves(start)[name])
+
+
+def test_a_backbone_of_other_heads_is_refused(tmp_path: pathlib.Path) -> None:
+    config, start = fresh("depthwise", heads=2)
+    with pytest.raises(InputError, match=r"another size: heads: found 1, expected 2$"):
+        read_backbone(written(tmp_path, "dinov2"), config.backbone, start)
+
+
+def test_a_backbone_of_another_size_is_refused(tmp_path: pathlib.Path) -> None:
+    source = written(tmp_path, "registers")
+    config, start = fresh("depthwise", depth=3)
+    words = f"{source}: this backbone is of another size: depth: found 2, expected 3; .*registers: "
+    with pytest.raises(InputError, match=words + "found 4, expected 0"):
+        read_backbone(source, config.backbone, start)
+
+
+# Bad files
+
+
+class Opens:
+    """What an attacker puts into a pickle: loading it runs a call."""
+
+    def __init__(self, path: pathlib.Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
+    path = folder / ("file.safetensors" if kind.startswith("safetensors") else "file.pth")
+    state = random_state(SMALL["dinov2"])
+    whole = io.BytesIO()
+    torch.save(state, whole)
+    data = whole.getvalue()
+    if kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "cut":
+        path.write_bytes(data[: len(data) // 2])
+    elif kind.startswith("old format cut at"):
+        torch.save(state, path, _use_new_zipfile_serialization=False)
+        path.write_bytes(path.read_bytes()[: int(kind.split()[-1])])
+    elif kind == "safetensors empty":
+        path.write_bytes(b"")
+    elif kind == "safetensors of text":
+        path.write_text("no checkpoint, but long enough to be one")
+    elif kind == "safetensors of eight bits":
+        hugging = random_state(public_shapes(HUGGING_FACE, "huggingface"))
+        name = "layernorm.bias"
+        save(path, hugging | {name: hugging[name].to(torch.float8_e4m3fn)})
+    elif kind == "a float count":
+        state = random_state(SMALL["cricavpr"])
+        count = next(name for name in state if name.endswith("num_batches_tracked"))
+        torch.save(nested(state | {count: torch.zeros(())}), path)
+    elif kind == "no width":
+        torch.save(state | {"cls_token": torch.zeros(1, 1, 0)}, path)
+    elif kind == "a folder":
+        path.mkdir()
+    elif kind == "cut at the end":
+        path.write_bytes(data[:-10])
+    elif kind == "text":
+        path.write_text("no checkpoint")
+    elif kind == "zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("readme.txt", "no checkpoint")
+    elif kind == "runs code":
+        torch.save(state | {"norm.weight": Opens(folder / "made")}, path)
+    elif kind == "old pickle that runs code":
+        torch.save(Opens(folder / "made"), path, _use_new_zipfile_serialization=False)
+    elif kind == "a list":
+        torch.save([1, 2], path)
+    elif kind == "no tensor":
+        torch.save(state | {"epoch": 3}, path)
+    elif kind == "double":
+        torch.save(state | {"norm.bias": state["norm.bias"].double()}, path)
+    elif kind == "nan":
+        torch.save(state | {"norm.bias": state["norm.bias"] * float("nan")}, path)
+    elif kind == "sparse":
+        torch.save(state | {"norm.bias": state["norm.bias"].to_sparse()}, path)
+    elif kind == "eight bits":
+        torch.save(state | {"norm.bias": state["norm.bias"].to(torch.float8_e4m3fn)}, path)
+    elif kind == "no data":
+        torch.save(state | {"norm.bias": state["norm.bias"].to("meta")}, path)
+    elif kind == "a number for a name":
+        torch.save({**state, 3: torch.zeros(3)}, path)
+    elif kind == "one position":
+        torch.save(state | {"pos_embed": torch.zeros(1, 1, 64)}, path)
+    elif kind == "a depth for an age":
+        config = json.dumps({"backbone": {"depth": 10**9}})
+        torch.save({"state_dict": state, "config": config}, path)
+    elif kind == "a deep configuration":
+        torch.save({"state_dict": state, "config": "[" * 10**5}, path)
+    elif kind == "some with module.":
+        torch.save(
+            {("module." if k.startswith("norm.") else "") + k: v for k, v in state.items()}, path
+        )
+    elif kind == "extra and missing":
+        torch.save({k.replace("norm.bias", "norm.shift"): v for k, v in state.items()}, path)
+    elif kind == "safetensors of another model":
+        save(path, {"conv1.weight": torch.zeros(3)})
+    elif kind == "safetensors cut":
+        path.write_bytes(safetensors.numpy.save({"x": np.zeros(9)})[:-9])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("missing", "found no such file, expected a checkpoint"),
+        ("empty", "not a whole torch checkpoint"),
+        ("cut", "not a whole torch checkpoint"),
+        ("cut at the end", "not a whole torch checkpoint"),
+        ("old format cut at 322", "not a whole torch checkpoint"),
+        ("old format cut at 338", "not a whole torch checkpoint"),
+        ("old format cut at 2000", "not a whole torch checkpoint"),
+        ("safetensors empty", "not a whole safetensors file"),
+        ("safetensors of text", "not a whole safetensors file"),
+        ("safetensors of eight bits", "found a type that numpy does not know: .*float8"),
+        ("a float count", "num_batches_tracked found float32, expected int64"),
+        ("no width", "cls_token found of shape .1, 1, 0., expected more than 2 axes, none of th"),
+        ("a folder", "found a folder, expected a checkpoint"),
+        ("text", "not a whole torch checkpoint|refused"),
+        ("zip", "not a whole torch checkpoint"),
+        ("runs code", "refused: it asks for [a-z]+.mkdir, expected nothing but tensors"),
+        ("old pickle that runs code", "refused: it asks for [a-z]+.mkdir"),
+        ("a list", "found list, expected a dictionary of tensors by name"),
+        ("no tensor", "found epoch, expected nothing but tensors by name"),
+        ("double", "norm.bias found float64, expected float32, float16 or bfloat16"),
+        ("nan", "norm.bias holds NaN or infinity"),
+        ("sparse", "norm.bias is no plain tensor: .*Sparse"),
+        ("eight bits", "norm.bias is no plain tensor: .*Float8"),
+        ("no data", "norm.bias is no plain tensor: .*meta"),
+        ("a number for a name", "found 3, expected nothing but tensors by name"),
+        ("one position", "found 1 position embeddings, expected 1 and a square number"),
+        ("a depth for an age", "found 35 tensors, expected those of 1000000002 blocks and l"),
+        ("a deep configuration", "found no configuration under 'config'"),
+        (
+            "some with module.",
+            "2 blocks: module.norm.bias unknown; module.norm.weight unknown; norm.bias missing; "
+            "norm.weight missing$",
+        ),
+        ("extra and missing", "2 blocks: norm.bias missing; norm.shift unknown$"),
+        ("safetensors of another model", "found no checkpoint that we know .*conv1.weight"),
+        ("safetensors cut", "not a whole safetensors file"),
+    ],
+)
+def test_bad_files_are_one_clear_error_and_nothing_is_written(
+    tmp_path: pathlib.Path, kind: str, words: str
+) -> None:
+    source = bad_file(tmp_path, kind)
+    before = files(tmp_path)
+    with pytest.raises(InputError, match=words) as caught:
+        convert(source, tmp_path / "new" / "ours.safetensors")
+    assert str(caught.value).startswith(f"{source}: ")
+    assert "\n" not in str(caught.value)
+    assert files(tmp_path) == before  # nor has any code of the file made its folder
+
+
+def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
+    public, ours = written(tmp_path, "dino-salad"), tmp_path / "ours.safetensors"
+    for target, layout, words in (
+        ("x.pth", None, "x.pth: found suffix '.pth', expected .safetensors"),
+        ("x.safetensors", "dinov2", "found a public checkpoint .dino-salad. beside --layout"),
+        ("x.safetensors", "timm", "layout: found 'timm'"),
+        (".", None, "found a folder, expected a file"),
+    ):
+        with pytest.raises(InputError, match=words):
+            convert(public, tmp_path / target, layout)
+    convert(public, ours)
+    for target, layout, words in (
+        ("x.pth", "dinov2", "layout dinov2: found a model of aggregator salad"),
+        ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt for dino"),
+        ("x", None, "x: found suffix '', expected .pth"),
+        ("x\0.pth", None, "cannot be made"),
+        ("x" * 300 + ".pth", None, "cannot be made: .*too long"),
+        ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors for hugging"),
+        ("x.safetensors", None, "layout huggingface: found a model of aggregator salad"),
+        ("x.safetensors", "reference", "suffix '.safetensors', expected .pth or .pt or .ckpt"),
+    ):
+        with pytest.raises(InputError, match=words):
+            convert(ours, tmp_path / target, layout)
+    assert files(tmp_path) == {"public.ckpt", "ours.safetensors"}
+    long = tmp_path / f"{'x' * 245}.ckpt"  # the temporary name beside it must not be longer
+    convert(ours, long)
+    assert long.read_bytes() == public.read_bytes()
+
+
+def test_without_torch_its_files_ask_for_it(tmp_path: pathlib.Path, monkeypatch) -> None:
+    source = written(tmp_path, "dinov2")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(InputError, match=r"torch is needed and not installed"):
+        read_checkpoint(source)

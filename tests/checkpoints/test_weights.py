@@ -1,0 +1,609 @@
+"""Weights there and back bit for bit, and files that are none of ours."""
+
+import dataclasses
+import functools
+import json
+import os
+import pathlib
+import re
+import struct
+import typing
+import warnings
+import zlib
+from collections.abc import Iterator
+from typing import Any, Literal
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+
+import crisalad_jax
+from crisalad_jax.checkpoints import weights
+from crisalad_jax.checkpoints.weights import (
+    is_ours,
+    load_extras,
+    load_weights,
+    model_hash,
+    save_weights,
+)
+from crisalad_jax.config import source
+from crisalad_jax.config.fields import free_field
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.parts import Part
+from crisalad_jax.config.plugins import load_plugin
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.sinkhorn import SinkhornConfig, SinkhornStep
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import MODEL, assert_equal, random_params
+
+WITHOUT_ENCODER = dataclasses.replace(
+    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
+)
+REGISTERS = dataclasses.replace(
+    MODEL, backbone=dataclasses.replace(MODEL.backbone, registers=4, ffn="swiglu")
+)
+
+
+@pytest.mark.parametrize("config", [MODEL, WITHOUT_ENCODER, REGISTERS])
+def test_weights_survive_a_file_bit_for_bit(tmp_path, config):
+    params = random_params(config)
+    save_weights(tmp_path / "new" / "w.safetensors", params, config)
+    assert os.listdir(tmp_path / "new") == ["w.safetensors"]
+    found, found_config = load_weights(tmp_path / "new" / "w.safetensors")
+    assert found_config == config
+    assert_equal(found, params)
+
+
+def test_the_package_offers_both(tmp_path, params):
+    crisalad_jax.save(tmp_path / "w.safetensors", params, MODEL)
+    found, config = crisalad_jax.load(str(tmp_path / "w.safetensors"))
+    assert config == MODEL
+    assert_equal(found, params)
+
+
+def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
+    """Read by the format's own description: a length, a JSON header, the bytes."""
+    data = (shared / "weights.safetensors").read_bytes()
+    (length,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + length])
+    metadata = header.pop("__metadata__")
+    assert metadata.keys() == {"crisalad-jax 2"}
+    told = json.loads(metadata["crisalad-jax 2"])
+    assert told.keys() == {"config", "version", "parts", "aggregator"}
+    assert told["config"] == to_plain(MODEL)
+    assert told["version"] == crisalad_jax.__version__
+    assert {field: name for field, (name, _) in told["parts"].items()} == {
+        "backbone": "vit",
+        "aggregator": "salad",
+        "aggregator.dustbin": "column",
+        "aggregator.sinkhorn.step": "sinkhorn",
+        "aggregator.sinkhorn.gradient": "unrolled",
+    }
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for _, digest in told["parts"].values())
+    assert header.keys() == named_leaves(params).keys()
+    entry = header["aggregator.score.fc1.weight"]
+    assert (entry["dtype"], entry["shape"]) == ("F32", [32, 16])
+    start, end = entry["data_offsets"]
+    values = np.frombuffer(data[8 + length + start : 8 + length + end], "<f4").reshape(32, 16)
+    np.testing.assert_array_equal(values, params.aggregator.score.fc1.weight)
+
+
+def test_the_same_weights_give_the_same_bytes(tmp_path, params):
+    for name in ("a", "b", "c", "d"):
+        save_weights(tmp_path / f"{name}.safetensors", params, MODEL)
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+
+
+def test_only_what_parameters_do_not_depend_on_is_free(shared):
+    path = shared / "weights.safetensors"
+    other = dataclasses.replace(
+        MODEL,
+        image_size=(56, 70),
+        compute_dtype="bfloat16",
+        aggregator=dataclasses.replace(MODEL.aggregator, dropout=0.5),
+        cross_image=dataclasses.replace(MODEL.cross_image, dropout=0.5),
+    )
+    load_weights(path, expected=other)
+    with pytest.raises(InputError, match=f"^{path}: these weights are of another model: ") as error:
+        load_weights(path, expected=PRESETS["tiny"])
+    assert "backbone.dim: found 32, expected 128" in str(error.value)
+    assert "aggregator.clusters: found 4, expected 16" in str(error.value)
+    assert "image_size" not in str(error.value)
+
+
+def test_parameters_of_one_image_size_keep_it(tmp_path):
+    config = dataclasses.replace(
+        WITHOUT_ENCODER, aggregator=MixVprConfig(channels=8, rows=2, depth=1)
+    )
+    params, path = random_params(config), tmp_path / "w.safetensors"
+    save_weights(path, params, config)
+    found, _ = load_weights(path, expected=dataclasses.replace(config, compute_dtype="bfloat16"))
+    assert_equal(found, params)
+    # As many patches, in another grid: every array would fit.
+    turned = dataclasses.replace(config, image_size=(56, 42))
+    with pytest.raises(InputError, match=r"another model: image_size: found .*42, 56.*56, 42"):
+        load_weights(path, expected=turned)
+    assert model_hash(params, turned) != model_hash(params, config)
+
+
+def test_aggregators_that_a_model_does_not_have_are_free(tmp_path, shared):
+    """Files of version 0.1 have the settings of all, side by side."""
+    found = []
+    for queries in (64, 8):
+        plain = PLAIN_OF_VERSION_0_1 | {"boq": {"channels": 384, "queries": queries}}
+        path = tmp_path / f"{queries}.safetensors"
+        rewrite(shared, path, lambda arrays: None, {"crisalad-jax 1": json.dumps(plain)})
+        found.append(load_weights(path, expected=MODEL))
+    (params, config), (others, other) = found
+    assert config == other == MODEL
+    assert model_hash(params, config) == model_hash(others, other)
+
+
+def rewrite(shared: pathlib.Path, path: pathlib.Path, change, metadata=None) -> None:
+    """The shared weights with changed arrays, or other metadata."""
+    arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
+    change(arrays)
+    ours = {"crisalad-jax 2": json.dumps({"config": to_plain(MODEL)})}
+    safetensors.numpy.save_file(arrays, path, metadata=ours if metadata is None else metadata)
+
+
+# What version 0.1 wrote for MODEL, to the letter: the settings of eleven aggregators side by side.
+PLAIN_OF_VERSION_0_1 = json.loads(
+    """{"image_size": [42, 56], "normalisation": "imagenet",
+    "backbone": {"dim": 32, "depth": 2, "heads": 2, "mlp_ratio": 4.0, "ffn": "mlp", "registers": 0,
+        "position_grid": 3, "position_start": "random", "layer_scale_start": 1.0,
+        "adapter": {"kind": "depthwise", "bottleneck": 0.5, "kernel_size": 3, "alpha": 0.2}},
+    "aggregator": "salad",
+    "salad": {"clusters": 4, "cluster_dim": 8, "token_dim": 16, "hidden": 16, "dropout": 0.3,
+        "sinkhorn": {"method": "sinkhorn", "dustbin": "column", "epsilon": 1.0, "iterations": 3,
+            "tolerance": null, "must_converge": false, "domain": "scaling", "relaxation": 1.0,
+            "anderson": 0, "row_tau": 1.0, "column_tau": 1.0, "gradient": "unrolled"}},
+    "gem_pyramid": {}, "class_token": {}, "gem": {}, "netvlad": {"clusters": 64},
+    "conv_ap": {"channels": 1024, "side": 2}, "cosplace": {"dim": 512},
+    "mixvpr": {"channels": 1024, "rows": 4, "depth": 4},
+    "anyloc": {"clusters": 32, "layer": -1, "facet": "value"},
+    "boq": {"channels": 384, "queries": 64, "layers": 2, "rows": 32},
+    "transvpr": {"levels": 2, "dim": 256},
+    "encoder": {"layers": 2, "heads": 2, "feedforward": 16, "dropout": 0.1, "global_token": true},
+    "compute_dtype": "float32", "keeps": "products"}"""
+)
+
+
+def under_names_of_version_0_1(params: Any) -> dict[str, np.ndarray]:
+    """The arrays by name; the cross-image encoder's began with `encoder.`."""
+    return {
+        re.sub(r"^cross_image\.", "encoder.", name): np.asarray(leaf)
+        for name, leaf in named_leaves(params).items()
+    }
+
+
+def test_a_file_of_version_0_1_loads_bit_for_bit(tmp_path, params):
+    path = tmp_path / "w.safetensors"
+    arrays = under_names_of_version_0_1(params)
+    assert "encoder.layers.0.attn.qkv.weight" in arrays
+    extra = {"extra.backbone.mask_token": np.ones((1, 32), np.float32)}
+    metadata = {"crisalad-jax 1": json.dumps(PLAIN_OF_VERSION_0_1)}
+    safetensors.numpy.save_file(arrays | extra, path, metadata=metadata)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)  # it says nothing of sources
+        found, config = load_weights(path, expected=MODEL)
+    assert config == MODEL
+    assert_equal(found, params)
+    assert is_ours(path)
+    assert load_extras(path).keys() == {"backbone.mask_token"}
+    # As it would be written today.
+    save_weights(tmp_path / "again.safetensors", found, config)
+    assert_equal(load_weights(tmp_path / "again.safetensors")[0], params)
+
+
+@pytest.mark.parametrize(
+    ("inside", "old", "fields"),
+    [
+        ("keeps", "blocks", {"remat": "full"}),
+        ("keeps", "everything", {"remat": "none"}),
+        ("salad.sinkhorn.relaxation", 1.5, {"step": SinkhornStep(relaxation=1.5)}),
+        ("salad.sinkhorn.method", "newton", {"step": "newton"}),
+        ("salad.sinkhorn.anderson", 3, {"anderson_memory": 3}),
+        ("salad.sinkhorn.dustbin", "row and column", {"dustbin": "row and column"}),
+        ("salad.sinkhorn.epsilon", 0.5, {"epsilon": 0.5}),
+        ("salad.sinkhorn.row_tau", 0.9, {"row_tau": 0.9}),
+        ("salad.sinkhorn.column_tau", 0.8, {"column_tau": 0.8}),
+        ("backbone.position_start", "sincos", {"position_init": "sincos"}),
+        ("backbone.layer_scale_start", 0.1, {"layer_scale_init": 0.1}),
+    ],
+)
+def test_settings_of_version_0_1_have_their_places(tmp_path, inside, old, fields):
+    plain = json.loads(json.dumps(PLAIN_OF_VERSION_0_1))
+    *folders, last = inside.split(".")
+    functools.reduce(lambda tree, name: tree[name], folders, plain)[last] = old
+    config = changed(MODEL, fields)
+    params = random_params(config)
+    metadata = {"crisalad-jax 1": json.dumps(plain)}
+    path = tmp_path / "w.safetensors"
+    safetensors.numpy.save_file(under_names_of_version_0_1(params), path, metadata=metadata)
+    found, found_config = load_weights(path)
+    assert found_config == config != MODEL
+    assert_equal(found, params)
+
+
+def changed(config: Any, fields: dict[str, Any]) -> Any:
+    """A configuration with other values in the fields of these names, wherever they are inside."""
+    changes = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name in fields:
+            changes[field.name] = fields[field.name]
+        elif dataclasses.is_dataclass(value):
+            changes[field.name] = changed(value, fields)
+    return dataclasses.replace(config, **changes)
+
+
+@pytest.mark.parametrize("built", [True, False])
+def test_a_vocabulary_of_version_0_1_is_bound_to_its_backbone(tmp_path, built):
+    """Which a checksum among the parameters told; a vocabulary not yet built had 0."""
+    config = dataclasses.replace(WITHOUT_ENCODER, aggregator=AnyLocConfig(layer=0))
+    params = random_params(config)
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
+    checksum = 0
+    for name, leaf in named_leaves(params.backbone).items():
+        checksum = zlib.crc32(np.asarray(leaf).tobytes(), zlib.crc32(name.encode(), checksum))
+    mark = np.float32(1 + checksum % (2**24 - 1) if built else 0)
+    anyloc = {"aggregator": "anyloc", "anyloc": {"clusters": 32, "layer": 0, "facet": "value"}}
+    plain = PLAIN_OF_VERSION_0_1 | anyloc
+    plain["encoder"] = plain["encoder"] | {"layers": 0}
+    path, metadata = tmp_path / "w.safetensors", {"crisalad-jax 1": json.dumps(plain)}
+
+    def write(mark: np.ndarray) -> None:
+        named = arrays | {"aggregator.backbone": np.asarray(mark)}
+        safetensors.numpy.save_file(named, path, metadata=metadata)
+
+    write(mark)
+    found, found_config = load_weights(path)
+    assert found_config == config
+    np.testing.assert_array_equal(found.aggregator.words, params.aggregator.words)
+    save_weights(tmp_path / "again.safetensors", found, config)
+    other = jax.tree.map(lambda leaf: leaf + 1, found.backbone)
+    moved = dataclasses.replace(found, backbone=other)
+    if not built:
+        save_weights(tmp_path / "other.safetensors", moved, config)
+        return
+    with pytest.raises(InputError, match="found a vocabulary of another backbone"):
+        save_weights(tmp_path / "other.safetensors", moved, config)
+    write(mark + np.float32(1))
+    with pytest.raises(InputError, match=f"^{path}: found a vocabulary of another backbone"):
+        load_weights(path)
+
+
+SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.pop(SCORE), [f"{SCORE} missing"]),
+        (lambda a: a.update(extra=np.zeros(2)), ["extra unknown"]),
+        (lambda a: a.update({SCORE: a[SCORE].T.copy()}), [SCORE, "(16, 32), expected", "(32, 16)"]),
+        (lambda a: a.update({SCORE: a[SCORE].astype("f8")}), ["float64", "expected float32"]),
+        (lambda a: a.update({DUST: np.float32(np.nan)[...]}), [f"{DUST} holds NaN or infinity"]),
+        (lambda a: (a.pop(SCORE), a.pop(DUST)), [f"{SCORE} missing", f"{DUST} missing"]),
+        (lambda a: a.clear(), ["backbone.norm.bias missing"]),
+    ],
+)
+def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words):
+    path = tmp_path / "w.safetensors"
+    rewrite(shared, path, change)
+    with pytest.raises(InputError, match=f"^{path}: weights do not fit: ") as error:
+        load_weights(path)
+    assert "\n" not in str(error.value)
+    for word in words:
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "words"),
+    [
+        ({}, r"found metadata \[\]"),
+        ({"format": "pt"}, r"found metadata \['format'\]"),
+        ({"crisalad-jax 1": ""}, "found no configuration in its metadata"),
+        ({"crisalad-jax 1": "{"}, "found no configuration in its metadata"),
+        ({"crisalad-jax 1": "[]"}, "found list"),
+        ({"crisalad-jax 1": '{"clusters": 3}'}, "clusters"),
+        ({"crisalad-jax 1": "[" * 10**5}, "found no configuration in its metadata"),
+        ({"crisalad-jax 1": '{"encoder": {"layers": 99999999999}}'}, "of up to 99999999999"),
+        ({"crisalad-jax 1": '{"encoder": {"layers": 900}}'}, "far from the sizes"),
+        (
+            {"crisalad-jax 1": '{"aggregator": "boq", "boq": {"layers": 900}}'},
+            "far from the sizes",
+        ),
+        ({"crisalad-jax 1": '{"backbone": {"dim": 9000000000000}}'}, "of up to 9000000000000"),
+        ({"crisalad-jax 2": ""}, "found no configuration in its metadata"),
+        ({"crisalad-jax 2": "{"}, "found no configuration in its metadata"),
+        ({"crisalad-jax 2": "[]"}, "found no configuration in its metadata, expected 'config'"),
+        ({"crisalad-jax 2": "{}"}, "found no configuration in its metadata, expected 'config'"),
+        ({"crisalad-jax 2": '{"config": []}'}, "found list"),
+        ({"crisalad-jax 2": '{"config": {"clusters": 3}}'}, "clusters"),
+        ({"crisalad-jax 2": "[" * 10**5}, "found no configuration in its metadata"),
+        ({"crisalad-jax 2": '{"config": {}, "parts": []}'}, "found parts of list, expected an ob"),
+        ({"crisalad-jax 2": '{"config": {}, "aggregator": 3}'}, "found aggregator of int, expect"),
+        (
+            {"crisalad-jax 2": '{"config": {"cross_image": {"layers": 99999999999}}}'},
+            "of up to 99999999999",
+        ),
+        ({"crisalad-jax 2": '{"config": {"cross_image": {"layers": 900}}}'}, "far from the sizes"),
+        (
+            {"crisalad-jax 2": '{"config": {"aggregator": {"name": "boq", "layers": 900}}}'},
+            "far from the sizes",
+        ),
+        (
+            {"crisalad-jax 2": '{"config": {"backbone": {"name": "vit", "dim": 9000000000000}}}'},
+            "of up to 9000000000000",
+        ),
+    ],
+)
+def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
+    path = tmp_path / "w.safetensors"
+    rewrite(shared, path, lambda arrays: None, metadata)
+    with pytest.raises(InputError, match=words) as error:
+        load_weights(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("length", [0, 5, 40, 5000, -1])
+def test_a_file_cut_short_is_refused(tmp_path, shared, length):
+    path = tmp_path / "w.safetensors"
+    path.write_bytes((shared / "weights.safetensors").read_bytes()[:length])
+    with pytest.raises(InputError, match=f"^{path}: not a whole safetensors file") as error:
+        load_weights(path)
+    assert "\n" not in str(error.value)
+
+
+def test_no_file_or_another_one_is_refused(tmp_path):
+    for path, what in ((tmp_path, "a folder"), (tmp_path / "none.safetensors", "no such file")):
+        with pytest.raises(InputError, match=f"^{path}: found {what}, expected a .safetensors"):
+            load_weights(path)
+    (tmp_path / "w.safetensors").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
+    with pytest.raises(InputError, match=r"w\.safetensors: not a whole safetensors file"):
+        load_weights(tmp_path / "w.safetensors")
+
+
+def test_the_hash_is_of_what_descriptors_are_a_function_of(shared):
+    params, config = load_weights(shared / "weights.safetensors")
+    found = model_hash(params, config)
+    assert len(found) == 64
+    assert model_hash(random_params(MODEL), MODEL) == found
+    free = dataclasses.replace(config, image_size=(56, 56), compute_dtype="bfloat16", remat="full")
+    free = dataclasses.replace(free, aggregator=dataclasses.replace(free.aggregator, dropout=0.0))
+    assert model_hash(params, free) == found
+    leaves, structure = jax.tree.flatten(params)
+    for number in (0, len(leaves) // 2, len(leaves) - 1):
+        changed = np.array(leaves[number])
+        changed.flat[-1] = np.nextafter(changed.flat[-1], 2)
+        others = jax.tree.unflatten(structure, [*leaves[:number], changed, *leaves[number + 1 :]])
+        assert model_hash(others, config) != found
+    sinkhorn = dataclasses.replace(config.aggregator.sinkhorn, iterations=4)
+    salad = dataclasses.replace(config.aggregator, sinkhorn=sinkhorn)
+    assert model_hash(params, dataclasses.replace(config, aggregator=salad)) != found
+
+
+def fields_of(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
+    """Fields with a value of their own, or a part: the names, what has them, and the fields."""
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), f"{prefix}{field.name}"
+        if isinstance(value, Part) or not dataclasses.is_dataclass(value):
+            yield name, config, field
+        if dataclasses.is_dataclass(value):
+            yield from fields_of(value, f"{name}.")
+
+
+def other_values(config: Any, field: dataclasses.Field[Any]) -> Iterator[Any]:
+    """Values that a field might have as well; some do not fit the other fields."""
+    value = getattr(config, field.name)
+    hint = typing.get_type_hints(type(config))[field.name]
+    if isinstance(value, Part):
+        yield from (name for name in value.registry if name != value.part_name)
+        kind = type("Another", (type(value),), {"part_name": "another"})
+        yield dataclasses.dataclass(frozen=True)(kind)(**vars(value))
+    elif typing.get_origin(hint) is Literal:
+        yield from (each for each in typing.get_args(hint) if each != value)
+    elif isinstance(value, bool):
+        yield not value
+    elif isinstance(value, int):
+        yield from {value + 1, value + 2, 2 * value, 1} - {value}
+    elif isinstance(value, float):
+        yield from (value / 2, value + 0.5)
+    elif isinstance(value, tuple):
+        yield tuple(2 * each for each in value)
+    else:
+        yield 0.5  # of what is None
+
+
+CONVERGING = changed(MODEL, {"tolerance": 1e-3, "gradient": "stop"})
+
+
+def put(config: Any, name: str, value: Any) -> Any:
+    head, _, rest = name.partition(".")
+    inner = put(getattr(config, head), rest, value) if rest else value
+    return dataclasses.replace(config, **{head: inner})
+
+
+@pytest.mark.parametrize("name", [name for name, _, _ in fields_of(CONVERGING)])
+def test_the_hash_changes_with_every_field_that_matters(params, name):
+    """How parameters start, dropout, rounding, and what a step keeps in memory do not matter."""
+    free = {
+        *("image_size", "compute_dtype", "remat", "aggregator.dropout", "cross_image.dropout"),
+        *("backbone.position_init", "backbone.layer_scale_init"),
+    }
+    config, field = next((has, field) for each, has, field in fields_of(CONVERGING) if each == name)
+    tried = 0
+    for value in other_values(config, field):
+        try:
+            other = put(CONVERGING, name, value)
+        except InputError:
+            continue
+        tried += 1
+        same = model_hash(params, other) == model_hash(params, CONVERGING)
+        assert same == (name in free), value
+    assert tried
+
+
+@dataclasses.dataclass(frozen=True)
+class LaterSinkhorn(SinkhornConfig):
+    """Of a later version."""
+
+    patience: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class LaterSalad(SaladConfig):
+    """Of a later version."""
+
+    sinkhorn: SinkhornConfig = LaterSinkhorn()
+    flavour: str = "plain"
+
+
+@dataclasses.dataclass(frozen=True)
+class LaterModel(ModelConfig):
+    """Of a later version."""
+
+    whitening: bool = False
+    seed: int = free_field(0)
+
+
+def as_later(kind: type, config: Any, **fields: Any) -> Any:
+    theirs = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return kind(**theirs, **fields)
+
+
+def test_a_field_that_a_later_version_adds_leaves_the_hash_at_its_default(params):
+    def later_hash(sinkhorn: dict[str, Any], salad: dict[str, Any], model: dict[str, Any]) -> str:
+        inner = as_later(LaterSinkhorn, MODEL.aggregator.sinkhorn, **sinkhorn)
+        plain = dataclasses.replace(MODEL.aggregator, sinkhorn=inner)
+        aggregator = as_later(LaterSalad, plain, **salad)
+        whole = dataclasses.replace(MODEL, aggregator=aggregator)
+        return model_hash(params, as_later(LaterModel, whole, **model))
+
+    found = model_hash(params, MODEL)
+    assert later_hash({}, {}, {}) == found
+    assert later_hash({}, {}, {"seed": 7}) == found
+    others = {
+        later_hash({"patience": 3}, {}, {}),
+        later_hash({}, {"flavour": "mint"}, {}),
+        later_hash({}, {}, {"whitening": True}),
+    }
+    assert len(others | {found}) == 4
+
+
+# Parts of plug-ins
+
+
+@pytest.fixture
+def _own_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test registers ends with it."""
+    for name in ("_parts", "_presets"):
+        monkeypatch.setattr(AGGREGATORS, name, dict(getattr(AGGREGATORS, name)))
+
+
+PLUGIN = '''
+from crisalad_jax.nn.aggregators import register_aggregator
+
+@register_aggregator("brightest")
+def brightest(features):
+    """The largest of all patches, channel by channel."""
+    return features.patches.max(axis=0)
+'''
+
+
+def save_brightest(path: pathlib.Path) -> ModelConfig:
+    """Write a model of the plug-in's aggregator."""
+    config = dataclasses.replace(WITHOUT_ENCODER, aggregator="brightest")
+    save_weights(path, random_params(config), config)
+    return config
+
+
+@pytest.mark.usefixtures("_own_parts")
+def test_a_part_that_is_not_registered_is_named(tmp_path, monkeypatch):
+    plugin, path = tmp_path / "plugin.py", tmp_path / "w.safetensors"
+    plugin.write_text(PLUGIN)
+    built_in = dict(AGGREGATORS._parts)
+    load_plugin(str(plugin))
+    config = save_brightest(path)
+    assert load_weights(path)[1] == config
+    monkeypatch.setattr(AGGREGATORS, "_parts", built_in)
+    with pytest.raises(InputError) as error:
+        load_weights(path)
+    message = str(error.value)
+    assert message.startswith(f"{path} (metadata): aggregator: found 'brightest', expected one of ")
+    assert "is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin" in message
+    assert message.endswith("@ config.aggregator")
+    assert "\n" not in message
+
+
+def test_a_step_that_is_not_registered_is_named(tmp_path, shared):
+    plain = to_plain(MODEL)
+    plain["aggregator"]["sinkhorn"]["step"] = {"name": "capacity"}
+    path = tmp_path / "w.safetensors"
+    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps({"config": plain})})
+    words = "step: found 'capacity', expected one of .*plug-in missing.* @ config.aggregator.sinkh"
+    with pytest.raises(InputError, match=words):
+        load_weights(path)
+
+
+def notes_of(path: pathlib.Path) -> list[str]:
+    """What loading tells."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        load_weights(path)
+    return [str(one.message) for one in told if issubclass(one.category, Note)]
+
+
+@pytest.mark.usefixtures("_own_parts")
+def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
+    plugin, path = tmp_path / "plugin.py", tmp_path / "w.safetensors"
+    plugin.write_text(PLUGIN)
+    load_plugin(str(plugin))
+    save_brightest(path)
+    assert notes_of(path) == []
+    # A later process reads the file anew. Comments, docstrings and layout are no other source.
+    plugin.write_text("# Mine.\n" + PLUGIN.replace("The largest of all", "Maximum of") + "\n\n")
+    source._file_digest.cache_clear()
+    assert notes_of(path) == []
+    plugin.write_text(PLUGIN.replace("max(", "min("))
+    source._file_digest.cache_clear()
+    (note,) = notes_of(path)
+    assert note == (
+        f"{path}: found another source of aggregator brightest than these weights were written "
+        "with; descriptors may differ"
+    )
+    # Whatever the version of this package: a plug-in has one of its own.
+    monkeypatch.setattr(weights, "VERSION", "99.0")
+    assert notes_of(path) == [note]
+
+
+def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypatch):
+    path = tmp_path / "w.safetensors"
+    with safetensors.safe_open(shared / "weights.safetensors", framework="numpy") as file:
+        told = json.loads(file.metadata()["crisalad-jax 2"])
+    told["parts"]["aggregator.dustbin"][1] = "0" * 64
+    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(told)})
+    (note,) = notes_of(path)
+    assert f"{path}: found another source of aggregator.dustbin column than" in note
+    assert notes_of(shared / "weights.safetensors") == []
+    # Those of another version are held by this package's tests to do the same.
+    monkeypatch.setattr(weights, "VERSION", "99.0")
+    assert notes_of(path) == []
+
+
+@pytest.mark.parametrize("parts", [{"aggregator": 3}, {"aggregator": ["salad"]}, {"x": []}])
+def test_sources_that_are_none_are_passed_over(tmp_path, shared, parts):
+    path = tmp_path / "w.safetensors"
+    told = {"config": to_plain(MODEL), "version": crisalad_jax.__version__, "parts": parts}
+    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(told)})
+    assert notes_of(path) == []

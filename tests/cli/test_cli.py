@@ -1,0 +1,857 @@
+"""The command line: what it writes, and for every bad input one line on stderr and exit code 2."""
+
+import dataclasses
+import errno
+import importlib
+import json
+import pathlib
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+
+import cv2
+import h5py
+import jax
+import numpy as np
+import PIL.Image
+import pytest
+import safetensors.numpy
+import torch
+
+import crisalad_jax.cli
+from crisalad_jax.checkpoints.layouts import public_shapes
+from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.cli import main
+from crisalad_jax.config.io import read_config, to_plain
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.results import to_json
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad, describe
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import (
+    BATCH,
+    IMAGES_PER_PLACE,
+    MODEL,
+    RECIPE,
+    STEPS,
+    random_params,
+    write_picture,
+)
+from tests.random_checkpoints import random_state, save
+
+Capture = pytest.CaptureFixture[str]
+
+WITHOUT_ENCODER = dataclasses.replace(
+    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
+)
+# See test_evaluation: rounding of float32 sums.
+TOLERANCE = 2e-6
+
+
+def succeeds(capfd: Capture, *arguments: object) -> str:
+    """Run; the words on stdout, with any space or line break as one space."""
+    code = main([str(a) for a in arguments])
+    printed = capfd.readouterr()
+    assert (code, printed.err) == (0, "")
+    return " ".join(printed.out.split())
+
+
+def fails(capfd: Capture, *arguments: object, words: tuple[object, ...]) -> str:
+    """Run; code 2 and a single line on stderr that holds the words, even from code below Python."""
+    code = main([str(a) for a in arguments])
+    error = capfd.readouterr().err
+    assert code == 2
+    assert error.startswith("crisalad: ")
+    assert error.count("\n") == 1
+    assert error.endswith("\n")
+    for word in words:
+        assert str(word) in error
+    return error
+
+
+def files_in(folder: pathlib.Path) -> set[str]:
+    """All but TensorBoard's, whose names have a time in them."""
+    files = (p for p in folder.rglob("*") if p.is_file() and p.parent.name != "tensorboard")
+    return {p.relative_to(folder).as_posix() for p in files}
+
+
+def train(shared: pathlib.Path, data: pathlib.Path, out: pathlib.Path, *more: object) -> tuple:
+    """A run of RECIPE. Weights are given: to draw them takes longer than the run."""
+    return (
+        *("train", "--data", data, "--out", out, "--config", shared / "recipe.json"),
+        *("--weights", shared / "weights.safetensors", "--quiet", *more),
+    )
+
+
+def spoil(path: pathlib.Path, how: str) -> None:
+    data = path.read_bytes()
+    path.write_bytes({"empty": b"", "cut": data[: len(data) // 2], "text": b"no image"}[how])
+
+
+POSITIONAL = {
+    ("convert", "source"): "SRC",
+    ("convert", "target"): "DST",
+    ("query", "images"): "IMAGE",
+}
+SPOILT = pytest.mark.parametrize("how", ["empty", "cut", "text"])
+
+
+# Arguments
+
+
+def test_help_lists_every_command_and_flag(capfd):
+    out = succeeds(capfd, "--help")
+    for command, summary in crisalad_jax.cli._COMMANDS.items():
+        assert f"{command} {summary}" in out
+        help_text = succeeds(capfd, command, "--help")
+        module = importlib.import_module(f"crisalad_jax.cli.{command}")
+        for field in dataclasses.fields(getattr(module, command.capitalize())):
+            if (command, field.name) in POSITIONAL:
+                assert POSITIONAL[command, field.name] in help_text
+            elif field.name != "settings":
+                assert f"--{field.name.replace('_', '-')}" in help_text
+    for flag in (
+        "--model.backbone.adapter.kind",
+        "--optimiser.learning-rate",
+        "--places-per-batch",
+    ):
+        assert flag in succeeds(capfd, "train", "--help")
+
+
+def test_no_command_prints_the_usage(capfd):
+    assert main([]) == 2
+    assert capfd.readouterr().err.startswith("usage: crisalad COMMAND")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            "tran --data d --out o",
+            "command: found 'tran', expected one of ablate, compare, convert",
+        ),
+        ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
+        ("train --data d --out o --preset b16", "preset: found 'b16'"),
+        ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
+        ("train --data d --out o --recipe salad --config c", "--recipe: found beside --config"),
+        ("train --data d --out o --micro-batch 5", "micro_batch: found 5, expected a divisor of"),
+        ("train --data d --out o --loss.kind fast-ap", "expected 'none': it ranks all images"),
+        ("evaluate --data d --preset b16", "preset: found 'b16'"),
+        ("info --colour red", "--colour"),
+        ("train --data d --out o --epoch 3", "--epochs"),  # perhaps you meant
+        ("train --data d", "--out"),
+        ("extract", "--weights PATH --images PATH --out PATH"),
+        ("train --data d --out o --seed one", "--seed"),
+        ("train --data d --out o --preset", "--preset"),
+        ("train --data d --out o --seed -1", "TrainConfig.seed: found -1"),
+        ("train --data d --out o --epochs 0", "TrainConfig.epochs: found 0"),
+        ("train --data d --out o --trainable half", "trainable: found 'half'"),
+        ("train --data d --out o --optimiser.learning-rate 0", "learning_rate: found 0"),
+        ("train --data d --out o --model.image-size 100 98", "found 100 x 98, .*nearest: 98 x 98"),
+        ("train --data d --out o --image-size 100 98", "found 100 x 98"),
+        ("train --data d --out o --model.backbone.ffn relu", "relu.*mlp.*swiglu"),
+        ("train --data d --out o --model.backbone.dim 100", "ViTConfig.dim: found 100"),
+        ("train --data d --out o --on-bad-image ignore", "ignore.*stop.*skip"),
+        ("evaluate --data d --grouping single,sorted", "grouping: found 'sorted', expected one of"),
+        ("evaluate --data d --grouping a/b/c", "grouping: found 'a/b/c', .*QUERIES/DATABASE"),
+        ("evaluate --data d --seeds 0", "seeds: found 0, expected at least 1"),
+        ("evaluate --data d --batch-size 0", "batch size: found 0"),
+        ("evaluate --data d --seed -1", "seed: found -1"),
+        ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
+        ("extract --weights w --images d --out f.npy --grouping all", "grouping: found 'all'"),
+        ("extract --weights w --images d --out f.npy --batch-size 0", "batch size: found 0"),
+        ("info --image-size 112 98", "56 patches for 64 clusters"),
+        ("info --image-size 112", "--image-size"),
+        ("info --trainable last-13-blocks+head", "last 13 blocks, expected at most 12"),
+        ("demo --seed -1 --out o", "seed: found -1"),
+    ],
+)
+def test_bad_arguments(capfd, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    error = fails(capfd, *arguments.split(), words=())
+    assert re.search(words, error), error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "No such file"),
+        ("{", "cannot read this configuration"),
+        ('{"epochs": 3, "colour": "red"}', "colour"),
+        ('{"epochs": "three"}', "expected int"),
+        ('{"model": {"image_size": [100, 98]}}', "found 100 x 98"),
+    ],
+)
+def test_a_bad_config_file(capfd, tmp_path, content, words):
+    path = tmp_path / "mine.json"
+    if content is not None:
+        path.write_text(content)
+    fails(
+        capfd,
+        *("train", "--data", "d", "--out", tmp_path / "run", "--config", path),
+        words=(f"crisalad: {path}: ", words),
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_interrupt_is_no_traceback(capfd, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("crisalad_jax.cli.info.model_summary", interrupt)
+    assert main(["info"]) == 130
+    assert capfd.readouterr().err == "crisalad: interrupted\n"
+
+
+def test_the_console_script_and_the_module_are_the_same_thing(tmp_path):
+    """One process for real: nothing else may write to stderr, and the code must come through."""
+    write_picture(tmp_path / "a.jpg", 0)
+    spoil(tmp_path / "a.jpg", "cut")
+    save_weights(tmp_path / "w.safetensors", random_params(MODEL), MODEL)
+    command = [sys.executable, "-m", "crisalad_jax", "extract", "--quiet"]
+    command += ["--weights", "w.safetensors", "--images", ".", "--out", "d.npy"]
+    root = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
+    done = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("crisalad: a.jpg: found an image cut short")
+    assert done.stderr.count("\n") == 1
+    assert files_in(tmp_path) == {"a.jpg", "w.safetensors"}
+
+
+# train
+
+
+def test_a_run_from_the_command_line_and_the_same_command_again(
+    capfd, tmp_path, shared, benchmark, run
+):
+    arguments = train(
+        shared, shared / "city", tmp_path / "run", "--val", shared / "town", "--patience", "None"
+    )
+    out = succeeds(capfd, *arguments)
+    assert "8 places, 24 images; validation on town/test (@UTM, 25 m)" in out
+    assert f"{STEPS} steps, best Recall@5" in out
+    assert (tmp_path / "run" / "curves.png").stat().st_size > 0
+    found, expected = (
+        load_weights(folder / "last.safetensors") for folder in (tmp_path / "run", run)
+    )
+    assert found[1] == MODEL
+    for name, leaf in named_leaves(found[0]).items():
+        np.testing.assert_array_equal(leaf, named_leaves(expected[0])[name])
+    resolved = tmp_path / "run" / "config.json"
+    assert read_config(TrainConfig, resolved) == dataclasses.replace(RECIPE, patience=None)
+
+    log = (tmp_path / "run" / "metrics.jsonl").read_bytes()
+    out = succeeds(capfd, *arguments)
+    assert f"{STEPS} steps, best Recall@5" in out
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == log
+
+
+def without_column(city: pathlib.Path) -> pathlib.Path:
+    table = city / "Dataframes" / "Brill.csv"
+    rows = [line.split(",") for line in table.read_text().splitlines()]
+    table.write_text("\n".join(",".join(row[:3] + row[4:]) for row in rows))
+    return table
+
+
+def without_file(city: pathlib.Path) -> pathlib.Path:
+    sorted((city / "Images" / "Brill").iterdir())[4].unlink()
+    return city / "Dataframes" / "Brill.csv"
+
+
+def few_images(city: pathlib.Path) -> pathlib.Path:
+    for table in (city / "Dataframes").iterdir():
+        header, *rows = table.read_text().splitlines()
+        table.write_text("\n".join([header, *rows[::IMAGES_PER_PLACE]]))
+    return city
+
+
+def few_places(city: pathlib.Path) -> pathlib.Path:
+    (city / "Dataframes" / "Brill.csv").unlink()
+    table = city / "Dataframes" / "Aston.csv"
+    table.write_text("\n".join(table.read_text().splitlines()[:7]))
+    return city
+
+
+def no_tables(city: pathlib.Path) -> pathlib.Path:
+    for table in (city / "Dataframes").iterdir():
+        table.unlink()
+    return city / "Dataframes"
+
+
+def no_number(city: pathlib.Path) -> pathlib.Path:
+    table = city / "Dataframes" / "Aston.csv"
+    table.write_text(table.read_text().replace(",2020,", ",MMXX,", 1))
+    return table
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (without_column, "missing northdeg"),
+        (without_file, "Brill_0000001_2020_05_001_1.5_2.5_pano.jpg"),
+        (few_images, "found no place with at least 2 images; the largest has 1"),
+        (few_places, "found 2 places, expected at least places_per_batch 3"),
+        (no_tables, "found no CSV file"),
+        (no_number, "line 2: year: found 'MMXX'"),
+    ],
+)
+def test_bad_places(
+    capfd, tmp_path, shared, city, damage: Callable[[pathlib.Path], pathlib.Path], words
+):
+    culprit = damage(city)
+    fails(capfd, *train(shared, city, tmp_path / "run"), words=(f"crisalad: {culprit}: ", words))
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_and_empty_folders(capfd, tmp_path, shared):
+    (tmp_path / "empty").mkdir()
+    out, weights = tmp_path / "out", shared / "weights.safetensors"
+    for data in (tmp_path / "none", tmp_path / "empty"):
+        fails(capfd, *train(shared, data, out), words=(f"crisalad: {data}: ",))
+        fails(capfd, *train(shared, shared / "city", out, "--val", data), words=(f"{data}: ",))
+        fails(capfd, "evaluate", "--weights", weights, "--data", data, words=(f"{data}: found ",))
+        fails(
+            capfd,
+            *("extract", "--weights", weights, "--images", data, "--out", tmp_path / "d.npy"),
+            words=(f"crisalad: {data}: found ", "expected"),
+        )
+    assert files_in(tmp_path) == set()
+    assert not out.exists()
+
+
+@SPOILT
+def test_a_bad_training_image_stops_the_run_until_it_is_repaired(
+    capfd, tmp_path, shared, city, how
+):
+    """Half of the places are spoilt, and every batch holds three of four: one is met."""
+    whole = {}
+    for path in sorted((city / "Images").rglob("*_000000[01]_*.jpg")):
+        whole[path] = path.read_bytes()
+        spoil(path, how)
+    arguments = train(shared, city, tmp_path / "run")
+    error = fails(capfd, *arguments, words=(f"crisalad: {city}/Images/",))
+    assert pathlib.Path(error.split(": ")[1]) in whole
+    # A run that has not begun; no half of any file.
+    assert files_in(tmp_path / "run") == {"config.json", "metrics.jsonl"}
+    for path, data in whole.items():
+        path.write_bytes(data)
+    assert f"{STEPS} steps" in succeeds(capfd, *arguments)
+
+
+def test_bad_training_images_are_skipped_and_counted(capfd, tmp_path, shared, city):
+    for path, how in zip(
+        sorted((city / "Images").rglob("*_000000[01]_*.jpg")),
+        ["empty", "cut", "text"] * 4,
+        strict=True,
+    ):
+        spoil(path, how)
+    arguments = train(shared, city, tmp_path / "run", "--on-bad-image", "skip")
+    out = succeeds(capfd, *arguments)
+    log = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    skipped = sum(json.loads(line)["skipped_images"] for line in log)
+    assert skipped > 0
+    assert f"{skipped} unreadable images skipped" in out
+
+
+def test_a_loss_that_is_not_finite_names_the_step_and_keeps_the_last_good_state(
+    capfd, tmp_path, shared, params: Crisalad
+):
+    """Finite weights so large that the first loss overflows."""
+    huge = jax.tree.map(lambda leaf: leaf * 1e30, params)
+    save_weights(tmp_path / "huge.safetensors", huge, MODEL)
+    arguments = train(shared, shared / "city", tmp_path / "run")
+    position = arguments.index("--weights") + 1
+    arguments = (*arguments[:position], tmp_path / "huge.safetensors", *arguments[position + 1 :])
+    fails(
+        capfd,
+        *arguments,
+        words=("nan", "at step 1, expected finite", f"after step 0 is kept in {tmp_path / 'run'}"),
+    )
+    kept, _ = load_weights(tmp_path / "run" / "last.safetensors")
+    for name, leaf in named_leaves(kept).items():
+        np.testing.assert_array_equal(leaf, named_leaves(huge)[name])
+    assert (tmp_path / "run" / "metrics.jsonl").read_text() == ""
+
+
+def test_a_folder_of_other_files_or_of_another_run_is_left_alone(capfd, tmp_path, shared, run):
+    (tmp_path / "notes.txt").write_text("mine")
+    fails(
+        capfd,
+        *train(shared, shared / "city", tmp_path),
+        words=(f"crisalad: {tmp_path}: found files but no run",),
+    )
+    assert files_in(tmp_path) == {"notes.txt"}
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    fails(
+        capfd,
+        *train(shared, shared / "city", run, "--seed", "6"),
+        words=(f"crisalad: {run}: holds a run of another configuration", "seed: found 6, expected"),
+    )
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_too_few_patches_for_the_clusters(capfd, tmp_path, shared):
+    fails(
+        capfd,
+        *train(shared, shared / "city", tmp_path / "run", "--image-size", "28", "28"),
+        words=("found 28 x 28, which is 4 patches for 4 clusters", "works: 42 x 42"),
+    )
+    assert not (tmp_path / "run").exists()
+
+
+# Weights
+
+
+def test_weights_of_another_configuration(capfd, tmp_path, shared):
+    weights = shared / "weights.safetensors"
+    fails(
+        capfd,
+        *("train", "--preset", "tiny", "--data", shared / "city", "--out", tmp_path / "run"),
+        *("--weights", weights),
+        words=(f"crisalad: {weights}: ", "another model", "backbone.dim: found 32, expected 128"),
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_extract_computes_in_the_type_that_is_asked_for(capfd, tmp_path, shared):
+    town = shared / "town"
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
+    succeeds(capfd, *extract(shared, town, tmp_path / "n.npy", "--compute-dtype", "bfloat16"))
+    config = json.loads((tmp_path / "n.config.json").read_text())
+    assert config["model"]["compute_dtype"] == "bfloat16"
+    wide, narrow = (np.load(tmp_path / name) for name in ("d.npy", "n.npy"))
+    assert np.abs(narrow - wide).max() > 1e-4  # float32 would be off by 1e-6
+    # bfloat16 keeps 8 bits: a step is off by up to 2^-9, some 20 of them by 1 % or so, and the
+    # cosine by half the square of that, with room for an unlucky image.
+    assert (narrow * wide).sum(axis=-1).min() > 0.999
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "cut", "foreign", "shape", "nan"])
+def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
+    weights = tmp_path / "w.safetensors"
+    whole = shared / "weights.safetensors"
+    arrays = safetensors.numpy.load_file(whole)
+    metadata = {"crisalad-jax 1": json.dumps(to_plain(MODEL))}
+    if kind == "cut":
+        weights.write_bytes(whole.read_bytes()[:-100])
+    elif kind == "empty":
+        weights.write_bytes(b"")
+    elif kind == "foreign":
+        safetensors.numpy.save_file(arrays, weights, metadata={"format": "pt"})
+    elif kind != "missing":
+        arrays["aggregator.dust_bin"] = (
+            np.zeros(2, np.float32) if kind == "shape" else np.array(np.nan, np.float32)
+        )
+        safetensors.numpy.save_file(arrays, weights, metadata=metadata)
+    before = files_in(tmp_path)
+    start = ("--weights", weights)
+    town = shared / "town"
+    for arguments in (
+        (
+            "train",
+            "--config",
+            shared / "recipe.json",
+            "--data",
+            shared / "city",
+            "--out",
+            tmp_path / "r",
+        ),
+        ("evaluate", "--data", town, "--json", tmp_path / "table.json"),
+        ("extract", "--images", town, "--out", tmp_path / "d.npy"),
+        ("info",),
+    ):
+        fails(capfd, *arguments, *start, words=(f"crisalad: {weights}: ",))
+    assert files_in(tmp_path) == before
+
+
+# convert, and a backbone to start from
+
+
+BACKBONE = ModelConfig(
+    aggregator="class-token",
+    backbone=ViTConfig(
+        dim=64, depth=2, heads=1, position_grid=3, adapter=AdapterConfig(kind="none")
+    ),
+    cross_image=CrossImageConfig(layers=0),
+)
+
+
+@pytest.fixture
+def public(tmp_path) -> pathlib.Path:
+    """A DINOv2 checkpoint of two blocks of width 64."""
+    return save(tmp_path / "dinov2.pth", random_state(public_shapes(BACKBONE, "dinov2")))
+
+
+def test_convert_says_what_it_found(capfd, tmp_path, public):
+    ours, back = tmp_path / "w.safetensors", tmp_path / "back.pth"
+    out = succeeds(capfd, "convert", public, ours)
+    assert f"{public} (DINOv2 .pth) -> {ours} (crisalad-jax): backbone of width 64, 2 blocks" in out
+    assert "descriptor of 64 numbers" in out
+    assert load_weights(ours)[1] == BACKBONE
+    out = succeeds(capfd, "convert", ours, back)
+    assert f"(crisalad-jax) -> {back} (DINOv2 .pth)" in out
+    assert back.read_bytes() == public.read_bytes()
+    succeeds(capfd, "convert", ours, back, "--layout", "reference")
+    assert torch.load(back).keys() == {"state_dict", "config"}
+
+
+def test_convert_refuses_in_one_line(capfd, tmp_path, public):
+    for arguments, words in (
+        ((public, tmp_path / "x.pth"), ("x.pth: found suffix '.pth', expected .safetensors",)),
+        ((tmp_path / "none", tmp_path / "x.safetensors"), ("none: found no such file",)),
+        ((public, tmp_path / "x.safetensors", "--layout", "timm"), ("layout: found 'timm'",)),
+        ((public,), ("DST",)),
+    ):
+        fails(capfd, "convert", *arguments, words=words)
+    assert files_in(tmp_path) == {"dinov2.pth"}
+
+
+@pytest.mark.slow
+def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
+    model = dataclasses.replace(
+        RECIPE.model, backbone=dataclasses.replace(BACKBONE.backbone, adapter=AdapterConfig())
+    )
+    recipe = dataclasses.replace(RECIPE, model=model, trainable="adapters+head", epochs=1)
+    write_json(tmp_path / "recipe.json", to_plain(recipe))
+    arguments = (
+        *("train", "--config", tmp_path / "recipe.json", "--backbone", public),
+        *("--data", shared / "city", "--quiet"),
+    )
+    fails(
+        capfd,
+        *(*arguments, "--out", tmp_path / "r", "--weights", public),
+        words=("--backbone: found beside --weights",),
+    )
+    fails(
+        capfd,
+        *(*arguments, "--out", tmp_path / "r", "--model.backbone.depth", 3),
+        words=(f"{public}: this backbone is of another size: depth: found 2, expected 3",),
+    )
+    assert not (tmp_path / "r").exists()
+    succeeds(capfd, *arguments, "--out", tmp_path / "run")
+    trained, _ = load_weights(tmp_path / "run" / "last.safetensors")
+    found = named_leaves(trained.backbone)
+    # The frozen part is the file's to the bit; the adapters have moved from their start at 0.
+    for name, leaf in named_leaves(read_checkpoint(public).params.backbone).items():
+        np.testing.assert_array_equal(found[name], leaf)
+    assert np.abs(found["blocks.adapter.up.weight"]).max() > 0
+
+
+# evaluate
+
+
+def test_evaluate_prints_and_writes_the_table(
+    capfd, tmp_path, shared, params: Crisalad, benchmark: Benchmark
+):
+    out = succeeds(
+        capfd,
+        *("evaluate", "--weights", shared / "weights.safetensors", "--data", shared / "town"),
+        *("--batch-size", BATCH, "--seed", "3", "--json", tmp_path / "table.json", "--quiet"),
+        *("--seeds", "2", "--out", tmp_path / "pictures"),
+    )
+    assert "town/test (@UTM, 25 m): 5 queries, 7 database images; positive: UTM distance" in out
+    # The customer is told that a descriptor depends on its batch, and how each row grouped.
+    assert f"depends on the images in its batch of {BATCH}: single = every image alone" in out
+    assert "window = every image with those just before it in file order" in out
+    assert "Shuffled: mean of 2 seeds ± their standard deviation" in out
+    table = json.loads((tmp_path / "table.json").read_text())
+    expected = evaluate(params, MODEL, benchmark, batch_size=BATCH, seed=3, seeds=2, quiet=True)
+    groupings = ["single", "shuffled", "sequential", "window/single"]
+    assert [row["grouping"] for row in table["results"]] == groupings
+    for row, result in zip(table["results"], expected, strict=True):
+        assert row == {
+            "benchmark": benchmark.name,
+            "model": f"{shared.name}/weights.safetensors",
+            **json.loads(json.dumps(to_json(result))),
+        }
+        assert f"{100 * result.recalls[1]:.1f}" in out
+    assert table["model"] == to_plain(MODEL)
+    assert (table["batch_size"], table["seed"], table["seeds"]) == (BATCH, 3, 2)
+    assert table["rule"] == benchmark.rule
+    assert f"the image's own place, told by {table['same_place']}" in out
+    assert files_in(tmp_path / "pictures") == {
+        "config.json",
+        *(f"gallery_{name.replace('/', '-')}.png" for name in groupings),
+    }
+    written = json.loads((tmp_path / "pictures" / "config.json").read_text())
+    assert written == {key: value for key, value in table.items() if key != "results"}
+
+
+def test_without_an_encoder_there_is_one_row(capfd, tmp_path, shared):
+    save_weights(tmp_path / "w.safetensors", random_params(WITHOUT_ENCODER), WITHOUT_ENCODER)
+    out = succeeds(
+        capfd,
+        *("evaluate", "--weights", tmp_path / "w.safetensors", "--data", shared / "town"),
+        *("--batch-size", BATCH, "--json", tmp_path / "table.json", "--quiet"),
+    )
+    assert "No cross-image encoder: no descriptor depends on its batch." in out
+    (row,) = json.loads((tmp_path / "table.json").read_text())["results"]
+    assert row["grouping"] == "any"
+
+
+@SPOILT
+def test_a_bad_image_stops_an_evaluation(capfd, tmp_path, shared, town, how):
+    bad = sorted((town / "images" / "test" / "database").iterdir())[5]
+    spoil(bad, how)
+    fails(
+        capfd,
+        *("evaluate", "--weights", shared / "weights.safetensors", "--data", town, "--quiet"),
+        *("--batch-size", BATCH, "--json", tmp_path / "out" / "t.json", "--out", tmp_path / "out"),
+        words=(f"crisalad: {bad}: found ",),
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_evaluation_sets(capfd, tmp_path, shared, town):
+    start = ("evaluate", "--weights", shared / "weights.safetensors", "--data", town)
+    fails(capfd, *start, "--split", "val", words=(f"crisalad: {town}: ", "splits test"))
+    fails(capfd, *start, "--radius", "-1", words=("radius: found -1",))
+    fails(capfd, *start, "--image-size", "28", "28", words=("4 patches for 4 clusters",))
+    fails(capfd, *start, "--image-size", "50", "56", words=("found 50 x 56", "nearest: 56 x 56"))
+    query = sorted((town / "images" / "test" / "queries").iterdir())[0]
+    query.rename(query.with_name("street.jpg"))
+    fails(capfd, *start, words=(f"{query.with_name('street.jpg')}: found no coordinates",))
+    query.with_name("street.jpg").unlink()
+    for path in (town / "images" / "test" / "queries").iterdir():
+        path.unlink()
+    fails(capfd, *start, words=(f"crisalad: {town}/images/test/queries: found no image",))
+
+
+# extract
+
+
+def extract(shared: pathlib.Path, images: pathlib.Path, out: pathlib.Path, *more: object) -> tuple:
+    return (
+        *("extract", "--weights", shared / "weights.safetensors", "--images", images),
+        *("--out", out, "--batch-size", BATCH, "--quiet", *more),
+    )
+
+
+def described(params: Crisalad, paths: list[pathlib.Path]) -> np.ndarray:
+    """Each alone, in a batch of one."""
+    rows = []
+    for path in paths:
+        image = resize_image(read_image(path), MODEL.image_size)
+        rows.append(describe(params, image[None], MODEL)[0])
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.config.json"])
+def test_extract_knows_at_once_that_one_of_its_files_cannot_be(capfd, tmp_path, shared, name):
+    (tmp_path / name).mkdir()
+    start = extract(shared, shared / "town", tmp_path / "d.npy")
+    fails(capfd, *start, words=(f"{tmp_path / name}: found a folder",))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_what_the_disk_refuses_is_one_line(capfd, tmp_path, shared, monkeypatch):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "d.npy")
+
+    monkeypatch.setattr(np.lib.format, "write_array_header_1_0", full)
+    start = extract(shared, shared / "town", tmp_path / "d.npy")
+    fails(capfd, *start, words=("No space left on device: 'd.npy'",))
+
+
+def test_extract_writes_descriptors_names_and_configuration(capfd, tmp_path, shared, params):
+    town = shared / "town"
+    out = succeeds(capfd, *extract(shared, town, tmp_path / "new" / "d.npy"))
+    assert "12 descriptors of 48 numbers, grouping single (every image alone)" in out
+    assert files_in(tmp_path / "new") == {"d.npy", "d.names.txt", "d.config.json"}
+    names = (tmp_path / "new" / "d.names.txt").read_text().splitlines()
+    assert names == sorted(path.relative_to(town).as_posix() for path in town.rglob("*.jpg"))
+    found = np.load(tmp_path / "new" / "d.npy")
+    np.testing.assert_allclose(
+        found, described(params, [town / name for name in names]), atol=TOLERANCE, rtol=0
+    )
+    config = json.loads((tmp_path / "new" / "d.config.json").read_text())
+    assert config == {
+        "weights": str(shared / "weights.safetensors"),
+        "images": str(town),
+        "grouping": "single",
+        "batch_size": BATCH,
+        "seed": 0,
+        "pca": None,
+        "skipped": [],
+        "model": to_plain(MODEL),
+    }
+
+    succeeds(capfd, *extract(shared, town, tmp_path / "h" / "d.h5"))
+    assert files_in(tmp_path / "h") == {"d.h5", "d.config.json"}
+    with h5py.File(tmp_path / "h" / "d.h5", "r") as file:
+        for name, row in zip(names, found, strict=True):
+            np.testing.assert_array_equal(file[name]["global_descriptor"][()], row)
+
+    succeeds(capfd, *extract(shared, town, tmp_path / "s.npy", "--grouping", "sequential"))
+    database = np.stack([resize_image(read_image(town / name), (42, 56)) for name in names[:BATCH]])
+    np.testing.assert_allclose(
+        np.load(tmp_path / "s.npy")[:BATCH],
+        describe(params, database, MODEL),
+        atol=TOLERANCE,
+        rtol=0,
+    )
+
+
+def write_odd_images(folder: pathlib.Path) -> None:
+    """Pairs: NAME.odd.SUFFIX, and NAME.plain.png, the same picture as Pillow turns it to RGB."""
+    folder.mkdir()
+
+    def picture(seed: int, channels: int = 3) -> np.ndarray:
+        coarse = np.random.default_rng(seed).integers(0, 256, (4, 5, 4), dtype=np.uint8)
+        return cv2.resize(coarse, (90, 60), interpolation=cv2.INTER_CUBIC)[..., :channels]
+
+    def save(name: str, odd: PIL.Image.Image, plain: PIL.Image.Image | None = None, **how) -> None:
+        odd.save(folder / name, quality=95, **how)
+        with PIL.Image.open(folder / name) as saved:
+            plain = saved if plain is None else plain
+            plain.convert("RGB").save(folder / f"{name.split('.')[0]}.plain.png")
+
+    grey = picture(0)[..., 0].copy()
+    save(
+        "deep.odd.png",
+        PIL.Image.fromarray((grey.astype(np.uint16) << 8) + 37),
+        plain=PIL.Image.fromarray(grey),
+    )
+    save("grey.odd.png", PIL.Image.fromarray(picture(1)[..., 0].copy()))
+    save("alpha.odd.png", PIL.Image.fromarray(picture(2, channels=4)))
+    save("cmyk.odd.jpg", PIL.Image.fromarray(picture(3)).convert("CMYK"))
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 6  # to be turned a quarter clockwise
+    sideways = PIL.Image.fromarray(picture(4))
+    upright = sideways.transpose(PIL.Image.Transpose.ROTATE_270)
+    save("turned.odd.jpg", sideways, plain=upright, exif=exif)
+    dot = PIL.Image.new("RGB", (1, 1), (200, 90, 30))
+    save("dot.odd.png", dot, plain=dot.resize((56, 42)))
+    wide = PIL.Image.fromarray(picture(5)).resize((20_000, 30))
+    save("wide.odd.png", wide, plain=wide.resize((56, 42), PIL.Image.Resampling.BILINEAR))
+
+
+def test_odd_images_are_described_as_their_plain_twins(capfd, tmp_path, shared):
+    write_odd_images(tmp_path / "images")
+    succeeds(capfd, *extract(shared, tmp_path / "images", tmp_path / "d.npy"))
+    names = (tmp_path / "d.names.txt").read_text().splitlines()
+    rows = dict(zip(names, np.load(tmp_path / "d.npy"), strict=True))
+    odd = {name.split(".")[0]: row for name, row in rows.items() if ".odd." in name}
+    plain = {name.split(".")[0]: row for name, row in rows.items() if ".plain." in name}
+    assert odd.keys() == plain.keys()
+    assert len(odd) == 7
+    for name, row in odd.items():
+        similarities = {other: float(row @ plain[other]) for other in plain}
+        # Decoders, JPEG and resizing move a pixel by a few grey levels of 255, which turns a unit
+        # vector by little; other pictures are far.
+        assert similarities.pop(name) > 0.999, (name, similarities)
+        assert max(similarities.values()) < 0.99, (name, similarities)
+
+
+@SPOILT
+def test_extract_stops_at_a_bad_image_and_leaves_nothing(capfd, tmp_path, shared, town, how):
+    bad = list_images(town)[6]
+    spoil(bad, how)
+    for name in ("d.npy", "d.h5"):
+        fails(
+            capfd,
+            *extract(shared, town, tmp_path / "out" / name),
+            words=(f"crisalad: {bad}: found",),
+        )
+    assert not (tmp_path / "out").exists()
+
+
+def test_extract_skips_bad_images_and_says_so(capfd, tmp_path, shared, town, params):
+    paths = list_images(town)
+    for index, how in ((0, "empty"), (6, "cut"), (11, "text")):
+        spoil(paths[index], how)
+    kept = [path for index, path in enumerate(paths) if index not in (0, 6, 11)]
+    out = succeeds(capfd, *extract(shared, town, tmp_path / "d.npy", "--on-bad-image", "skip"))
+    assert "9 descriptors" in out
+    assert "3 unreadable images left out" in out
+    names = (tmp_path / "d.names.txt").read_text().splitlines()
+    assert [town / name for name in names] == kept
+    np.testing.assert_allclose(
+        np.load(tmp_path / "d.npy"), described(params, kept), atol=TOLERANCE, rtol=0
+    )
+    skipped = json.loads((tmp_path / "d.config.json").read_text())["skipped"]
+    assert [town / name for name in skipped] == [paths[0], paths[6], paths[11]]
+
+
+def test_extract_with_no_readable_image(capfd, tmp_path, shared):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_text("no image")
+    fails(
+        capfd,
+        *extract(shared, tmp_path / "images", tmp_path / "d.npy", "--on-bad-image", "skip"),
+        words=(f"crisalad: {tmp_path / 'images'}: found 1 images, none of them readable",),
+    )
+    assert files_in(tmp_path) == {"images/a.jpg"}
+
+
+def test_an_output_that_cannot_be_written_is_named(capfd, tmp_path, shared):
+    (tmp_path / "file").write_text("")
+    fails(
+        capfd,
+        *extract(shared, shared / "town", tmp_path / "file" / "d.npy"),
+        words=(f"crisalad: {tmp_path / 'file' / 'd.npy'}: cannot be made",),
+    )
+    (tmp_path / "d.h5").mkdir()
+    fails(
+        capfd,
+        *extract(shared, shared / "town", tmp_path / "d.h5"),
+        words=(f"crisalad: {tmp_path / 'd.h5'}: found a folder",),
+    )
+    assert files_in(tmp_path) == {"file"}
+
+
+# info
+
+
+def test_info_gives_the_papers_numbers(capfd, tmp_path):
+    out = succeeds(capfd, "info", "--preset", "b14", "--json", tmp_path / "info.json")
+    for number in ("741,504", "39,223,296", "8,448"):
+        assert number in out
+    summary = json.loads((tmp_path / "info.json").read_text())
+    assert summary["descriptor"] == 8448
+    # Table 3: 741,504 parameters and 39.223 M multiply-accumulates an adapter.
+    assert summary["one_adapter"]["parameters"] == 741_504
+    assert summary["one_adapter"]["paper_macs"] == 39_223_296
+    # The two linears at all 257 tokens; the convolutions as the paper counts them.
+    assert summary["one_adapter"]["macs"] == 257 * 589_824 + 256 * 150_912
+    parts = {part["part"]: part for part in summary["parts"]}
+    assert parts["adapters"]["parameters"] == 12 * 741_504
+    # DINOv2 ViT-B/14: 86.58 M parameters, of which its mask token (768) is not part of our model.
+    backbone = (
+        parts["backbone blocks"]["parameters"] + parts["backbone embedding, norm"]["parameters"]
+    )
+    assert backbone == 86_580_480 - 768
+    assert summary["frozen_parameters"] == backbone
+    assert (
+        summary["trainable_parameters"] == sum(p["parameters"] for p in parts.values()) - backbone
+    )
+
+
+def test_info_of_a_file_and_of_other_choices(capfd, tmp_path, shared, params):
+    succeeds(
+        capfd,
+        *("info", "--weights", shared / "weights.safetensors", "--image-size", "56", "70"),
+        *("--trainable", "all", "--json", tmp_path / "info.json"),
+    )
+    summary = json.loads((tmp_path / "info.json").read_text())
+    count = sum(leaf.size for leaf in jax.tree.leaves(params))
+    assert (summary["trainable_parameters"], summary["frozen_parameters"]) == (count, 0)
+    assert summary["image_size"] == [56, 70]
+    assert summary["descriptor"] == 48

@@ -1,0 +1,394 @@
+"""Presets, recipes, and what a configuration refuses."""
+
+import dataclasses
+import re
+
+import pytest
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.data.augmentations.light import LightAugmentConfig
+from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.circle import CircleConfig
+from crisalad_jax.losses.contrastive import ContrastiveConfig
+from crisalad_jax.losses.fast_ap import FastAPConfig
+from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.supcon import SupConConfig
+from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.recipes import RECIPES, recipe
+from crisalad_jax.utils.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("preset", "dim", "depth", "heads", "hidden"),
+    # Oquab et al. 2023, table 17, and the public checkpoints' shapes: w12 of g14 is 2 x 4096.
+    [
+        ("s14", 384, 12, 6, 1536),
+        ("b14", 768, 12, 12, 3072),
+        ("l14", 1024, 24, 16, 4096),
+        ("g14", 1536, 40, 24, 4096),
+    ],
+)
+def test_presets_are_the_four_sizes_of_dinov2(preset, dim, depth, heads, hidden):
+    backbone = PRESETS[preset].backbone
+    assert (backbone.dim, backbone.depth, backbone.heads) == (dim, depth, heads)
+    assert backbone.hidden == hidden
+    assert PRESETS[preset].descriptor_dim == 8448
+
+
+def test_the_recipe_is_the_papers():
+    config = recipe("b14")  # section 4.2
+    assert config.optimiser.learning_rate == 6e-5
+    assert (config.places_per_batch, config.images_per_place) == (48, 4)
+    assert config.trainable == "adapters+head"
+    assert config.model.image_size == (224, 224)
+    loss = config.loss
+    assert (loss.kind.part_name, loss.miner, loss.miner_margin) == (
+        "multi-similarity",
+        "multi-similarity",
+        0.1,
+    )
+    assert (loss.kind.alpha, loss.kind.beta) == (1.0, 50.0)
+    assert config.augmentation == RandAugmentConfig(operations=3)
+
+
+def test_the_recipes_are_their_papers():
+    """serizba/salad and Lu-Feng/CricaVPR as published; Table 2's rows."""
+    salad = recipe("b14", "salad")
+    assert (salad.places_per_batch, salad.images_per_place, salad.epochs) == (60, 4, 4)
+    assert salad.trainable == "last-4-blocks+head"
+    assert (salad.model.backbone.adapter.kind, salad.model.cross_image.layers) == ("none", 0)
+    optimiser = salad.optimiser
+    assert (optimiser.kind, optimiser.learning_rate) == ("adamw", 6e-5)
+    assert optimiser.weight_decay == 9.5e-9
+    assert (optimiser.schedule, optimiser.end_lr_fraction, optimiser.decay_steps) == (
+        "linear",
+        0.2,
+        4000,
+    )
+    cricavpr = recipe("b14", "cricavpr")
+    assert (cricavpr.places_per_batch, cricavpr.images_per_place) == (72, 4)
+    assert cricavpr.model.descriptor_dim == 10_752
+    assert cricavpr.model.backbone.adapter.kind == "multi-resolution"
+    optimiser = cricavpr.optimiser
+    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
+    assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
+    paper = recipe("b14")
+    netvlad = recipe("b14", "netvlad")
+    assert (netvlad.places_per_batch, netvlad.images_per_place) == (48, 4)
+    assert netvlad.loss.kind.part_name == "multi-similarity"
+    assert netvlad.model.descriptor_dim == 64 * 768
+    for name, change in (
+        ("crisalad-1e-4", {"learning_rate": 1e-4}),
+        ("crisalad-step", {"schedule": "step"}),
+    ):
+        varied = dataclasses.replace(paper.optimiser, **change)
+        assert recipe("b14", name) == dataclasses.replace(paper, optimiser=varied)
+    assert recipe("b14", "crisalad") == paper
+    assert recipe("tiny", "scratch") == recipe("tiny")
+
+
+def test_classification_is_as_published():
+    """gmberton/CosPlace and gmberton/EigenPlaces: their papers' constants and their code's."""
+    cosplace = recipe("b14", "cosplace")
+    assert cosplace.model.aggregator.part_name == "cosplace"
+    assert cosplace.model.cross_image.layers == 0
+    assert cosplace.model.descriptor_dim == 512
+    optimiser = cosplace.optimiser
+    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-5, 0.0)
+    assert optimiser.end_lr_fraction == 1.0
+    assert (cosplace.places_per_batch, cosplace.images_per_place) == (32, 1)
+    assert (cosplace.epochs, cosplace.patience) == (50, None)
+    loss = cosplace.loss.kind
+    assert loss.part_name == "large-margin-cosine"
+    assert (loss.scale, loss.margin, loss.learning_rate) == (30.0, 0.4, 0.01)
+    classes = loss.classes
+    assert (classes.kind, classes.groups, classes.steps) == ("places", 8, 10_000)
+    assert (classes.cell, classes.sector) == (10.0, 30.0)
+    assert (classes.spacing, classes.sector_spacing) == (5, 2)
+    assert cosplace.min_images_of_place == cosplace.min_images == 4
+    eigenplaces = recipe("b14", "eigenplaces")
+    assert eigenplaces.model.descriptor_dim == 2048
+    assert eigenplaces.optimiser == optimiser
+    assert (eigenplaces.min_images, eigenplaces.min_images_of_place) == (5, 1)
+    loss = eigenplaces.loss.kind
+    assert (loss.scale, loss.margin, loss.learning_rate) == (100.0, 0.4, 0.01)
+    classes = loss.classes
+    assert (classes.kind, classes.groups, classes.steps) == ("viewpoints", 9, 5000)
+    assert (classes.cell, classes.spacing, classes.focal_distance) == (15.0, 3, 10.0)
+
+
+def test_a_classification_needs_no_second_image_of_a_place():
+    classified = recipe("b14", "cosplace")
+    assert TrainConfig(loss=classified.loss, images_per_place=1).images_per_place == 1
+    with pytest.raises(InputError, match=r"TrainConfig\.images_per_place: found 0"):
+        TrainConfig(loss=classified.loss, images_per_place=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "width"),
+    # The published descriptors of b14: BoQ's, and 4,096 of MixVPR and Conv-AP.
+    [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288)],
+)
+def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int):
+    found, paper = recipe("b14", name), recipe("b14")
+    assert found.model.aggregator == AGGREGATORS.find(name)()
+    assert found.model.descriptor_dim == width
+    assert found.model.cross_image.layers == 0
+    as_paper = dataclasses.replace(
+        found.model, aggregator="salad", cross_image=paper.model.cross_image
+    )
+    assert dataclasses.replace(found, model=as_paper) == paper
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", sorted({*RECIPES, *AGGREGATORS}))
+def test_every_recipe_fits_every_preset(preset: str, name: str):
+    assert recipe(preset, name).model.backbone.dim == PRESETS[preset].backbone.dim
+
+
+def test_augmentation_is_the_one_named():
+    light = LightAugmentConfig(blur=3.0)
+    config = TrainConfig(augmentation=light)
+    assert config.augmentation is light
+    assert TrainConfig(augmentation="light").augmentation == LightAugmentConfig()
+    assert TrainConfig(augmentation="rand-augment").augmentation == RandAugmentConfig()
+    assert TrainConfig(augmentation="none").augmentation == NoAugmentation()
+
+
+def test_equal_configurations_name_one_program():
+    assert hash(recipe("tiny")) == hash(recipe("tiny"))
+    assert recipe("tiny").model == PRESETS["tiny"]
+
+
+def test_an_unknown_name_lists_the_known():
+    with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
+        recipe("b16")
+    words = (
+        r"^recipe: found 'dbow', expected one of anyloc, cosplace, cricavpr, crisal.*, scratch.*, "
+        r"or a registered part as NAME or KIND:NAME, with a kind of aggregator, .* \(is a plug-in "
+        r"missing\?"
+    )
+    with pytest.raises(InputError, match=words):
+        recipe("b14", "dbow")
+    with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
+        choose("colour", "", {"red": 1, "blue": 2})
+
+
+def of_clusters(clusters: int) -> ModelConfig:
+    return ModelConfig(aggregator=SaladConfig(clusters=clusters))
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "nearest"),
+    [(224, 230, "224 x 224"), (99, 98, "98 x 98"), (1, 14, "14 x 14"), (0, 98, "14 x 98")],
+)
+def test_sides_are_multiples_of_14(height, width, nearest):
+    words = rf"found {height} x {width}, expected .* 14 \(nearest: {nearest}\)"
+    with pytest.raises(InputError, match=words):
+        of_clusters(4).check_image_size((height, width))
+
+
+@pytest.mark.parametrize(
+    ("clusters", "side"), [(3, 28), (4, 42), (8, 42), (9, 56), (64, 126), (63, 112)]
+)
+def test_more_patches_than_clusters(clusters, side):
+    """The message's smallest square works, and the next smaller one does not."""
+    of_clusters(clusters).check_image_size((side, side))
+    smaller = side - 14
+    words = rf"{(smaller // 14) ** 2} patches for {clusters} clusters.*: {side} x {side}\)"
+    with pytest.raises(InputError, match=words):
+        of_clusters(clusters).check_image_size((smaller, smaller))
+
+
+def test_one_patch_more_than_clusters_is_enough():
+    of_clusters(4).check_image_size((14, 70))
+    with pytest.raises(InputError, match="5 patches for 5 clusters"):
+        of_clusters(5).check_image_size((14, 70))
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "words"),
+    [
+        (AdapterConfig, {"kind": "linear"}, "AdapterConfig.kind: found 'linear', expected one of"),
+        (AdapterConfig, {"kernel_size": 4}, "AdapterConfig.kernel_size: found 4, expected an odd"),
+        (AdapterConfig, {"bottleneck": 0.0}, "AdapterConfig.bottleneck: found 0.0"),
+        (ViTConfig, {"heads": 7}, "ViTConfig.dim: found 768, expected a multiple of the 7 heads"),
+        (ViTConfig, {"depth": 0}, "ViTConfig.depth: found 0, expected more than 0"),
+        (ViTConfig, {"registers": -1}, "ViTConfig.registers: found -1, expected at least 0"),
+        (ViTConfig, {"ffn": "glu"}, "ViTConfig.ffn: found 'glu'"),
+        (
+            ViTConfig,
+            {"dim": 6, "heads": 1, "position_init": "sincos"},
+            "ViTConfig.dim: found 6, expected a multiple of 4",
+        ),
+        (
+            ViTConfig,
+            {
+                "dim": 96,
+                "heads": 2,
+                "adapter": AdapterConfig(kind="multi-resolution", bottleneck=0.25),
+            },
+            "bottleneck: found 0.25, which is a width of 24 for dim 96; expected a multiple of 16",
+        ),
+        (ModelConfig, {"aggregator": "vlad"}, "^ModelConfig.aggregator: aggregator: found 'vlad'"),
+        (
+            ModelConfig,
+            {"aggregator": "gem-pyramid", "image_size": (28, 56)},
+            "found 28 x 56, expected at least 42 x 42, a patch for every region",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": "gem-pyramid", "cross_image": CrossImageConfig(heads=5)},
+            "aggregator gem-pyramid: found tokens of 768 numbers, expected a multiple of the "
+            "cross-image encoder's 5 heads",
+        ),
+        (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
+        (NetVladConfig, {"clusters": 1}, "NetVladConfig.clusters: found 1, expected at least 2"),
+        (AnyLocConfig, {"facet": "values"}, "AnyLocConfig.facet: found 'values', expected one of"),
+        (
+            ModelConfig,
+            {"aggregator": AnyLocConfig(layer=12)},
+            "AnyLocConfig.layer: found 12, expected -12 to 11 for a backbone of 12 blocks",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": AnyLocConfig(layer=-13)},
+            "AnyLocConfig.layer: found -13, expected -12 to 11",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": "anyloc"},
+            "CrossImageConfig.layers: found 2 for aggregator anyloc, with which nothing trains",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": ConvApConfig(side=3), "image_size": (28, 56)},
+            "found 28 x 56, expected at least 42 x 42, a patch for every region",
+        ),
+        (
+            BoqConfig,
+            {"channels": 200},
+            "BoqConfig.channels: found 200, expected a multiple of its heads, 3: one for every 64",
+        ),
+        (MixVprConfig, {"rows": 0}, "MixVprConfig.rows: found 0"),
+        (ConvApConfig, {"side": 0}, "ConvApConfig.side: found 0"),
+        (CosPlaceConfig, {"dim": -1}, "CosPlaceConfig.dim: found -1"),
+        (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
+        (SaladConfig, {"epsilon": -1.0}, "SaladConfig.epsilon: found -1.0"),
+        (SaladConfig, {"epsilon": float("nan")}, "SaladConfig.epsilon: found nan"),
+        (SaladConfig, {"dropout": 1.0}, "SaladConfig.dropout: found 1.0, expected .* less than 1"),
+        (SaladConfig, {"clusters": 0}, "SaladConfig.clusters: found 0"),
+        (CrossImageConfig, {"layers": -1}, "CrossImageConfig.layers: found -1"),
+        (CrossImageConfig, {"dropout": float("nan")}, "CrossImageConfig.dropout: found nan"),
+        (ModelConfig, {"compute_dtype": "float16"}, "ModelConfig.compute_dtype: found 'float16'"),
+        (ModelConfig, {"normalisation": "none"}, "ModelConfig.normalisation: found 'none'"),
+        (ModelConfig, {"image_size": (224, 225)}, "image size: found 224 x 225"),
+        (ModelConfig, {"image_size": (112, 112)}, "64 patches for 64 clusters"),
+        (
+            ModelConfig,
+            {"cross_image": CrossImageConfig(heads=12)},
+            "SaladConfig.cluster_dim: found 128, expected a multiple of .* 12 heads",
+        ),
+        (
+            ModelConfig,
+            {"aggregator": SaladConfig(token_dim=200)},
+            "SaladConfig.token_dim: found 200, expected a multiple of cluster_dim 128",
+        ),
+        (MultiSimilarityConfig, {"beta": 0.0}, "MultiSimilarityConfig.beta: found 0.0"),
+        (LossConfig, {"miner_margin": -0.1}, "LossConfig.miner_margin: found -0.1"),
+        (
+            LossConfig,
+            {"kind": "softmax"},
+            "^LossConfig.kind: loss: found 'softmax', expected one of circle",
+        ),
+        (LossConfig, {"miner": "hard"}, "LossConfig.miner: found 'hard'"),
+        (LossConfig, {"kind": "fast-ap"}, "expected 'none': it ranks all images"),
+        (
+            ContrastiveConfig,
+            {"negative_margin": 2.1},
+            "negative_margin: found 2.1, expected 0 to 2",
+        ),
+        (TripletConfig, {"margin": 0.0}, "TripletConfig.margin: found 0.0"),
+        (CircleConfig, {"margin": 1.0}, "CircleConfig.margin: found 1.0"),
+        (SupConConfig, {"temperature": 0.0}, "SupConConfig.temperature: found 0.0"),
+        (FastAPConfig, {"bins": 0}, "FastAPConfig.bins: found 0"),
+        (
+            ClassesConfig,
+            {"kind": "cities"},
+            "ClassesConfig.kind: found 'cities', expected one of cells, places, view",
+        ),
+        (LargeMarginCosineConfig, {"margin": 1.0}, "LargeMarginCosineConfig.margin: found 1.0"),
+        (ClassesConfig, {"groups": 0}, "ClassesConfig.groups: found 0"),
+        (ClassesConfig, {"steps": 0}, "ClassesConfig.steps: found 0"),
+        (
+            ClassesConfig,
+            {"sector": 50.0},
+            "ClassesConfig.sector: found 2 sectors of 50 degrees, expected a divisor of",
+        ),
+        (RandAugmentConfig, {"magnitude": 31}, "RandAugmentConfig.magnitude: found 31"),
+        (RandAugmentConfig, {"operations": -1}, "RandAugmentConfig.operations: found -1"),
+        (LightAugmentConfig, {"crop": 1.0}, "LightAugmentConfig.crop: found 1.0"),
+        (LightAugmentConfig, {"grey": 1.1}, "LightAugmentConfig.grey: found 1.1"),
+        (LightAugmentConfig, {"blur": -1.0}, "LightAugmentConfig.blur: found -1.0"),
+        (OptimiserConfig, {"learning_rate": 0.0}, "OptimiserConfig.learning_rate: found 0.0"),
+        (OptimiserConfig, {"weight_decay": -1.0}, "OptimiserConfig.weight_decay: found -1.0"),
+        (OptimiserConfig, {"b2": 1.0}, "OptimiserConfig.b2: found 1.0"),
+        (OptimiserConfig, {"clip_norm": 0.0}, "OptimiserConfig.clip_norm: found 0.0"),
+        (
+            TrainConfig,
+            {"augmentation": "heavy"},
+            "^TrainConfig.augmentation: augmentation: found 'heavy'",
+        ),
+        (TrainConfig, {"batch_order": "any"}, "TrainConfig.batch_order: found 'any'"),
+        (TrainConfig, {"epochs": 0}, "TrainConfig.epochs: found 0"),
+        (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
+        (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, .*images_per_place .4"),
+        (TrainConfig, {"trainable": "tail"}, "TrainConfig.trainable: found 'tail', expected head"),
+        (TrainConfig, {"trainable": "last--1-blocks+head"}, "TrainConfig.trainable"),
+        (TrainConfig, {"patience": 0}, "TrainConfig.patience: found 0"),
+        (TrainConfig, {"seed": -1}, "TrainConfig.seed: found -1"),
+    ],
+)
+@pytest.mark.usefixtures("_unchecked")
+def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
+    with pytest.raises(InputError, match=words) as caught:
+        kind(**fields)
+    assert "\n" not in str(caught.value)
+
+
+def test_anylocs_layer_is_its_papers_of_vit_g():
+    """31 of 40 blocks, by Keetha et al., whether from the front or from the end."""
+    assert AnyLocConfig().block(40) == AnyLocConfig(layer=31).block(40) == 31
+    assert recipe("g14", "anyloc").model.descriptor_dim == 32 * 1536  # 49,152, as published
+
+
+def test_a_model_without_adapters_cannot_train_them():
+    bare = ModelConfig(backbone=ViTConfig(adapter=AdapterConfig(kind="none")))
+    with pytest.raises(InputError, match=re.escape("found adapters+head for a model without")):
+        TrainConfig(model=bare)
+    assert TrainConfig(model=bare, trainable="last-4-blocks+head").model is bare
+
+
+def test_without_an_encoder_its_widths_need_not_fit():
+    config = ModelConfig(cross_image=CrossImageConfig(layers=0, heads=7))
+    assert config.descriptor_dim == 8448
+    with pytest.raises(InputError, match="7 heads"):
+        dataclasses.replace(config, cross_image=CrossImageConfig(heads=7))

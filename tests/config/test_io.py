@@ -1,0 +1,224 @@
+"""Configurations there and back through JSON, and what of a file is refused."""
+
+import dataclasses
+import json
+import pathlib
+from typing import Any
+
+import pytest
+
+from crisalad_jax.config.aliases import upgrade
+from crisalad_jax.config.io import differences, from_plain, read_config, to_plain
+from crisalad_jax.losses import LOSSES
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.recipes import RECIPES, recipe
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
+
+CHANGED = dataclasses.replace(
+    recipe("tiny"), cities=("Aston", "Brill"), patience=4, augmentation=recipe("b14").augmentation
+)
+RECIPES_OF_PRESETS = {
+    f"{preset} {name}": recipe(preset, name)
+    for preset in PRESETS
+    for name in sorted({*RECIPES, *AGGREGATORS, *LOSSES})
+}
+
+
+@pytest.mark.parametrize("config", [*map(recipe, PRESETS), CHANGED], ids=[*PRESETS, "changed"])
+def test_every_recipe_survives_a_file(tmp_path: pathlib.Path, config: TrainConfig):
+    write_json(tmp_path / "config.json", to_plain(config))
+    found = read_config(TrainConfig, tmp_path / "config.json")
+    assert found == config
+    assert hash(found) == hash(config)  # tuples have not become lists
+
+
+@pytest.mark.parametrize("config", RECIPES_OF_PRESETS.values(), ids=RECIPES_OF_PRESETS)
+def test_every_recipe_of_every_preset_survives_json(config: TrainConfig):
+    plain = to_plain(config)
+    assert json.loads(json.dumps(plain)) == plain
+    found = from_plain(TrainConfig, plain, source="here")
+    assert found == config
+    assert hash(found) == hash(config)
+    assert to_plain(found) == plain
+    model = from_plain(ModelConfig, plain["model"], source="here")
+    assert model == config.model
+    # All of it is named as it is today.
+    assert upgrade(TrainConfig, plain) == plain
+    assert upgrade(ModelConfig, plain["model"]) == plain["model"]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_survives_json(preset: str):
+    found = from_plain(ModelConfig, to_plain(PRESETS[preset]), source="here")
+    assert found == PRESETS[preset]
+    assert hash(found) == hash(PRESETS[preset])
+
+
+def test_plain_values_are_json_and_complete():
+    plain = to_plain(recipe("tiny"))
+    assert json.loads(json.dumps(plain)) == plain
+    assert plain["model"]["image_size"] == [98, 98]
+    assert plain["model"]["backbone"]["adapter"]["kind"] == "depthwise"
+    assert plain["model"]["aggregator"]["sinkhorn"]["iterations"] == 3
+    assert plain["model"]["aggregator"]["name"] == "salad"
+    assert plain["loss"]["kind"]["name"] == "multi-similarity"
+    assert plain["augmentation"]["name"] == "light"
+    assert plain.keys() == {field.name for field in dataclasses.fields(TrainConfig)}
+
+
+def test_fields_left_out_take_their_defaults():
+    assert from_plain(TrainConfig, {}, source="here") == TrainConfig()
+    found = from_plain(TrainConfig, {"optimiser": {"learning_rate": 1}}, source="here")
+    assert found.optimiser.learning_rate == 1.0
+    assert type(found.optimiser.learning_rate) is float
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ({"model": {"imag_size": [98, 98]}}, ["imag_size", "config.model"]),
+        ({"model": {"image_size": [100, 98]}}, ["found 100 x 98", "nearest: 98 x 98"]),
+        ({"model": {"image_size": [98]}}, ["config.model.image_size"]),
+        ({"model": {"backbone": {"dim": "32"}}}, ["'32'", "expected int", "config.model.backbone"]),
+        ({"model": {"backbone": {"ffn": "relu"}}}, ["relu", "swiglu", "config.model.backbone.ffn"]),
+        ({"model": 3}, ["config.model"]),
+        ({"model": None}, ["config.model"]),
+        ({"epochs": 3.7}, ["3.7", "expected int", "config.epochs"]),
+        ({"epochs": 0}, ["epochs", "expected more than 0"]),
+        ({"seed": True}, ["True", "expected int", "config.seed"]),
+        ({"patience": "x"}, ["'x'", "config.patience"]),
+        ({"cities": "Rome"}, ["'Rome'", "list of names", "config.cities"]),
+        ({"loss": {"match_pml_zero": "no"}}, ["'no'", "expected bool", "loss.match_pml_zero"]),
+        ({"loss": {"library_quirk": "no"}}, ["'no'", "expected bool", "loss.match_pml_zero"]),
+        ({"model": {"aggregator": ["gem"]}}, ["['gem']", "config.model.aggregator"]),
+        ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),
+        ({"model": {"aggregator": {"clusters": 32}}}, ["None", "config.model.aggregator"]),
+        ({"model": {"aggregator": {"name": "gem", "clusters": 2}}}, ["found clusters"]),
+        ({"model": {"aggregator": {"name": "gem"}, "gem": {}}}, ["found gem", "config.model"]),
+        ({"model": {"aggregator": "gem", "gem": 3}}, ["found 3", "config.model.aggregator"]),
+        ({"model": {"keeps": []}}, ["found []", "config.model.remat"]),
+        ({"model": {"keeps": "some"}}, ["'some'", "dots", "config.model.remat"]),
+        ({"model": {"keeps": "blocks", "remat": "full"}}, ["found keeps", "config.model"]),
+        ({"augment": "light", "light_augment": 3}, ["found 3", "config.augmentation"]),
+        ({"augment": ["light"]}, ["['light']", "config.augmentation"]),
+        ({"augment": "light", "augmentation": "light"}, ["found augment", "config"]),
+        ({"epochs": 0.5, "seed": "1"}, ["config.epochs", "config.seed"]),
+        ([], ["list"]),
+        (None, ["NoneType"]),
+        ("b14", ["str"]),
+    ],
+)
+def test_what_does_not_fit_is_named_in_one_line(value: Any, words: list[str]):
+    with pytest.raises(InputError) as caught:
+        from_plain(TrainConfig, value, source="some/config.json")
+    message = str(caught.value)
+    assert message.startswith("some/config.json: ")
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b'{"model": {'])
+def test_a_file_that_is_no_configuration_is_named(tmp_path: pathlib.Path, content: bytes):
+    path = tmp_path / "config.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=f"^{path}: ") as caught:
+        read_config(ModelConfig, path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: pathlib.Path):
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(InputError, match=f"^{path}: cannot read"):
+            read_config(ModelConfig, path)
+
+
+@pytest.mark.parametrize(
+    ("value", "words", "place"),
+    [
+        (
+            {"model": {"backbone": "x"}},
+            "backbone: found 'x', expected one of vit",
+            "model.backbone",
+        ),
+        (
+            {"model": {"aggregator": {"name": "x", "size": 3}}},
+            "aggregator: found 'x', expected one of anyloc, boq, ",
+            "model.aggregator",
+        ),
+        (
+            {"model": {"aggregator": {"name": "salad", "dustbin": "x"}}},
+            "dustbin: found 'x', expected one of column, mass, ",
+            "model.aggregator.dustbin",
+        ),
+        (
+            {"model": {"aggregator": {"name": "salad", "sinkhorn": {"step": {"name": "x"}}}}},
+            "step: found 'x', expected one of dual-softmax, newton, ",
+            "model.aggregator.sinkhorn.step",
+        ),
+        (
+            {"model": {"aggregator": {"name": "salad", "sinkhorn": {"gradient": "x"}}}},
+            "gradient: found 'x', expected one of implicit, optimistix, ",
+            "model.aggregator.sinkhorn.gradient",
+        ),
+        (
+            {"loss": {"kind": {"name": "x", "size": 3}}},
+            "loss: found 'x', expected one of circle, ",
+            "loss.kind",
+        ),
+        (
+            {"augmentation": {"name": "x"}},
+            "augmentation: found 'x', expected one of light, none, ",
+            "augmentation",
+        ),
+        # Under the names of version 0.1:
+        (
+            {"model": {"aggregator": "x", "salad": {}}},
+            "aggregator: found 'x', expected one of anyloc, boq, ",
+            "model.aggregator",
+        ),
+        (
+            {"model": {"salad": {"sinkhorn": {"method": "x", "dustbin": "column"}}}},
+            "step: found 'x', expected one of dual-softmax, newton, ",
+            "model.aggregator.sinkhorn.step",
+        ),
+        (
+            {"loss": {"kind": "x", "triplet": {}}},
+            "loss: found 'x', expected one of circle, ",
+            "loss.kind",
+        ),
+        (
+            {"augment": "x", "light_augment": {}},
+            "augmentation: found 'x', expected one of light, none, ",
+            "augmentation",
+        ),
+    ],
+)
+def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value: Any, words: str, place: str):
+    with pytest.raises(InputError) as caught:
+        from_plain(TrainConfig, value, source="some/config.json")
+    message = str(caught.value)
+    assert message.startswith(f"some/config.json: {words}")
+    assert message.endswith(
+        f" (is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin) @ config.{place}"
+    )
+    assert "\n" not in message
+
+
+def test_differences_name_the_fields_in_full():
+    b14 = recipe("b14")
+    other = dataclasses.replace(
+        b14,
+        seed=3,
+        model=dataclasses.replace(
+            b14.model, aggregator=dataclasses.replace(b14.model.aggregator, clusters=32)
+        ),
+    )
+    assert differences(b14, b14) == []
+    assert differences(other, b14) == [
+        "model.aggregator.clusters: found 32, expected 64",
+        "seed: found 3, expected 0",
+    ]

@@ -1,0 +1,194 @@
+"""Registries: what they take, and what they refuse."""
+
+import abc
+import dataclasses
+from typing import Any
+
+import pytest
+
+from crisalad_jax.config.parts import REGISTRIES, Part, Registry, part_field, resolve_names
+from crisalad_jax.utils.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Bird(Part, abc.ABC):
+    @abc.abstractmethod
+    def call(self) -> str: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Duck(Bird):
+    volume: int = 1
+
+    def call(self) -> str:
+        return "quack" * self.volume
+
+
+@dataclasses.dataclass(frozen=True)
+class Goose(Bird):
+    def call(self) -> str:
+        return "honk"
+
+
+@dataclasses.dataclass
+class Thawed:
+    def call(self) -> str:
+        return "drip"
+
+
+class Plain(Duck):
+    """Inherits what makes a dataclass, and is none itself."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stone:
+    def call(self) -> str:
+        return ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Named(Duck):
+    name: str = "Donald"
+
+
+@dataclasses.dataclass(frozen=True)
+class Mute(Bird):
+    pass
+
+
+@dataclasses.dataclass(frozen=True)
+class Needy(Duck):
+    weight: int = dataclasses.field(kw_only=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Listed(Duck):
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+
+def chirp() -> str:
+    """A small bird's."""
+    return "chirp"
+
+
+@pytest.fixture
+def birds(monkeypatch: pytest.MonkeyPatch) -> Registry[Bird]:
+    monkeypatch.setitem(REGISTRIES, "bird", None)  # taken away again
+    registry = Registry("bird", Bird)
+    registry.register("duck", loud={"volume": 3})(Duck)
+    return registry
+
+
+def test_a_part_is_found_and_made_by_its_name(birds: Registry[Bird]):
+    assert birds.register("goose")(Goose) is Goose
+    assert birds.names() == list(birds) == ["duck", "goose"]
+    assert "goose" in birds
+    assert birds.find("goose") is Goose
+    assert Goose.part_name == "goose"
+    assert Goose.registry is REGISTRIES["bird"] is birds
+    assert birds.make("duck") == Duck()
+    assert birds.make("duck", "loud") == Duck(volume=3)
+    assert birds.make("duck", "low") == Duck()
+    assert birds.make("duck", "loud", volume=2) == Duck(volume=2)
+
+
+@pytest.mark.parametrize("name", ["duck", "goose"])
+def test_a_name_that_is_taken_is_refused(birds: Registry[Bird], name: str):
+    birds.register("goose")(Goose)
+    other = Goose if name == "duck" else Duck
+    there = birds.find(name)
+    words = (
+        f"^register_bird: found the name '{name}' taken by {__name__}.{there.__qualname__}, "
+        f"expected another name for {other.__qualname__}$"
+    )
+    with pytest.raises(InputError, match=words):
+        birds.register(name)(other)
+    assert birds.find(name) is there
+    assert there.part_name == name
+    assert (Duck.part_name, Goose.part_name) == ("duck", "goose")
+    assert birds.make("duck", "loud") == Duck(volume=3)
+
+
+def test_a_class_has_one_name(birds: Registry[Bird]):
+    """Files would name the other one."""
+    with pytest.raises(
+        InputError, match=r"^register_bird 'drake': found Duck registered as 'duck'"
+    ):
+        birds.register("drake")(Duck)
+    assert birds.names() == ["duck"]
+    assert birds.make("duck").part_name == "duck"
+
+
+def test_a_cell_that_runs_again_brings_the_same_part(birds: Registry[Bird]):
+    again = dataclasses.make_dataclass(
+        "Duck",
+        [("volume", int, 5)],
+        bases=(Bird,),
+        frozen=True,
+        namespace={"call": lambda self: "", "__module__": __name__},
+    )
+    assert birds.register("duck")(again) is again
+    assert birds.make("duck").volume == 5
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (Thawed, "found Thawed, which is no frozen dataclass, expected @dataclasses.dataclass\\("),
+        (Plain, "found Plain, which is no frozen dataclass, expected @dataclasses.dataclass\\("),
+        (int, "found int, which is no frozen dataclass, expected @dataclasses.dataclass\\("),
+        (Stone, "found Stone, expected a subclass of Bird$"),
+        (Named, "found a field 'name', which files keep the part's own in$"),
+        (Needy, ".* missing 1 required keyword-only argument: 'weight'; expected a default for"),
+        (Listed, "unhashable type: 'list'; expected a default for every field, and values that"),
+        (Mute, "found no method call, expected it$"),
+        (chirp, "found function, expected a frozen dataclass that inherits from Bird$"),
+        (3, "found int, expected a frozen dataclass that inherits from Bird$"),
+        (Duck(), "found Duck, expected a frozen dataclass that inherits from Bird$"),
+    ],
+)
+def test_what_is_no_part_is_refused_in_one_line(birds: Registry[Bird], part: Any, words: str):
+    with pytest.raises(InputError, match=f"^register_bird 'new': {words}") as caught:
+        birds.register("new")(part)
+    assert "\n" not in str(caught.value)
+    assert birds.names() == ["duck"]
+    assert not hasattr(part, "part_name") or part.part_name == "duck"
+
+
+def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(REGISTRIES, "bird", None)
+    birds = Registry("bird", Bird, of_function=lambda f: {"call": lambda self: f()})
+    assert birds.register("chirp")(chirp) is chirp
+    assert birds.make("chirp").call() == "chirp"
+    assert birds.make("chirp") == birds.make("chirp")
+    with pytest.raises(InputError, match=r"^register_bird 'three': found int, expected a frozen"):
+        birds.register("three")(3)  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize("name", ["swan", "", None, ["duck"], {}])
+def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds: Registry[Bird], name: Any):
+    with pytest.raises(InputError) as caught:
+        birds.find(name)
+    assert str(caught.value) == (
+        f"bird: found {name!r}, expected one of duck (is a plug-in missing? --plugin FILE.py or "
+        "MODULE, or load_plugin)"
+    )
+    with pytest.raises(InputError, match=r"^bird: found "):
+        birds.make(name)
+
+
+def test_a_field_takes_a_part_or_its_name(birds: Registry[Bird]):
+    @dataclasses.dataclass(frozen=True)
+    class Pond:
+        bird: Any = part_field(birds, "duck")
+
+        def __post_init__(self) -> None:
+            resolve_names(self)
+
+    assert Pond().bird == Pond(bird="duck").bird == Duck()
+    assert Pond(bird=Duck(volume=2)).bird == Duck(volume=2)
+    with pytest.raises(InputError, match=r"^Pond.bird: bird: found 'swan', expected one of duck "):
+        Pond(bird="swan")
+    for other in (3, None, Stone(), Duck):
+        with pytest.raises(InputError, match=r"^Pond.bird: found .*, expected a bird or its name$"):
+            Pond(bird=other)

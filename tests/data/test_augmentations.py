@@ -1,0 +1,325 @@
+"""Every operation against Pillow, strengths against torchvision's table, and the draws."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from crisalad_jax.data.augmentations import Augmentation, NoAugmentation
+from crisalad_jax.data.augmentations import rand_augment as module
+from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
+from crisalad_jax.data.augmentations.rand_augment import (
+    OPERATIONS,
+    RandAugmentConfig,
+    rand_augment,
+)
+from parity.reference.augment import OPERATIONS as PILLOWS
+from parity.reference.augment import strengths as torchvisions
+
+
+def picture(height=224, width=224, seed=0):
+    """Smooth colour, noise, and a range of levels that does not fill 0 to 255."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(20, 220, (9, 9, 3)).astype(np.float32)
+    smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    noise = rng.uniform(-15, 15, (height, width, 3))
+    return np.clip(smooth + noise, 5, 235).astype(np.uint8)
+
+
+GEOMETRIC = ("ShearX", "ShearY", "TranslateX", "TranslateY", "Rotate")
+PHOTOMETRIC = tuple(name for name in PILLOWS if name not in GEOMETRIC)
+
+
+def strengths(name, shape):
+    for magnitude in (0, 4, 9, 30):
+        strength = OPERATIONS[name].strength(magnitude / 30, *shape)
+        yield strength
+        if OPERATIONS[name].signed:
+            yield -strength
+
+
+def test_the_operations_are_torchvisions_fourteen():
+    assert list(OPERATIONS) == list(PILLOWS)
+    assert len(OPERATIONS) == 14
+
+
+def test_strengths_at_224_and_magnitude_9():
+    found = {name: o.strength(9 / 30, 224, 224) for name, o in OPERATIONS.items()}
+    assert found["ShearX"] == found["ShearY"] == pytest.approx(0.09)
+    assert int(found["TranslateX"]) == int(found["TranslateY"]) == 30
+    assert found["Rotate"] == pytest.approx(9)
+    for name in ("Brightness", "Color", "Contrast", "Sharpness"):
+        assert found[name] == pytest.approx(0.27)
+    assert found["Posterize"] == 7
+    assert found["Solarize"] == pytest.approx(178.5)
+
+
+def test_strengths_at_every_magnitude():
+    bins = np.arange(31)
+    table = {
+        "ShearX": np.linspace(0, 0.3, 31),
+        "ShearY": np.linspace(0, 0.3, 31),
+        "TranslateX": np.linspace(0, 150 / 331 * 200, 31),
+        "TranslateY": np.linspace(0, 150 / 331 * 100, 31),
+        "Rotate": np.linspace(0, 30, 31),
+        "Posterize": 8 - np.round(bins / (30 / 4)),
+        "Solarize": np.linspace(255, 0, 31),
+        **dict.fromkeys(("Brightness", "Color", "Contrast", "Sharpness"), np.linspace(0, 0.9, 31)),
+    }
+    for name, expected in table.items():
+        found = [OPERATIONS[name].strength(m / 30, 100, 200) for m in bins]
+        # Only the order of float64 operations differs.
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    for magnitude in bins:
+        for name, (expected, signed) in torchvisions(int(magnitude), 200, 100).items():
+            found = OPERATIONS[name]
+            assert found.strength(magnitude / 30, 100, 200) == pytest.approx(expected)
+            assert found.signed == signed
+
+
+@pytest.mark.parametrize("shape", [(224, 224), (70, 126), (2, 3), (1, 1)])
+@pytest.mark.parametrize("name", PHOTOMETRIC)
+def test_photometric_operations_are_pillows_bit_for_bit(name, shape):
+    image = picture(*shape)
+    for strength in strengths(name, shape):
+        expected = PILLOWS[name](Image.fromarray(image), strength)
+        np.testing.assert_array_equal(OPERATIONS[name].apply(image, strength), expected)
+
+
+@pytest.mark.parametrize("level", [0, 255])
+@pytest.mark.parametrize("name", PHOTOMETRIC)
+def test_photometric_operations_on_one_level_and_on_full_range(name, level):
+    image = np.full((20, 30, 3), level, np.uint8)
+    image[:, :, 1] = np.random.default_rng(1).integers(0, 256, (20, 30))
+    for strength in strengths(name, (20, 30)):
+        expected = PILLOWS[name](Image.fromarray(image), strength)
+        np.testing.assert_array_equal(OPERATIONS[name].apply(image, strength), expected)
+
+
+@pytest.mark.parametrize("shape", [(224, 224), (70, 126), (1, 1)])
+@pytest.mark.parametrize("name", GEOMETRIC)
+def test_geometric_operations_are_pillows(name, shape):
+    image = picture(*shape)
+    for strength in strengths(name, shape):
+        warped = OPERATIONS[name].apply(image, strength)
+        expected = np.asarray(PILLOWS[name](Image.fromarray(image), strength))
+        # Pillow cuts off fractions where OpenCV rounds: at most a level, half of one on average.
+        # A point within rounding of the rim may be black in one only: at most 4 pixels allowed.
+        difference = np.abs(warped.astype(int) - expected).max(axis=-1)
+        assert (difference > 1).sum() <= 4
+        assert difference[difference <= 1].mean() < 0.9
+        # Moved pixels are to be the same pixels.
+        if name.startswith("Translate"):
+            np.testing.assert_array_equal(warped, expected)
+
+
+def test_operations_are_drawn_uniformly(monkeypatch):
+    drawn = []
+
+    def spy(name):
+        operation = OPERATIONS[name]
+
+        def apply(image, strength):
+            drawn.append((name, strength))
+            return image
+
+        return operation._replace(apply=apply)
+
+    monkeypatch.setattr(module, "OPERATIONS", {name: spy(name) for name in OPERATIONS})
+    generator = np.random.default_rng(0)
+    image = np.zeros((224, 224, 3), np.uint8)
+    for _ in range(4000):
+        rand_augment(image, RandAugmentConfig(), generator)
+    assert len(drawn) == 12_000
+    counts = np.array([sum(d == name for d, _ in drawn) for name in OPERATIONS])
+    expected = 12_000 / 14
+    # 34.5 is the 0.1 % point of chi-squared with 13 degrees of freedom; the seed is fixed.
+    assert ((counts - expected) ** 2 / expected).sum() < 34.5
+    for name, operation in OPERATIONS.items():
+        signs = np.array([np.sign(strength) for d, strength in drawn if d == name])
+        # Five standard deviations of a fair coin thrown about 857 times: 0.17.
+        assert abs(signs.mean()) < 0.17 if operation.signed else (signs >= 0).all()
+    # With replacement: the three of a draw are all different with probability 14*13*12 / 14**3.
+    triples = [len({name for name, _ in drawn[i : i + 3]}) for i in range(0, 12_000, 3)]
+    # Five standard deviations of the share of 4000 draws: 0.032.
+    assert np.mean([n == 3 for n in triples]) == pytest.approx(14 * 13 * 12 / 14**3, abs=0.032)
+
+
+def augment(image: np.ndarray, config: Augmentation, generator: np.random.Generator) -> np.ndarray:
+    """What is drawn for a place by another generator does not matter here."""
+    return config.apply(image, generator, of_place=np.random.default_rng(99))
+
+
+@pytest.mark.parametrize("config", [RandAugmentConfig(), LightAugmentConfig()])
+@pytest.mark.parametrize("shape", [(224, 224), (70, 126), (1, 1)])
+def test_the_same_seed_gives_the_same_picture(config, shape):
+    image = picture(*shape)
+    untouched = image.copy()
+    first = [augment(image, config, np.random.default_rng(seed)) for seed in range(8)]
+    second = [augment(image, config, np.random.default_rng(seed)) for seed in range(8)]
+    for a, b in zip(first, second, strict=True):
+        assert a.dtype == np.uint8
+        assert a.shape == image.shape
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(image, untouched)
+    if shape != (1, 1):
+        assert len({a.tobytes() for a in first}) > 4
+
+
+def test_each_augmentation_is_its_own_change():
+    image = picture()
+    assert augment(image, NoAugmentation(), np.random.default_rng(0)) is image
+    strong, mild = RandAugmentConfig(operations=2, magnitude=20), LightAugmentConfig()
+    expected = rand_augment(image, strong, np.random.default_rng(3))
+    np.testing.assert_array_equal(augment(image, strong, np.random.default_rng(3)), expected)
+    expected = light_augment(image, mild, np.random.default_rng(3))
+    np.testing.assert_array_equal(augment(image, mild, np.random.default_rng(3)), expected)
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_operations_take_a_mirrored_view(name):
+    mirrored = np.flip(picture(70, 126), axis=1)
+    strength = OPERATIONS[name].strength(9 / 30, 70, 126)
+    np.testing.assert_array_equal(
+        OPERATIONS[name].apply(mirrored, strength),
+        OPERATIONS[name].apply(np.ascontiguousarray(mirrored), strength),
+    )
+
+
+def test_light_takes_a_mirrored_view():
+    mirrored = np.flip(picture(70, 126), axis=1)
+    changed = [
+        light_augment(image, LightAugmentConfig(), np.random.default_rng(0))
+        for image in (mirrored, np.ascontiguousarray(mirrored))
+    ]
+    np.testing.assert_array_equal(changed[0], changed[1])
+
+
+def test_no_operations_change_nothing():
+    image = picture()
+    config = RandAugmentConfig(operations=0)
+    np.testing.assert_array_equal(rand_augment(image, config, np.random.default_rng(0)), image)
+
+
+STILL = {"crop": 0.0, "shift": 0.0, "rotation": 0.0, "blur": 0.0, "colour": 0.0, "grey": 0.0}
+
+
+def light(image, seed=0, **changes):
+    return light_augment(
+        image, LightAugmentConfig(**{**STILL, **changes}), np.random.default_rng(seed)
+    )
+
+
+def test_light_of_nothing_changes_nothing():
+    np.testing.assert_array_equal(light(picture(70, 126)), picture(70, 126))
+
+
+def blob(height, width, x, y):
+    """A bright spot of standard deviation 3 about pixel (x, y)."""
+    columns, rows = np.arange(width) - x, np.arange(height)[:, None] - y
+    spot = 250 * np.exp(-(columns**2 + rows**2) / 18)
+    return np.repeat(np.rint(spot).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def centroid(image):
+    weights = image[..., 0].astype(float)
+    rows, columns = np.indices(weights.shape)
+    return np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
+
+
+def spots_moved(**changes):
+    """Where spots at the centre and 40 pixels to its right go, for 100 seeds."""
+    starts = [(80, 60), (120, 60)]
+    images = [blob(121, 161, *start) for start in starts]
+    return np.array([[centroid(light(i, seed, **changes)) for i in images] for seed in range(100)])
+
+
+def test_light_crop_magnifies_about_the_centre():
+    moved = spots_moved(crop=0.2)
+    # A spot's centroid is known to about 0.02 pixels after rounding to 8 bits; 0.1 is safe.
+    np.testing.assert_allclose(moved[:, 0], [[80, 60]] * 100, atol=0.1)
+    magnification = (moved[:, 1, 0] - moved[:, 0, 0]) / 40
+    assert magnification.min() > 0.997
+    assert magnification.max() < 1 / 0.8 + 0.003
+    # 100 uniform draws leave 15 % of either end empty with probability below 1e-6.
+    assert magnification.min() < 1 / (1 - 0.2 * 0.15)
+    assert magnification.max() > 1 / (1 - 0.2 * 0.85)
+
+
+def test_light_shift_is_a_share_of_each_side():
+    moved = spots_moved(shift=0.05)[:, 0] - (80, 60)
+    # Tolerances as above.
+    limits = np.array([0.05 * 161, 0.05 * 121])
+    assert (np.abs(moved) < limits + 0.1).all()
+    assert (moved.min(axis=0) < -0.7 * limits).all()
+    assert (moved.max(axis=0) > 0.7 * limits).all()
+
+
+def test_light_rotation_is_in_degrees_about_the_centre():
+    moved = spots_moved(rotation=10.0)
+    # Tolerances as above: 0.1 pixel at a radius of 40 is 0.15 degrees.
+    np.testing.assert_allclose(moved[:, 0], [[80, 60]] * 100, atol=0.1)
+    arm = moved[:, 1] - moved[:, 0]
+    np.testing.assert_allclose(np.hypot(*arm.T), 40, atol=0.1)
+    degrees = np.degrees(np.arctan2(arm[:, 1], arm[:, 0]))
+    assert np.abs(degrees).max() < 10.15
+    assert degrees.min() < -7
+    assert degrees.max() > 7
+
+
+def test_light_border_reflects():
+    # Reflection makes up no new levels: a picture of 100 to 150 stays so.
+    image = np.random.default_rng(0).integers(100, 151, (60, 80, 3), dtype=np.uint8)
+    for seed in range(20):
+        warped = light(image, seed, shift=0.3, rotation=20.0)
+        assert warped.min() >= 100
+        assert warped.max() <= 150
+
+
+def test_light_blur_is_gaussian():
+    variances = []
+    for seed in range(50):
+        weights = light(blob(81, 81, 40, 40), seed, blur=2.0)[..., 0].astype(float)
+        columns = np.arange(81) - 40
+        variances.append((weights.sum(axis=0) * columns**2).sum() / weights.sum())
+    sigmas = np.sqrt(np.maximum(np.array(variances) - variance_of_blob(), 0))
+    # Variances add; rounding to 8 bits and the kernel's cut at 3 sigma lose a few percent.
+    assert sigmas.max() < 2.05
+    assert sigmas.max() > 1.6
+    assert sigmas.min() < 0.5
+
+
+def variance_of_blob():
+    weights = blob(81, 81, 40, 40)[..., 0].astype(float)
+    return (weights.sum(axis=0) * (np.arange(81) - 40) ** 2).sum() / weights.sum()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_light_colour_is_brightness_then_contrast_then_saturation(seed):
+    image = picture()
+    generator = np.random.default_rng(seed)
+    # The same draws in the same order: scale, two shifts, angle, sigma, then the three factors.
+    generator.random(5)
+    brightness, contrast, saturation = generator.uniform(0.7, 1.3, 3)
+    luma = np.array([0.299, 0.587, 0.114])
+    expected = image * brightness
+    mean = (expected @ luma).mean()
+    expected = mean + contrast * (expected - mean)
+    grey = (expected @ luma)[..., None]
+    expected = np.clip(grey + saturation * (expected - grey), 0, 255)
+    # Half a level from rounding to 8 bits, and less than half from OpenCV's fixed-point factors.
+    np.testing.assert_allclose(light(image, seed, colour=0.3), expected, atol=1, rtol=0)
+
+
+def test_light_grey_has_equal_channels():
+    image = picture()
+    grey = light(image, grey=1.0)
+    np.testing.assert_array_equal(grey, grey[..., :1].repeat(3, axis=-1))
+    # Rounded luma against Pillow's, which has the same weights in 16 bits.
+    expected = np.asarray(Image.fromarray(image).convert("L")).astype(int)
+    assert np.abs(grey[..., 0] - expected).max() <= 1
+    share = np.mean(
+        [np.ptp(light(image[:8, :8], s, grey=0.3), axis=-1).max() == 0 for s in range(300)]
+    )
+    # Five standard deviations of 300 draws: 0.13.
+    assert share == pytest.approx(0.3, abs=0.13)

@@ -1,0 +1,286 @@
+"""Classes and groups against what their definitions ask of every pair, and cells by hand."""
+
+import itertools
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.data.class_groups import (
+    Classes,
+    cell_classes,
+    class_groups,
+    focal_classes,
+    focal_points,
+)
+from crisalad_jax.data.places import Places
+from crisalad_jax.data.views import Views, views_of
+from crisalad_jax.utils.errors import InputError
+
+COSPLACE = ClassesConfig(kind="cells")
+EIGENPLACES = ClassesConfig(kind="viewpoints", cell=15.0, spacing=3)
+METRES = 111_195.0
+"""A degree of latitude, to half a percent."""
+
+
+def street(count: int, side: float, seed: int = 0) -> tuple[Views, np.ndarray]:
+    """Images anywhere in a square of two cities, which look anywhere."""
+    generator = np.random.default_rng(seed)
+    east, north = generator.uniform(-side, side, (2, count))
+    views = Views(east, north, generator.uniform(0, 360, count), np.ones(2, bool))
+    return views, generator.integers(0, 2, count)
+
+
+def members(classes: Classes) -> list[np.ndarray]:
+    return [classes.images[a:b] for a, b in itertools.pairwise(classes.start)]
+
+
+def test_cells_are_squares_and_sectors():
+    views, city = street(3000, 40.0)
+    classes = cell_classes(views, city, COSPLACE, min_images=3)
+
+    def key(image: int) -> tuple:
+        e, n, h = views.east[image] // 10, views.north[image] // 10, views.heading[image] // 30
+        return int(city[image]), e, n, h
+
+    counts = Counter(map(key, range(len(city))))
+    found = {key(images[0]): images for images in members(classes)}
+    assert found.keys() == {name for name, count in counts.items() if count >= 3}
+    assert 0 < len(found) < len(counts)
+    for name, images in found.items():
+        assert {key(image) for image in images} == {name}
+        assert len(set(images.tolist())) == counts[name]
+    assert len(classes.group) == len(found)
+    # The paper's G_uvw: 5 x 5 x 2 groups, of the cells that agree modulo these.
+    for images, group in zip(members(classes), classes.group, strict=True):
+        _, e, n, h = key(images[0])
+        assert group == (e % 5 * 5 + n % 5) * 2 + h % 2
+    assert len(set(classes.group.tolist())) == 50
+
+
+def test_classes_of_a_group_are_no_neighbours():
+    """At least M (N - 1) = 40 m or alpha (L - 1) = 30 degrees apart, whichever images of them."""
+    views, city = street(4000, 60.0, seed=1)
+    classes = cell_classes(views, city, COSPLACE, min_images=1)
+    checked = 0
+    for group in range(0, 50, 7):
+        mine = [
+            images for images, g in zip(members(classes), classes.group, strict=True) if g == group
+        ]
+        for one, other in itertools.combinations(mine, 2):
+            if city[one[0]] != city[other[0]]:
+                continue
+            a, b = np.meshgrid(one, other)
+            apart = np.maximum(
+                np.abs(views.east[a] - views.east[b]), np.abs(views.north[a] - views.north[b])
+            )
+            turn = np.abs((views.heading[a] - views.heading[b] + 180) % 360 - 180)
+            assert ((apart >= 40) | (turn >= 30)).all()
+            checked += 1
+    assert checked > 100
+
+
+def test_focal_points_lie_across_and_along_the_street():
+    """A street to the north-east, walked to and fro: 10 m from its middle, by hand."""
+    along, across = np.array([3.0, 4.0]) / 5, np.array([4.0, -3.0]) / 5
+    positions = np.array([50.0, 80.0]) + np.array([[s] for s in (-5, -2, 2, 5)]) * along
+    points = focal_points(positions, 10.0)
+    assert points is not None
+    expected = [[[58, 74], [42, 86]], [[56, 88], [44, 72]]]
+    np.testing.assert_allclose(points, expected, atol=1e-12)
+    np.testing.assert_allclose(points[0, 0], [50, 80] + 10 * across, atol=1e-12)
+    assert focal_points(np.full((4, 2), 7.0), 10.0) is None  # no street
+
+
+def test_a_class_looks_at_its_focal_point():
+    """A cell whose street runs to the east: who looks south, north, or along it, by hand."""
+    # Focal points, 10 m from (7, 7): (7, 17), (7, -3), (17, 7), (-3, 7).
+    rows = [
+        (2.0, 7.0, 26.5),  # to (7, 17): atan2(5, 10) is 26.6 degrees
+        (12.0, 7.0, 350.0),  # 333.4, so 16.6 beside it
+        (2.0, 7.0, 71.0),  # 44.4 beside it; along the street 71
+        (12.0, 7.0, 200.0),  # to (7, -3): 206.6
+        (7.0, 7.0, 271.0),  # to the west, along the street
+        (4.0, 7.0, 265.0),  # the same
+        (10.0, 7.0, 300.0),  # the same, 30 beside it; 43.3 beside (7, 17), at 343.3
+        (7.0, 7.0, 135.5),  # to none: 45.5 beside (17, 7)
+    ]
+    views = Views(*np.array(rows).T, np.ones(1, bool))
+    city = np.zeros(len(rows), int)
+    lateral, frontal = focal_classes(views, city, EIGENPLACES, min_images=3)
+    assert [sorted(images.tolist()) for images in members(lateral)] == [[0, 1, 2, 6]]
+    assert [sorted(images.tolist()) for images in members(frontal)] == [[4, 5, 6]]
+    assert lateral.group.tolist() == frontal.group.tolist() == [0]
+    lateral, frontal = focal_classes(views, city, EIGENPLACES, min_images=4)
+    assert (len(lateral.group), len(frontal.group)) == (1, 0)
+
+
+def test_viewpoints_of_a_city_are_what_their_definition_says():
+    views, city = street(1500, 45.0, seed=2)
+    both = focal_classes(views, city, EIGENPLACES, min_images=3)
+    for side, classes in enumerate(both):
+        assert len(classes.group) > 10
+        for images, group in zip(members(classes), classes.group, strict=True):
+            e, n = views.east[images[0]] // 15, views.north[images[0]] // 15
+            assert group == e % 3 * 3 + n % 3
+            cell = (views.east // 15 == e) & (views.north // 15 == n) & (city == city[images[0]])
+            positions = np.column_stack([views.east, views.north])[cell]
+            # The principal directions once more, by the eigenvectors of the covariance.
+            direction = np.linalg.eigh(np.cov(positions.T))[1][:, side]
+            looking = []
+            for sign in (1, -1):
+                east, north = (positions.mean(0) + sign * 10 * direction - positions).T
+                dot = east * np.sin(np.deg2rad(views.heading[cell]))
+                dot += north * np.cos(np.deg2rad(views.heading[cell]))
+                looking.append(np.flatnonzero(cell)[dot >= np.hypot(east, north) * np.sqrt(0.5)])
+            assert set(images.tolist()) in [set(each.tolist()) for each in looking]
+            assert len(images) == max(map(len, looking))
+
+
+def city_of(
+    centres: list[tuple[float, float]], counts: list[int], *, cities: int = 1, heading: int = 90
+) -> Places:
+    """Places at (east, north) metres of a corner on an ocean; images of one are within a metre."""
+    files, place = [], []
+    for number, ((east, north), count) in enumerate(zip(centres, counts, strict=True)):
+        for view in range(count):
+            lat, lon = 0.001 + (north + 0.1 * view) / METRES, -40.5 + (east + 0.1 * view) / METRES
+            files.append(f"C_{number:07d}_2020_05_{heading:03d}_{lat:.9f}_{lon:.9f}_pano.jpg")
+            place.append(number)
+    return Places(
+        root=Path("root"),
+        cities=tuple(f"city{i}" for i in range(cities)),
+        files=tuple(files),
+        image_place=np.array(place, np.int32),
+        place_city=(np.arange(len(counts)) * cities // len(counts)).astype(np.int32),
+        place_id=np.arange(len(counts)),
+        place_start=np.concatenate([[0], np.cumsum(counts)]),
+    )
+
+
+def test_places_are_dealt_to_groups_without_neighbours():
+    """Every 15 m along a street, in three groups: at least 40 m apart, as cells are."""
+    places = city_of([(15.0 * i, 0.0) for i in range(60)], [4] * 60)
+    config = ClassesConfig(groups=3)
+    groups = class_groups(places, config, min_images=4, places_per_batch=2)
+    views = views_of(places)
+    assert len(groups) == 3
+    everything = [file for group in groups for file in group.files]
+    assert sorted(everything) == sorted(places.files)
+    for group in groups:
+        assert len(group.place_id) == 20
+        for number, place in enumerate(group.place_id):
+            start, end = group.place_start[number : number + 2]
+            assert group.files[start:end] == places.files[4 * place : 4 * place + 4]
+            assert (group.image_place[start:end] == number).all()
+        centres = views.east[4 * group.place_id]
+        assert np.diff(np.sort(centres)).min() > 40
+    # With fewer groups than a neighbourhood has places some are left out, and never put together.
+    (group,) = class_groups(places, ClassesConfig(groups=1), min_images=4, places_per_batch=2)
+    assert group.place_id.tolist() == list(range(0, 60, 3))
+
+
+def test_without_positions_places_are_dealt_by_number():
+    places = city_of([(0.0, 0.0)] * 10, [1] * 10)
+    assert not views_of(places).known[0]
+    groups = class_groups(places, ClassesConfig(groups=3), min_images=1, places_per_batch=3)
+    assert [group.place_id.tolist() for group in groups] == [[0, 3, 6, 9], [1, 4, 7], [2, 5, 8]]
+
+
+def test_places_with_too_few_images_are_no_classes():
+    places = city_of([(100.0 * i, 0.0) for i in range(6)], [4, 1, 4, 3, 5, 4])
+    (group,) = class_groups(places, ClassesConfig(groups=1), min_images=4, places_per_batch=1)
+    assert group.place_id.tolist() == [0, 2, 4, 5]
+    assert group.image_counts.tolist() == [4, 4, 5, 4]
+
+
+def test_the_groups_with_most_classes_are_taken_and_places_may_be_joined():
+    """Two places in one cell become one class; 50 m on is the same group, 10 m on another."""
+    corner = (
+        views_of(city_of([(0.0, 0.0)], [2])).east[0] // 10 * 10
+        - views_of(city_of([(0.0, 0.0)], [2])).east[0]
+    )
+    east = corner + 2
+    places = city_of(
+        [(east, 0.0), (east + 3, 0.0), (east + 50, 0.0), (east + 10, 0.0)], [2, 2, 3, 4]
+    )
+    config = ClassesConfig(kind="cells", groups=1)
+    (group,) = class_groups(places, config, min_images=3, places_per_batch=2)
+    assert group.image_counts.tolist() == [4, 3]
+    assert group.files == places.files[:7]
+    both = class_groups(
+        places,
+        ClassesConfig(kind="cells", groups=9),
+        min_images=3,
+        places_per_batch=1,
+    )
+    assert [each.image_counts.tolist() for each in both] == [[4, 3], [4]]
+
+
+def test_lateral_and_frontal_groups_take_turns():
+    """A street of photographs to the north and to the east, alternately."""
+    generator = np.random.default_rng(0)
+    spots = generator.uniform(0, 90, (400, 2))
+    places = city_of([tuple(spot) for spot in spots], [1] * 400)
+    files = tuple(
+        file.replace("_090_", f"_{90 * (i % 4):03d}_") for i, file in enumerate(places.files)
+    )
+    places = Places(**{**vars(places), "files": files})
+    config = ClassesConfig(kind="viewpoints", cell=15.0, spacing=3, groups=2)
+    groups = class_groups(places, config, min_images=2, places_per_batch=1)
+    views = views_of(places)
+    sets = focal_classes(views, np.zeros(400, int), config, min_images=2)
+    assert len(groups) == 4
+    for turn, group in enumerate(groups):
+        classes = sets[turn % 2]
+        possible = {tuple(sorted(places.files[i] for i in images)) for images in members(classes)}
+        for a, b in itertools.pairwise(group.place_start):
+            assert tuple(sorted(group.files[a:b])) in possible
+
+
+@pytest.mark.parametrize(
+    ("changes", "batch", "words"),
+    [
+        (
+            {"kind": "cells"},
+            1,
+            "root: found at most 4 images in one cell of 10 m and 30 degrees, expected classes of "
+            "at least 5; --loss.kind.classes.kind places takes its places for classes",
+        ),
+        (
+            {"kind": "viewpoints"},
+            1,
+            "found at most [0-4] images that look at the lateral focal point of one cell of 10 m, "
+            "expected classes of at least 5",
+        ),
+        ({}, 1, "root: found no place with at least 5 images; the largest has 4"),
+    ],
+)
+def test_no_class_with_enough_images_is_told(changes, batch, words):
+    places = city_of([(100.0 * i, 0.0) for i in range(6)], [4] * 6)
+    config = ClassesConfig(**changes)
+    with pytest.raises(InputError, match=words):
+        class_groups(places, config, min_images=5, places_per_batch=batch)
+
+
+def test_fewer_classes_than_a_batch_asks_for_are_told():
+    places = city_of([(100.0 * i, 0.0) for i in range(9)], [4] * 9)
+    words = (
+        r"root: found 4 classes in the smallest of 2 groups, expected at least places_per_batch 5; "
+        r"fewer groups \(--loss.kind.classes.groups\) have more"
+    )
+    with pytest.raises(InputError, match=words):
+        class_groups(places, ClassesConfig(groups=2), min_images=4, places_per_batch=5)
+
+
+@pytest.mark.parametrize("classes", ["cells", "viewpoints"])
+def test_positions_that_are_asked_for_and_missing_are_told(classes):
+    places = city_of([(0.0, 0.0)] * 4, [1] * 4)
+    words = (
+        r"root: found one position \(lat, lon\) for all images of city0, expected where each was "
+        rf"taken, which loss.kind.classes.kind '{classes}' asks for; --loss.kind.classes.kind "
+    )
+    with pytest.raises(InputError, match=words):
+        class_groups(places, ClassesConfig(kind=classes), min_images=1, places_per_batch=1)

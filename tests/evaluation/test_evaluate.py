@@ -1,0 +1,385 @@
+"""Groupings against `describe` on the very images, and recalls against brute force."""
+
+import dataclasses
+import pathlib
+import re
+
+import faiss
+import numpy as np
+import pytest
+
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.evaluation.evaluate import evaluate, same_place_rule
+from crisalad_jax.evaluation.leakage import near, same_place_share
+from crisalad_jax.evaluation.results import GroupingResult
+from crisalad_jax.nn.model import describe
+from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
+from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import BATCH, MODEL, random_params
+
+# Entries of a unit descriptor of 48 numbers are of order 0.1. The same image in a batch of another
+# size, or beside padding, is summed in another order: some units in the last place of float32.
+TOLERANCE = 2e-6
+# What a changed neighbour makes of a descriptor, far above rounding.
+VISIBLE = 1e-3
+
+WITHOUT_ENCODER = dataclasses.replace(
+    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
+)
+
+
+def pictures(paths) -> np.ndarray:
+    return np.stack([resize_image(read_image(path), MODEL.image_size) for path in paths])
+
+
+@pytest.fixture(scope="module")
+def images(benchmark: Benchmark) -> np.ndarray:
+    return pictures(benchmark.database)
+
+
+@pytest.fixture(scope="module")
+def folder(benchmark: Benchmark, params) -> FolderTokens:
+    return read_tokens(params, MODEL, benchmark.database, batch_size=BATCH, label="", quiet=True)
+
+
+def grouped(params, folder: FolderTokens, grouping: str, **changes) -> np.ndarray:
+    return group(params, MODEL, folder, grouping, **({"batch_size": BATCH} | changes))
+
+
+def alike(found: np.ndarray, expected: np.ndarray) -> None:
+    np.testing.assert_allclose(found, expected, atol=TOLERANCE, rtol=0)
+
+
+def in_batches(params, images: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Each batch described by itself, the last with as few images as it has."""
+    descriptors = np.empty((len(images), MODEL.descriptor_dim), np.float32)
+    for start in range(0, len(images), BATCH):
+        chosen = order[start : start + BATCH]
+        descriptors[chosen] = describe(params, images[chosen], MODEL)
+    return descriptors
+
+
+def test_single_is_every_image_in_a_batch_of_one(params, folder, images):
+    expected = np.concatenate([describe(params, image[None], MODEL) for image in images])
+    alike(grouped(params, folder, "single"), expected)
+
+
+def test_sequential_is_consecutive_batches_whose_padding_is_unseen(params, folder, images):
+    assert len(images) % BATCH  # or nothing is padded
+    expected = in_batches(params, images, np.arange(len(images)))
+    found = grouped(params, folder, "sequential")
+    alike(found, expected)
+    assert np.abs(found - grouped(params, folder, "single")).max() > VISIBLE
+
+
+def test_shuffled_gives_each_image_its_own_descriptor_in_the_seeds_order(params, folder, images):
+    found = grouped(params, folder, "shuffled", seed=3)
+    order = np.random.default_rng(3).permutation(len(images))
+    assert not np.array_equal(order, np.arange(len(images)))
+    alike(found, in_batches(params, images, order))
+    np.testing.assert_array_equal(grouped(params, folder, "shuffled", seed=3), found)
+    assert np.abs(grouped(params, folder, "shuffled", seed=4) - found).max() > VISIBLE
+
+
+def test_window_is_each_image_with_those_just_before_it(params, folder, images):
+    found = grouped(params, folder, "window")
+    windows = [images[max(0, i - BATCH + 1) : i + 1] for i in range(len(images))]
+    assert [len(window) for window in windows] == [1, 2, 3, 4, 4, 4, 4]
+    alike(found, np.stack([describe(params, window, MODEL)[-1] for window in windows]))
+
+
+@pytest.mark.parametrize("changed", range(7))
+def test_a_window_owes_nothing_to_older_frames_nor_to_later_ones(params, folder, changed):
+    """Through two layers of a strip with a mask, an older frame would come through."""
+    assert MODEL.cross_image.layers == 2
+    local = folder.local.copy()
+    local[changed] = folder.local[(changed + 3) % 7]
+    global_tokens = folder.global_tokens.copy()
+    global_tokens[changed] = folder.global_tokens[(changed + 3) % 7]
+    before = grouped(params, folder, "window")
+    after = grouped(params, FolderTokens(global_tokens, local, folder.readable), "window")
+    moved = np.abs(after - before).max(axis=1)
+    sees = np.arange(7) - changed
+    # The same program on the same numbers: to the bit.
+    np.testing.assert_array_equal(moved[(sees < 0) | (sees >= BATCH)], 0)
+    assert (moved[(sees >= 0) & (sees < BATCH)] > VISIBLE).all()
+
+
+@pytest.mark.parametrize("grouping", GROUPINGS)
+def test_descriptors_are_unit_vectors(params, folder, grouping):
+    norms = np.linalg.norm(grouped(params, folder, grouping), axis=1)
+    np.testing.assert_allclose(norms, 1, atol=1e-6)  # float32, some roundings
+
+
+def test_an_unreadable_image_is_seen_by_none(params, benchmark, images, folder, tmp_path):
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"")
+    paths = [*benchmark.database[:2], bad, *benchmark.database[2:4]]
+    found = read_tokens(
+        params, MODEL, paths, batch_size=BATCH, label="", on_bad_image="skip", quiet=True
+    )
+    np.testing.assert_array_equal(found.readable, [True, True, False, True, True])
+    descriptors = grouped(params, found, "sequential")
+    alike(descriptors[[0, 1, 3]], np.asarray(describe(params, images[:3], MODEL)))
+    alike(descriptors[4:], np.asarray(describe(params, images[3:4], MODEL)))
+    with pytest.raises(InputError, match=f"^{bad}: "):
+        read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True)
+
+
+def test_recalls_equal_brute_force(params, benchmark):
+    results = evaluate(params, MODEL, benchmark, batch_size=BATCH, seed=7, seeds=1, quiet=True)
+    assert [result.grouping for result in results] == [
+        *("single", "shuffled", "sequential", "window/single")
+    ]
+    database, queries = pictures(benchmark.database), pictures(benchmark.queries)
+    positions = [
+        np.array([float(path.name.split("@")[1]) for path in paths])
+        for paths in (benchmark.database, benchmark.queries)
+    ]
+    right = np.abs(positions[1][:, None] - positions[0][None, :]) <= 25
+    assert right.any(axis=1).tolist() == [True] * 4 + [False]
+    # Database and queries are shuffled apart, by this seed and the next.
+    order = np.random.default_rng(7).permutation(7), np.random.default_rng(8).permutation(5)
+    expected = {
+        "single": [
+            np.concatenate([describe(params, image[None], MODEL) for image in side])
+            for side in (database, queries)
+        ],
+        "shuffled": [
+            in_batches(params, side, o) for side, o in zip((database, queries), order, strict=True)
+        ],
+        "sequential": [
+            in_batches(params, side, np.arange(len(side))) for side in (database, queries)
+        ],
+    }
+    windows = [queries[max(0, i - BATCH + 1) : i + 1] for i in range(len(queries))]
+    last = np.stack([describe(params, window, MODEL)[-1] for window in windows])
+    expected["window/single"] = [expected["single"][0], last]
+    for result in results:
+        a, b = expected[result.grouping]
+        similarities = b @ a.T
+        ranking = np.argsort(-similarities, axis=1, kind="stable")
+        # Two of the town's pictures are the same: their order is rounding's. All others are further
+        # apart than the roundings of float32 in sums of unit vectors.
+        found = result.neighbours.indices
+        swapped = found != ranking
+        assert set(found[swapped]) | set(ranking[swapped]) <= {5, 6}
+        np.testing.assert_allclose(
+            *(np.take_along_axis(similarities, each, axis=1) for each in (found, ranking)),
+            atol=1e-6,
+        )
+        hits = np.take_along_axis(right, ranking, axis=1)
+        for k in (1, 5, 10, 20):
+            # 4/5 at most: a query without positives is a miss.
+            assert result.recalls[k] == hits[:, :k].any(axis=1).mean()
+    assert results[0].recalls[20] == 0.8
+
+
+def test_only_the_groupings_asked_for_in_their_order(params, benchmark):
+    results = evaluate(
+        params,
+        MODEL,
+        benchmark,
+        groupings=("sequential", "single"),
+        batch_size=BATCH,
+        quiet=True,
+    )
+    assert [result.grouping for result in results] == ["sequential", "single"]
+
+
+def test_without_an_encoder_no_descriptor_depends_on_its_batch(benchmark):
+    params = random_params(WITHOUT_ENCODER)
+    folder = read_tokens(
+        params, WITHOUT_ENCODER, benchmark.database, batch_size=BATCH, label="", quiet=True
+    )
+    single, *others = (
+        group(params, WITHOUT_ENCODER, folder, name, batch_size=BATCH) for name in GROUPINGS
+    )
+    assert len(others) == 3
+    for found in others:
+        # A window's program is another one than a batch's.
+        alike(found, single)
+    (result,) = evaluate(params, WITHOUT_ENCODER, benchmark, batch_size=BATCH, quiet=True)
+    assert result.grouping == "any"
+    assert (result.query_share, result.database_share, dict(result.by_seed)) == (None, None, {})
+
+
+def test_an_image_that_cannot_be_read_stops_an_evaluation(params, town: pathlib.Path):
+    benchmark = open_benchmark(town)
+    benchmark.queries[2].write_bytes(benchmark.queries[2].read_bytes()[:200])
+    with pytest.raises(InputError, match=f"^{benchmark.queries[2]}: .*cut short"):
+        evaluate(params, MODEL, benchmark, batch_size=BATCH, quiet=True)
+
+
+def test_a_set_without_ground_truth_is_refused_before_anything_is_read(params, town):
+    benchmark = dataclasses.replace(open_benchmark(town), positives=None)
+    benchmark.database[0].write_bytes(b"")
+    with pytest.raises(InputError, match=re.escape(f"{benchmark.name}: no ground truth")):
+        evaluate(params, MODEL, benchmark, batch_size=BATCH, quiet=True)
+
+
+# A shuffle's seeds
+
+
+@pytest.fixture(scope="module")
+def shuffles(params, benchmark: Benchmark) -> tuple[GroupingResult, list[GroupingResult]]:
+    """Three seeds in one call, and each alone by the seed that the first says."""
+    # The last query is far from all, and what it retrieves changes with the shuffle.
+    positives = (*benchmark.positives[:4], np.array([1]))
+    benchmark = dataclasses.replace(benchmark, positives=positives)
+
+    def shuffled(seed: int, seeds: int) -> GroupingResult:
+        (result,) = evaluate(
+            params,
+            MODEL,
+            benchmark,
+            groupings=("shuffled/single",),
+            batch_size=BATCH,
+            seed=seed,
+            seeds=seeds,
+            quiet=True,
+        )
+        return result
+
+    together = shuffled(3, 3)
+    return together, [shuffled(seed, 1) for seed in together.by_seed]
+
+
+def test_mean_and_spread_are_those_of_the_seeds_alone(shuffles):
+    together, alone = shuffles
+    assert list(together.by_seed) == [3, 5, 7]
+    assert len({one.recalls[1] for one in alone}) > 1  # or there is no spread
+    for k in (1, 5, 10, 20):
+        found = [one.recalls[k] for one in alone]
+        assert [scores.recalls[k] for scores in together.by_seed.values()] == found
+        assert together.recalls[k] == pytest.approx(np.mean(found), rel=1e-15)
+        assert together.spread.recalls[k] == pytest.approx(np.std(found, ddof=1), abs=1e-15)
+    for name in ("average_precision", "recall_at_full_precision"):
+        found = [getattr(one, name) for one in alone]
+        assert getattr(together, name) == pytest.approx(np.mean(found), rel=1e-14)
+        assert getattr(together.spread, name) == pytest.approx(np.std(found, ddof=1), abs=1e-14)
+    assert together.query_share == pytest.approx(np.mean([one.query_share for one in alone]))
+    assert (together.database_share, alone[0].spread) == (None, None)
+
+
+def test_what_is_not_random_is_of_one_seed(params, benchmark):
+    (result,) = evaluate(
+        params,
+        MODEL,
+        benchmark,
+        groupings=("window/single",),
+        batch_size=BATCH,
+        seeds=3,
+        quiet=True,
+    )
+    assert (result.spread, dict(result.by_seed)) == (None, {})
+    assert result.precision_recall.average_precision == result.average_precision
+
+
+# Same-place shares
+
+
+def test_shares_are_told_by_positions_or_else_by_the_truth(params, benchmark):
+    """Seven database images 40 m apart but for the last two, 10 m; five queries far apart."""
+    positions = [
+        np.array([[float(path.name.split("@")[1]), 5e6] for path in paths])
+        for paths in (benchmark.queries, benchmark.database)
+    ]
+    unplaced = dataclasses.replace(benchmark, query_positions=None, database_positions=None)
+
+    def shares(benchmark: Benchmark) -> tuple[float | None, ...]:
+        (result,) = evaluate(
+            params,
+            MODEL,
+            benchmark,
+            groupings=("window/sequential",),
+            batch_size=BATCH,
+            quiet=True,
+        )
+        return result.query_share, result.database_share
+
+    assert same_place_rule(benchmark) == "a distance of at most 25 m"
+    assert same_place_rule(unplaced) == "a common positive"
+    # By fours (0 40 80 120) and (160 200 210): each of the last two sees one of two.
+    assert shares(benchmark) == (0, (0.5 + 0.5) / 7)
+    # The query at 205 has both of them as positives.
+    assert shares(unplaced) == (0, (0.5 + 0.5) / 7)
+    for radius in (45.0, 90.0):
+        expected = [
+            same_place_share(batches_of(len(where), kind, BATCH), near(where, radius))
+            for where, kind in zip(positions, ("window", "sequential"), strict=True)
+        ]
+        wider = dataclasses.replace(benchmark, radius=radius)
+        assert shares(wider) == tuple(expected)
+        assert min(expected) > 0
+
+
+# FAISS
+
+
+def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params, town):
+    """Database images that stand there twice or thrice make exact ties."""
+    folder = town / "images" / "test" / "database"
+    for path in sorted(folder.iterdir())[::2]:
+        for copy in "ab":
+            path.with_name(path.name.replace("@.jpg", f"@{copy}.jpg")).write_bytes(
+                path.read_bytes()
+            )
+    benchmark = open_benchmark(town)
+    assert len(benchmark.database) == 15
+    database, queries = (
+        grouped(
+            params,
+            read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True),
+            "single",
+        )
+        for paths in (benchmark.database, benchmark.queries)
+    )
+    index = faiss.IndexFlatL2(database.shape[1])
+    index.add(database)
+    # All of the database: among equal distances FAISS promises no order, ours is by index.
+    distances, indices = index.search(queries, len(database))
+    ranking = np.take_along_axis(indices, np.lexsort((indices, distances), axis=1), axis=1)
+    # Four images thrice; and those at 200 and 210 m are one picture.
+    assert (np.diff(np.sort(distances, axis=1), axis=1) == 0).sum(axis=1).tolist() == [9] * 5
+    (result,) = evaluate(
+        params, MODEL, benchmark, groupings=("single",), batch_size=BATCH, quiet=True
+    )
+    np.testing.assert_array_equal(result.neighbours.indices, ranking)
+    for k, recall in result.recalls.items():
+        right = [
+            bool(set(row[:k].tolist()) & set(wanted.tolist()))
+            for row, wanted in zip(ranking, benchmark.positives, strict=True)
+        ]
+        assert recall == np.mean(right)
+
+
+def test_an_observer_sees_the_descriptors_of_each_grouping(
+    benchmark: Benchmark, params, images: np.ndarray
+):
+    seen = {}
+
+    def observe(grouping: str, database: np.ndarray, queries: np.ndarray) -> None:
+        assert grouping not in seen  # of several shuffles the first alone
+        seen[grouping] = database, queries
+
+    results = evaluate(
+        params,
+        MODEL,
+        benchmark,
+        groupings=("single", "sequential", "shuffled"),
+        batch_size=BATCH,
+        seeds=2,
+        observe=observe,
+        quiet=True,
+    )
+    assert list(seen) == ["single", "sequential", "shuffled"]
+    first = describe(params, images[:BATCH], MODEL)
+    np.testing.assert_allclose(seen["sequential"][0][:BATCH], first, rtol=0, atol=TOLERANCE)
+    for result in results:
+        database, queries = seen[result.grouping]
+        best = (queries @ database.T).max(axis=1)
+        np.testing.assert_allclose(result.neighbours.similarities[:, 0], best, atol=TOLERANCE)

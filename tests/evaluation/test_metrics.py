@@ -1,0 +1,209 @@
+"""Scores by hand, by brute force, and against scipy's binomial distribution."""
+
+import faiss
+import hypothesis
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import scipy.stats
+
+from crisalad_jax.evaluation import metrics as scores
+from crisalad_jax.retrieval.search import search
+from crisalad_jax.utils.errors import InputError
+
+
+def test_recall_by_hand():
+    indices = np.array(
+        [
+            [4, 1, 2, 3, 0],  # right at rank 1
+            [4, 1, 2, 3, 0],  # right at ranks 3 and 4
+            [0, 1, 2, 3, 4],  # its positives were not found
+            [0, 1, 2, 3, 4],  # it has none: a miss, and still counted
+            [3, 2, 1, 4, 0],  # right at rank 5
+        ]
+    )
+    positives = [np.array(p, np.int64) for p in ([4], [2, 3], [7, 9], [], [0, 12])]
+    found = scores.recalls(indices, positives, ks=(1, 2, 3, 5, 20))
+    assert found == {1: 1 / 5, 2: 1 / 5, 3: 2 / 5, 5: 3 / 5, 20: 3 / 5}
+    assert list(scores.recalls(indices, positives)) == [1, 5, 10, 20]
+
+
+@hypothesis.settings(max_examples=50, deadline=None)
+@hypothesis.given(seed=st.integers(0, 2**32 - 1))
+def test_recall_agrees_with_sets_and_never_falls(seed):
+    rng = np.random.default_rng(seed)
+    indices = np.stack([rng.permutation(30)[:12] for _ in range(8)])
+    positives = [rng.permutation(30)[: rng.integers(0, 4)] for _ in range(8)]
+    ks = (1, 2, 5, 12)
+    found = scores.recalls(indices, positives, ks)
+    for k in ks:
+        hits = [bool(set(i[:k]) & set(p)) for i, p in zip(indices, positives, strict=True)]
+        assert found[k] == sum(hits) / 8
+    assert sorted(found.values()) == list(found.values())
+
+
+def test_recall_rejects_what_it_cannot_count():
+    indices = np.array([[0, 1]])
+    with pytest.raises(InputError, match=r"^indices: found no queries"):
+        scores.recalls(np.zeros((0, 3), np.int64), [])
+    with pytest.raises(InputError, match=r"^positives: found 2 lists, expected 1"):
+        scores.recalls(indices, [np.array([0]), np.array([1])])
+    with pytest.raises(InputError, match=r"^positives: query 0 has -1"):
+        scores.recalls(indices, [np.array([-1])])
+    with pytest.raises(InputError, match=r"^ks: found 0"):
+        scores.recalls(indices, [np.array([0])], ks=(0, 5))
+
+
+# intervals
+
+
+@pytest.mark.parametrize(
+    ("queries", "hits"), [(1, 1), (7, 0), (7, 3), (147, 81), (740, 739), (27_592, 24_000)]
+)
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.99])
+def test_the_interval_of_hits_and_misses_is_binomial(queries, hits, confidence):
+    values = np.random.default_rng(0).permutation(np.arange(queries) < hits).astype(int)
+    found = scores.bootstrap_interval(values, confidence=confidence)
+    tails = (1 - confidence) / 2, 1 - (1 - confidence) / 2
+    # Both are whole numbers of queries: equal, to the last.
+    assert np.multiply(found, queries).round(6).tolist() == (
+        scipy.stats.binom.ppf(tails, queries, hits / queries).tolist()
+    )
+
+
+def test_the_interval_of_several_trials_is_what_resampling_gives():
+    generator = np.random.default_rng(1)
+    hits = generator.choice(4, 60, p=[0.3, 0.1, 0.2, 0.4])
+    found = scores.bootstrap_interval(hits, trials=3)
+    resamples = generator.choice(hits, (100_000, 60)).mean(axis=1) / 3
+    expected = np.quantile(resamples, [0.025, 0.975])
+    # The means stand 1/180 apart, and 100,000 draws place a quantile within one such step.
+    np.testing.assert_allclose(found, expected, atol=1.01 / 180, rtol=0)
+    assert found.high - found.low > 0.1
+
+
+def test_the_same_trial_thrice_is_that_trial():
+    hits = (np.arange(50) % 3 == 0).astype(int)
+    assert scores.bootstrap_interval(3 * hits, trials=3) == scores.bootstrap_interval(hits)
+    # Where hits vary less between queries, as means of trials do, the interval is narrower.
+    assert scores.bootstrap_interval(np.full(50, 1), trials=3) == (1 / 3, 1 / 3)
+
+
+def test_intervals_reject_what_they_cannot_count():
+    for hits, options, words in (
+        (np.array([], int), {}, r"^hits: found \[\], expected numbers from 0 to 1"),
+        (np.array([0, 2]), {}, r"^hits: found \[0, 2\], expected numbers from 0 to 1"),
+        (np.array([-1, 2]), {"trials": 3}, r"^hits: found \[-1, 2\]"),
+        (np.array([1]), {"confidence": 95}, "^confidence: found 95, expected a fraction"),
+    ):
+        with pytest.raises(InputError, match=words):
+            scores.bootstrap_interval(hits, **options)
+
+
+# precision and recall
+
+
+def _curve(similarities, right, answerable=None):
+    """Of one retrieval a query: database image 0, positive where right."""
+    count = len(right)
+    answerable = np.ones(count, bool) if answerable is None else answerable
+    positives = [
+        np.array([0] if good else [1] if any_ else [], np.int64)
+        for good, any_ in zip(right, answerable, strict=True)
+    ]
+    indices = np.zeros((count, 2), np.int64)
+    indices[:, 1] = 1  # a second retrieval counts for nothing
+    both = np.stack([similarities, np.full(count, -1.0)], axis=1).astype(np.float32)
+    return scores.precision_recall(indices, both, positives)
+
+
+def test_precision_and_recall_by_hand():
+    # Two without positives, accepted at 0.7 and 0.2; 0.5 is a tie of a right and a wrong one.
+    found = _curve(
+        [0.5, 0.9, 0.7, 0.5, 0.8, 0.2],
+        [True, True, False, False, True, False],
+        [True, True, False, True, True, False],
+    )
+    np.testing.assert_array_equal(found.thresholds, np.float32([0.9, 0.8, 0.7, 0.5, 0.2]))
+    np.testing.assert_allclose(found.precision, [1, 1, 2 / 3, 3 / 5, 1 / 2], rtol=1e-15)
+    np.testing.assert_allclose(found.recall, [1 / 4, 1 / 2, 1 / 2, 3 / 4, 3 / 4], rtol=1e-15)
+    assert found.recall_at_full_precision == 0.5
+    # Steps of recall: a quarter at 1, a quarter at 1, none, a quarter at 3/5, none.
+    assert found.average_precision == pytest.approx(0.25 + 0.25 + 0.25 * 0.6, rel=1e-15)
+
+
+def test_a_wrong_retrieval_on_top_leaves_nothing_at_full_precision():
+    assert _curve([0.9, 0.8], [False, True]).recall_at_full_precision == 0
+    # A tie with the most similar right one, too: no threshold takes the one without the other.
+    assert _curve([0.9, 0.9], [True, False]).recall_at_full_precision == 0
+    assert _curve([0.9, 0.8], [True, True])[3:] == (1.0, 1.0)
+    assert _curve([0.9, 0.8], [False, False], [False, False]) is None
+
+
+@hypothesis.settings(max_examples=60, deadline=None)
+@hypothesis.given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 25))
+def test_precision_and_recall_agree_with_counting_at_every_threshold(seed, count):
+    rng = np.random.default_rng(seed)
+    similarities = rng.integers(0, 8, count) / 8  # many ties
+    answerable = rng.random(count) < 0.8
+    right = answerable & (rng.random(count) < 0.6)
+    found = _curve(similarities, right, answerable)
+    if not answerable.any():
+        assert found is None
+        return
+    expected = []
+    for threshold in sorted(set(similarities), reverse=True):
+        accepted = [s >= threshold for s in similarities]
+        true = sum(a and r for a, r in zip(accepted, right, strict=True))
+        expected.append((threshold, true / sum(accepted), true / answerable.sum()))
+    for column, wanted in zip(found[:3], zip(*expected, strict=True), strict=True):
+        np.testing.assert_allclose(column, wanted, rtol=1e-15)
+    full = [recall for _, precision, recall in expected if precision == 1]
+    assert found.recall_at_full_precision == max(full, default=0)
+
+
+# FAISS
+
+
+def _tied(seed: int):
+    """Unit rows whose products are exact in float32, each several times in the database."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((90, 16), np.float32)
+    rows[:, :4] = rng.choice([-0.5, 0.5], (90, 4))
+    rows = rng.permuted(rows, axis=1)
+    database, queries = rows[rng.integers(0, 60, 150)], rows[50:]
+    positives = [rng.permutation(150)[: rng.integers(0, 4)] for _ in queries]
+    return database, queries, positives
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_recalls_are_those_of_a_flat_faiss_index_ties_included(seed):
+    database, queries, positives = _tied(seed)
+    ks = (1, 2, 5, 10, 20)
+    ours = search(database, queries, max(ks))
+    found = scores.recalls(ours.indices, positives, ks)
+    index = faiss.IndexFlatL2(16)
+    index.add(database)
+    # FAISS promises no order among equal distances. All of the database, then: our rule for ties,
+    # the lower index first, on FAISS's distances.
+    distances, indices = index.search(queries, len(database))
+    ranking = np.take_along_axis(indices, np.lexsort((indices, distances), axis=1), axis=1)
+    np.testing.assert_array_equal(ours.indices, ranking[:, : max(ks)])
+    assert found == scores.recalls(ranking, positives, ks)
+    # And as FAISS itself orders them: whatever the order, a recall lies between those of the
+    # luckiest and the unluckiest. Here they differ, so that the rule matters.
+    lucky, unlucky = {}, {}
+    for k in ks:
+        cut = np.sort(distances, axis=1)[:, k - 1 : k]
+        right = scores.right_retrievals(indices, positives)
+        lucky[k] = (right & (distances <= cut)).any(axis=1)
+        room = k - (distances < cut).sum(axis=1)
+        tied_wrong = (~right & (distances == cut)).sum(axis=1)
+        unlucky[k] = (right & (distances < cut)).any(axis=1) | (
+            (right & (distances == cut)).any(axis=1) & (tied_wrong < room)
+        )
+    plain = scores.recalls(index.search(queries, max(ks))[1], positives, ks)
+    for k in ks:
+        assert unlucky[k].mean() <= plain[k] <= lucky[k].mean()
+        assert unlucky[k].mean() <= found[k] <= lucky[k].mean()
+    assert any(unlucky[k].mean() < lucky[k].mean() for k in ks)

@@ -1,0 +1,76 @@
+"""Settings and notes of evaluations: what was asked stands beside what was found."""
+
+import json
+
+import numpy as np
+import pytest
+
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.record import evaluation_settings, table_notes, write_results
+from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
+from crisalad_jax.evaluation.similarity import FirstSimilarities, similarity_map
+from crisalad_jax.retrieval.search import Neighbours
+from tests.conftest import BATCH, MODEL
+
+NEIGHBOURS = Neighbours(np.zeros((1, 1), np.int64), np.ones((1, 1), np.float32))
+
+
+def result(grouping: str, rerank: str | None = None) -> GroupingResult:
+    return GroupingResult(grouping, {1: 0.5}, NEIGHBOURS, rerank=rerank)
+
+
+@pytest.fixture
+def settings(benchmark: Benchmark) -> dict:
+    return evaluation_settings(benchmark, MODEL, weights="w.safetensors", batch_size=BATCH, seeds=2)
+
+
+def test_settings_are_what_was_asked(settings, benchmark):
+    assert settings == json.loads(json.dumps(settings))
+    assert settings == {
+        "weights": "w.safetensors",
+        "benchmark": benchmark.name,
+        "rule": benchmark.rule,
+        "same_place": "a distance of at most 25 m",
+        "batch_size": BATCH,
+        "seed": 0,
+        "seeds": 2,
+        "pca": None,
+        "rerank": None,
+        "rerank_weights": None,
+        "model": to_plain(MODEL),
+    }
+
+
+def test_results_are_written_with_them(settings, benchmark, tmp_path):
+    results = [result("single"), result("single", "transvpr:3")]
+    write_results(tmp_path / "new" / "r.json", results, settings, model_name="mine")
+    found = json.loads((tmp_path / "new" / "r.json").read_text())
+    rows = found.pop("results")
+    assert found == settings
+    names = {"benchmark": benchmark.name, "model": "mine"}
+    assert rows == [names | json.loads(json.dumps(to_json(each))) for each in results]
+
+
+def test_notes_are_of_what_the_table_shows(settings):
+    alone = table_notes([result(ANY)], settings)
+    assert alone[1:] == ["No cross-image encoder: no descriptor depends on its batch."]
+    _, grouped = table_notes([result("single"), result("window/single")], settings)
+    assert f"in its batch of {BATCH}: single = every image alone; window = every" in grouped
+    assert "told by a distance of at most 25 m" in grouped
+    results = [result("shuffled"), result("shuffled", "transvpr:3")]
+    *_, shuffled, ranked = table_notes(results, settings)
+    assert shuffled.startswith("Shuffled: mean of 2 seeds ± their standard deviation")
+    assert ranked.startswith("+ transvpr:3: the first 3 retrievals by its scores")
+    assert len(table_notes(results, settings | {"seeds": 1})) == 3
+
+
+def test_similarities_of_the_first_grouping_are_kept():
+    generator = np.random.default_rng(0)
+    sides = [generator.standard_normal((n, 4)).astype(np.float32) for n in (5, 3)]
+    sides = [side / np.linalg.norm(side, axis=1, keepdims=True) for side in sides]
+    seen = FirstSimilarities()
+    assert seen.map is None
+    seen("single", *sides)
+    seen("sequential", *reversed(sides))
+    np.testing.assert_array_equal(seen.map, similarity_map(*sides))

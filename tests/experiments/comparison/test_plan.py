@@ -1,0 +1,141 @@
+"""What a comparison is made of, and what is refused before any work."""
+
+import dataclasses
+
+import pytest
+
+from crisalad_jax.experiments.comparison import METHODS, ComparedMethod, ComparisonConfig, prepare
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.training.recipes import from_scratch, recipe
+from tests.cli.test_cli import fails
+from tests.conftest import MODEL
+
+
+def test_batches_fit_the_training_set(config):
+    """Eight places of three images: all in one batch, a fifth of three steps to warm up."""
+    (variant,) = prepare(config).variants
+    training = variant.training
+    assert (training.places_per_batch, training.images_per_place) == (8, 3)
+    assert (training.min_images, training.epochs, training.patience) == (3, 3, None)
+    assert training.optimiser.warmup_steps == 0
+    assert (training.trainable, training.augmentation.part_name) == ("all", "light")
+    assert training.optimiser.learning_rate == recipe("tiny").optimiser.learning_rate
+
+
+def test_the_same_images_a_batch_for_all(settings):
+    names = ("crisalad", "salad", "cricavpr")
+    prepared = prepare(ComparisonConfig(**settings | {"names": names}))
+    assert {v.training.places_per_batch for v in prepared.variants} == {8}
+    assert [v.labels for v in prepared.variants] == [
+        *(("CriSALAD",), ("DINO-SALAD",), ("CricaVPR",))
+    ]
+    assert len(prepared.units) == 6
+
+
+def test_from_a_backbone_recipes_are_as_they_are(settings, shared):
+    backbone = str(shared / "weights.safetensors")
+    (variant,) = prepare(ComparisonConfig(**settings | {"backbone": backbone})).variants
+    expected = recipe("tiny", "crisalad")
+    assert variant.training == dataclasses.replace(
+        expected,
+        epochs=3,
+        patience=None,
+        places_per_batch=8,
+        images_per_place=3,
+        min_images=3,
+    )
+
+
+def test_a_method_is_a_line():
+    """All of the paper's Table 1, its text's GeM and AnyLoc, and BoQ."""
+    assert len(METHODS) == 13
+    for method in METHODS.values():
+        config = from_scratch(recipe("tiny", method.recipe))
+        assert (config.trainable, config.model.compute_dtype) == ("all", "float32")
+
+
+REFUSED = [
+    (("--methods", "crisalad,vlad"), ("--methods: found 'vlad', expected one of", "cricavpr")),
+    (("--methods", "salad,salad"), ("--methods: found salad, salad", "each once")),
+    (("--seeds", 0), ("seeds: found 0, expected at least 1",)),
+    (("--epochs", 0), ("--epochs: found 0, expected at least 1",)),
+    (("--rerank", 1), ("--rerank: found 1, expected at least 2",)),
+    (
+        ("--methods", "patch-netvlad", "--rerank", 7, "--image-size", 28, 28),
+        ("patch-netvlad: found images of 28 x 28, expected at least 42 x 42",),
+    ),
+    (("--grouping", "alone"), ("grouping: found 'alone', expected one of",)),
+    (("--weights", "crisalad"), ("--weights: found 'crisalad', expected NAME=FILE",)),
+    (("--weights", "salad=w"), ("--weights: found 'salad', expected one of those compared",)),
+    (("--weights", "crisalad=none"), ("none: found no such file",)),
+    (("--image-size", 50, 50), ("found 50 x 50, expected sides that are multiples of 14",)),
+    (("--preset", "huge"), ("preset: found 'huge', expected one of b14",)),
+    (("--train", "none"), ("none: found no folder Dataframes",)),
+    (("--test", "none"), ("none: found",)),
+    (("--backbone", "none"), ("none: found no such file",)),
+]
+
+
+@pytest.mark.parametrize(("changed", "words"), REFUSED, ids=[str(case[0]) for case in REFUSED])
+def test_refused_before_any_work(flags, capfd, tmp_path, changed, words):
+    fails(capfd, *flags, "--out", tmp_path / "out", *changed, words=words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_weights_of_another_method(flags, shared, capfd, tmp_path):
+    weights = shared / "weights.safetensors"
+    fails(
+        capfd,
+        *flags,
+        *("--out", tmp_path / "out", "--methods", "salad", "--weights", f"salad={weights}"),
+        words=(weights, "of another method than salad", "adapter depthwise, expected none"),
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_to_train_on(flags, capfd, tmp_path):
+    given = list(flags)
+    at = given.index("--train")
+    words = ("--train: found none, expected a training set for crisalad, or --weights of each",)
+    fails(capfd, *given[:at], *given[at + 2 :], "--out", tmp_path / "out", words=words)
+
+
+def test_an_occupied_place(flags, capfd, tmp_path):
+    (tmp_path / "letter.txt").write_text("mine")
+    fails(capfd, *flags, "--out", tmp_path, words=(tmp_path, "found files but no comparison"))
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_an_encoder_that_does_not_fit_one_of_them(flags, capfd, tmp_path, monkeypatch):
+    """CricaVPR's tokens are 32 wide here, SALAD's 12."""
+    twelve = dataclasses.replace(
+        MODEL,
+        aggregator=dataclasses.replace(MODEL.aggregator, cluster_dim=12, token_dim=12),
+        cross_image=CrossImageConfig(heads=3, feedforward=16),
+    )
+    monkeypatch.setitem(PRESETS, "tiny", twelve)
+    methods = ("--methods", "crisalad,cricavpr")
+    words = ("aggregator gem-pyramid: found tokens of 32 numbers", "encoder's 3 heads")
+    fails(capfd, *flags, *methods, "--out", tmp_path / "out", words=words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_more_ranked_anew_than_there_are(flags, capfd, tmp_path, monkeypatch):
+    monkeypatch.setitem(METHODS, "ranked", ComparedMethod("Ranked", "crisalad", rerank="any"))
+    words = ("--rerank: found 20 for ranked, expected at most the 7 database images of",)
+    fails(capfd, *flags, "--methods", "ranked", "--out", tmp_path / "out", words=words)
+
+
+def test_another_size_for_parameters_of_one(settings):
+    """MixVPR's parameters are for the patches of the size that is asked for, not the preset's."""
+    given = settings | {"names": ("mixvpr",), "image_size": (56, 70)}
+    (variant,) = prepare(ComparisonConfig(**given)).variants
+    assert variant.model.image_size == (56, 70)
+
+
+def test_a_page_without_a_place(flags, capfd, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("nothing\n")
+    words = (page, "found no <!-- out --> ... <!-- end of out -->, expected both comments")
+    fails(capfd, *flags, "--out", tmp_path / "out", "--page", page, words=words)

@@ -1,0 +1,265 @@
+"""Comparisons that are carried out, interrupted, and gone on with."""
+
+import dataclasses
+import json
+import shutil
+import statistics
+import types
+
+import jax
+import pytest
+
+from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
+from crisalad_jax.cli import main
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.experiments import comparison
+from crisalad_jax.experiments.comparison import (
+    METHODS,
+    ComparedMethod,
+    ComparisonConfig,
+    plan,
+    runner,
+)
+from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.utils.errors import InputError
+from tests.cli.test_cli import fails, succeeds
+from tests.conftest import BATCH, STEPS, assert_equal
+
+pytestmark = pytest.mark.usefixtures("quick")
+
+
+def run(config: ComparisonConfig, out) -> comparison.Summary:
+    prepared = comparison.prepare(config)
+    comparison.carry_out(prepared, out, say=lambda line: None, quiet=True)
+    return comparison.summarise(prepared, out)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder for a comparison that one test makes and others copy."""
+    return tmp_path_factory.mktemp("made") / "out"
+
+
+@pytest.fixture
+def finished(made, flags, tmp_path):
+    """A comparison that was carried out, to spoil."""
+    if not made.exists():
+        assert main([*map(str, flags), "--out", str(made)]) == 0
+    out = tmp_path / "out"
+    shutil.copytree(made, out)
+    return out
+
+
+def stamps(out):
+    """When each file of results and weights was written."""
+    kept = (path for path in out.rglob("*") if path.suffix in (".json", ".safetensors"))
+    return {
+        path.relative_to(out): path.stat().st_mtime_ns for path in kept if "state" not in path.parts
+    }
+
+
+def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
+    """Evaluated again, apart; the mean and the deviation by the statistics module."""
+    results = json.loads((finished / "results.json").read_text())
+    (row,) = results["rows"]
+    by_seed, digests = [], set()
+    for seed in (0, 1):
+        run_folder = finished / "crisalad" / f"seed-{seed}" / "run"
+        params, model = load_weights(run_folder / "last.safetensors")
+        (result,) = evaluate(
+            params, model, benchmark, groupings=("single",), batch_size=BATCH, quiet=True
+        )
+        by_seed.append(result.recalls)
+        assert json.loads((run_folder / "config.json").read_text())["seed"] == seed
+        digests.add(model_hash(params, model))
+    assert len(digests) == 2
+    (found,) = row["recalls"].values()
+    for k in (1, 5):
+        values = [recalls[k] for recalls in by_seed]
+        assert found[f"R@{k}"]["by_seed"] == values
+        assert found[f"R@{k}"]["mean"] == pytest.approx(statistics.mean(values), abs=1e-15)
+        assert found[f"R@{k}"]["spread"] == pytest.approx(statistics.stdev(values), abs=1e-15)
+    leaves = sum(leaf.size for leaf in jax.tree.leaves(params))
+    assert (row["dimension"], row["parameters"]) == (model.descriptor_dim, leaves)
+    assert (row["speed"], row["training"], row["images_per_second"]) == (1, 1, None)
+
+
+def test_what_it_leaves(finished):
+    written = {path.name for path in finished.iterdir() if path.is_file()}
+    assert written == {
+        *("config.json", "behind.json", "speed.json", "results.json", "table.md", "table.csv"),
+        *("index.html", "recall_0.png"),
+    }
+    page = (finished / "index.html").read_text()
+    assert "CriSALAD" in page
+    assert "://" not in page.replace("data:image", "")
+
+
+def test_only_what_is_missing_is_done_again(finished, flags, capfd, monkeypatch):
+    missing = finished / "crisalad" / "seed-1" / "test-0.json"
+    content, before = missing.read_text(), stamps(finished)
+    missing.unlink()
+
+    def never(*args: object, **options: object) -> None:
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(runner, "fit", never)
+    monkeypatch.setattr(runner, "race", never)
+    succeeds(capfd, *flags, "--out", finished)
+    after = stamps(finished)
+    changed = {str(path) for path in after if after[path] != before.get(path)}
+    assert changed == {"crisalad/seed-1/test-0.json", "results.json"}
+    seconds = '"seconds": '
+    assert _without(missing.read_text(), seconds) == _without(content, seconds)
+
+
+def _without(text: str, start: str) -> list[str]:
+    return [line for line in text.splitlines() if not line.strip().startswith(start)]
+
+
+def test_interrupted_between_training_and_evaluation(finished, flags, capfd, tmp_path, monkeypatch):
+    """Ctrl-C in the second run's evaluation: the first is left alone, the training not repeated."""
+    out = tmp_path / "again"
+    real, calls = runner.evaluate, []
+
+    def interrupted(*args, **options):
+        calls.append(options["seed"])
+        if calls == [0, 1]:
+            raise KeyboardInterrupt
+        return real(*args, **options)
+
+    monkeypatch.setattr(runner, "evaluate", interrupted)
+    assert main([*map(str, flags), "--out", str(out)]) == 130
+    capfd.readouterr()
+    assert sorted(path.name for path in out.rglob("test-*.json")) == ["test-0.json"]
+    assert not (out / "results.json").exists()
+    succeeds(capfd, *flags, "--out", out)
+    assert calls == [0, 1, 1]
+    ours, theirs = (
+        json.loads((folder / "results.json").read_text())["rows"][0] for folder in (out, finished)
+    )
+    assert ours["recalls"] == theirs["recalls"]
+    assert ours["sittings"] == 1
+
+
+def test_a_run_that_was_cut_short_goes_on(finished, flags, capfd, tmp_path):
+    """As a kill leaves it before training.json: its steps are not taken again."""
+    folder = finished / "crisalad" / "seed-0"
+    weights = (folder / "run" / "last.safetensors").read_bytes()
+    for name in ("training.json", "test-0.json"):
+        (folder / name).unlink()
+    out = succeeds(capfd, *flags, "--out", finished)
+    assert "Resumed, so that its steps' times are of several calls: CriSALAD." in out
+    assert (folder / "run" / "last.safetensors").read_bytes() == weights
+    assert json.loads((folder / "training.json").read_text())["steps"] == STEPS
+
+
+def test_a_file_of_results_that_is_cut_short(finished, flags, capfd):
+    path = finished / "crisalad" / "seed-0" / "test-0.json"
+    path.write_text(path.read_text()[:40])
+    fails(capfd, *flags, "--out", finished, words=(path, "cannot read this result", "delete it"))
+
+
+def test_a_result_of_another_set(finished, flags, capfd):
+    path = finished / "crisalad" / "seed-0" / "test-0.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"queries": 4}))
+    words = (path, "with 4 queries and 7 database images, expected", "with 5 and 7; delete it")
+    fails(capfd, *flags, "--out", finished, words=words)
+
+
+def test_another_comparison_is_refused(finished, flags, capfd):
+    words = (finished, "holds another comparison: seeds: found 3, expected 2")
+    fails(capfd, *flags, "--seeds", 3, "--out", finished, words=words)
+
+
+def test_weights_that_change_behind_their_name_are_refused(
+    shared, params, settings, tmp_path, monkeypatch
+):
+    """Their results would stand beside what is told of the others."""
+    monkeypatch.delattr(runner, "fit")
+    weights, out = tmp_path / "weights.safetensors", tmp_path / "out"
+    _, model = load_weights(shared / "weights.safetensors")
+    save_weights(weights, params, model)
+    config = ComparisonConfig(**settings | {"train": None, "weights": (f"crisalad={weights}",)})
+    summary = run(config, out)
+    assert run(config, out).rows == summary.rows
+    save_weights(weights, jax.tree.map(lambda x: x + 1, params), model)
+    with pytest.raises(InputError, match=r"out: .*weights\.safetensors: found changed since"):
+        run(config, out)
+
+
+def test_weights_are_not_trained(shared, params, benchmark, settings, tmp_path, monkeypatch):
+    """One evaluation, whatever the seeds, of just these; in every grouping that is asked for."""
+    monkeypatch.delattr(runner, "fit")
+    weights = shared / "weights.safetensors"
+    options = {"train": None, "weights": (f"crisalad={weights}",), "grouping": "single,sequential"}
+    summary = run(ComparisonConfig(**settings | options), tmp_path / "out")
+    single, sequential = summary.rows
+    _, model = load_weights(weights)
+    expected = evaluate(
+        params, model, benchmark, groupings=("single", "sequential"), batch_size=BATCH, quiet=True
+    )
+    for row, result in zip((single, sequential), expected, strict=True):
+        assert row.grouping == result.grouping
+        (recalls,) = row.recalls.values()
+        assert {k: recall.mean for k, recall in recalls.items()} == {
+            k: result.recalls[k] for k in (1, 5, 10)
+        }
+        assert {recall.spread for recall in recalls.values()} == {None}
+        # Of one trial the interval is the binomial one, as `evaluate` has it.
+        assert recalls[1].interval == result.intervals[1]
+    assert (single.trained, single.training) == (None, None)
+
+
+def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeypatch):
+    """Of a method that learns nothing: what the vocabulary gave is what is evaluated."""
+    built = []
+
+    def with_vocabulary(params, config, paths, *, seed, quiet):
+        built.append((len(paths), seed))
+        return dataclasses.replace(
+            params, aggregator=jax.tree.map(lambda x: x + 1, params.aggregator)
+        )
+
+    monkeypatch.setattr(runner, "with_vocabulary", with_vocabulary)
+    monkeypatch.delattr(runner, "fit")
+    config = ComparisonConfig(**settings | {"names": ("anyloc",)})
+    out = tmp_path / "out"
+    summary = run(config, out)
+    assert built == [(24, 0), (24, 1)]
+    assert summary.rows[0].trained == 0
+    params, model = load_weights(out / "anyloc" / "seed-1" / "start.safetensors")
+    key, _ = jax.random.split(jax.random.key(1))
+    fresh = init_crisalad(key, model)
+    moved = jax.tree.map(lambda x: x + 1, fresh.aggregator)
+    assert_equal(params, dataclasses.replace(fresh, aggregator=moved))
+    (out / "anyloc" / "seed-0" / "test-0.json").unlink()
+    again = run(config, out)
+    assert len(built) == 2
+    assert again.rows == summary.rows
+
+
+def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
+    """The second one re-ranks; how is another module's, which is given its words."""
+    monkeypatch.setitem(METHODS, "ranked", ComparedMethod("Ranked", "crisalad", rerank="by-name"))
+    anything = types.SimpleNamespace(check=lambda model: None)
+    monkeypatch.setattr(plan, "parse_reranking", lambda text: anything)
+    monkeypatch.setattr(runner, "parse_reranking", lambda text: f"parsed {text}")
+    seen = []
+    real = runner.evaluate
+
+    def noted(*args, rerank=None, **options):
+        seen.append((options["seed"], rerank))
+        plain = real(*args, **options)
+        return [*plain, *(one._replace(rerank=rerank) for one in plain)]
+
+    monkeypatch.setattr(runner, "evaluate", noted)
+    monkeypatch.delattr(runner, "fit")
+    (finished / "config.json").unlink()
+    config = ComparisonConfig(**settings | {"names": ("crisalad", "ranked"), "rerank": 5})
+    runner.write_json(finished / "config.json", runner.to_plain(config))
+    summary = run(config, finished)
+    assert seen == [(0, "parsed by-name:5"), (1, "parsed by-name:5")]
+    first, second = summary.rows
+    assert first.recalls == second.recalls
+    assert (first.speed, second.speed, second.training) == (1, 1, 1)

@@ -1,0 +1,158 @@
+"""Tables of hand-made results, to the letter."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+from crisalad_jax.evaluation.metrics import Interval
+from crisalad_jax.experiments.comparison import AdapterCost, Recall, Row, Summary, tables
+from crisalad_jax.experiments.comparison.summary import recall_of
+from crisalad_jax.experiments.comparison.timing import Race, race
+from crisalad_jax.utils.errors import InputError
+
+
+def test_recalls_of_ranks_by_hand():
+    """Two seeds, four queries: at 1 they hit 2 and 1, at 5 they hit 3 and 2."""
+    ranks = np.array([[1, 1, 3, 0], [1, 6, 5, 0]])
+    at_1, at_5 = recall_of(ranks, 1), recall_of(ranks, 5)
+    assert at_1.by_seed == (0.5, 0.25)
+    assert (at_1.mean, at_5.mean) == (0.375, 0.625)
+    # The sample deviation of two numbers is their distance over the square root of 2.
+    assert at_1.spread == pytest.approx(0.25 / np.sqrt(2), abs=1e-15)
+    assert recall_of(ranks[:1], 1).spread is None
+
+
+def test_the_interval_is_the_bootstraps():
+    """Against resampling itself; its ends lie on a grid of 1/24, and may be one step off."""
+    ranks = np.array([[1, 0, 2, 9, 1, 1, 0, 1], [1, 0, 1, 2, 0, 1, 3, 0], [2, 0, 0, 1, 1, 1, 1, 1]])
+    hits = (ranks == 1).mean(axis=0)
+    drawn = np.random.default_rng(0).integers(0, 8, (20_000, 8))
+    low, high = np.quantile(hits[drawn].mean(axis=1), (0.025, 0.975))
+    found = recall_of(ranks, 1).interval
+    assert found == pytest.approx((low, high), abs=1 / 24 + 1e-9)
+    assert found.low < found.high
+
+
+ONE = Recall(0.625, 0.125, Interval(0.4, 0.8), (0.75, 0.5))
+LONE = Recall(0.25, None, Interval(0.1, 0.4), (0.25,))
+
+
+def row(name, grouping, recall, **changes):
+    values = {
+        "labels": (name.title(),),
+        "dimension": 8448,
+        "recalls": {"town": dict.fromkeys((1, 5, 10), recall)},
+        "speed": 1.25,
+        "images_per_second": None,
+        "parameters": 1_000_000,
+        "trained": 10_000,
+        "training": 0.5,
+        "training_seconds": 90.0,
+        "sittings": 1,
+    }
+    return Row(name=name, grouping=grouping, **values | changes)
+
+
+SUMMARY = Summary(
+    "compare",
+    ("method",),
+    "first",
+    {},
+    [
+        row("first", "single", ONE),
+        row("first", "shuffled", ONE),
+        row("a|b", "any", LONE, trained=None, training=None),
+    ],
+    ["A note."],
+    [],
+    {},
+)
+
+
+def test_markdown():
+    assert tables.markdown(SUMMARY).splitlines()[2:] == [
+        "| First, single | 8,448 "
+        + "| 62.5 ± 12.5 (40.0-80.0) " * 3
+        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x |",
+        "| First, shuffled | 8,448 "
+        + "| 62.5 ± 12.5 (40.0-80.0) " * 3
+        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x |",
+        r"| A\|B | 8,448 " + "| 25.0 (10.0-40.0) " * 3 + "| 1.25 x | 1,000,000 | - | - |",
+        "",
+        "A note.",
+    ]
+
+
+def test_on_a_gpu_times_are_absolute():
+    assert tables.costs_of(row("first", "single", ONE, images_per_second=427.4)) == [
+        *("8,448", "427", "1,000,000", "10,000", "1.5 min")
+    ]
+
+
+def test_csv_has_a_line_for_each_number():
+    summary = SUMMARY._replace(sets={"town": None})
+    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(summary))))
+    assert len(lines) == 3 * 3
+    assert lines[0] == {
+        **{"method": "First", "name": "first", "grouping": "single", "set": "town", "k": "1"},
+        **{"recall": "0.625", "standard_deviation": "0.125", "low": "0.4", "high": "0.8"},
+        **{"seeds": "2", "dimension": "8448", "speed": "1.25", "images_per_second": ""},
+        **{"parameters": "1000000", "trained": "10000", "training": "0.5"},
+        "training_seconds": "",  # on a CPU
+    }
+    assert lines[-1]["standard_deviation"] == lines[-1]["training"] == ""
+
+
+def test_json_is_json():
+    found = json.loads(json.dumps(tables.as_json(SUMMARY)))
+    assert found["rows"][0]["recalls"]["town"]["R@5"] == {
+        "mean": 0.625,
+        "spread": 0.125,
+        "interval": [0.4, 0.8],
+        "by_seed": [0.75, 0.5],
+    }
+
+
+def test_table_3_in_markdown():
+    cost = AdapterCost("depthwise", 741_504, 741_504, 39_223_296, 190_218_240, (1.0, 0.9, 1.1))
+    text = tables.markdown(SUMMARY._replace(adapters=[cost]))
+    assert (
+        "| depthwise | 741,504 | 741,504 | 39.223 | 78.447 | 190.2 | 1.00 x (0.90 to 1.10) |"
+        in text.splitlines()
+    )
+
+
+def test_what_the_paper_prints_and_no_count_gives():
+    cost = AdapterCost("mlp", 590_976, 590_976, 1_180_800, 151_584_768, None)
+    assert tables.adapter_cells(cost) == [
+        *("mlp", "590,976 (printed: 2,356,080)", "590,976", "1.181", "2.362", "151.6", "-")
+    ]
+
+
+def test_a_table_in_a_page(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- city -->\nold\n<!-- end of city -->\nafter\n")
+    for _ in range(2):
+        tables.put_in_page(page, "city", "| new |\n")
+        assert page.read_text() == (
+            "before\n<!-- city -->\n\n| new |\n\n<!-- end of city -->\nafter\n"
+        )
+    with pytest.raises(InputError, match=r"page\.md: found no <!-- town --> \.\.\. <!-- end of"):
+        tables.put_in_page(page, "town", "")
+
+
+def test_races_are_run_in_turns():
+    """Round by round; the first call of all compiles, the first of a turn warms up, three count."""
+    order = []
+    contenders = {name: lambda name=name: lambda: order.append(name) for name in "ab"}
+    found = race(contenders, rounds=2)
+    assert order == ["a", "b"] + (["a"] * 4 + ["b"] * 4) * 2
+    assert {name: len(rounds) for name, rounds in found.rounds.items()} == {"a": 2, "b": 2}
+
+
+def test_ratios_are_of_one_round():
+    raced = Race({"slow": [2.0, 40.0, 9.0], "fast": [1.0, 10.0, 3.0]})
+    assert raced.slower("slow", "fast") == (3.0, 2.0, 4.0)

@@ -1,0 +1,159 @@
+"""Galleries by their frames and the pictures in them."""
+
+import cv2
+import numpy as np
+import pytest
+
+from crisalad_jax.experiments import report
+from crisalad_jax.experiments.report.gallery import _choose_queries, shortened
+from crisalad_jax.utils.errors import InputError
+from tests.experiments.report.pictures import (
+    GREEN,
+    RED,
+    boxes_of,
+    is_colour,
+    near_colour,
+    read_picture,
+)
+
+
+def _gallery(photographs, path, indices, positives, **options):
+    indices = np.array(indices)
+    similarities = np.linspace(0.9, 0.1, indices.shape[1])[None].repeat(len(indices), axis=0)
+    report.prediction_gallery(
+        path,
+        photographs["queries"][: len(indices)],
+        photographs["database"],
+        indices,
+        similarities,
+        positives and [np.array(p, np.int64) for p in positives],
+        **options,
+    )
+    return read_picture(path)
+
+
+def test_gallery_frames_are_green_where_right_and_red_where_wrong(photographs, tmp_path):
+    picture = _gallery(
+        photographs, tmp_path / "gallery.png", [[2, 1, 0], [3, 4, 5]], [[2, 0], [5]], title="T"
+    )
+    height, width = picture.shape[:2]
+    # Four columns of 1.7 inches at 120 dots, three gaps and two margins, two rows of 4 : 3.
+    assert 850 < width < 1000
+    assert 400 < height < 600
+    green, red = boxes_of(picture, GREEN), boxes_of(picture, RED)
+    columns = sorted({left // 20 for left, *_ in green + red})
+    found = np.full((2, 3), "?")
+    for boxes, letter in ((green, "g"), (red, "r")):
+        for left, top, *_ in boxes:
+            found[int(top > height / 2), columns.index(left // 20)] = letter
+    assert found.tolist() == [["g", "r", "g"], ["r", "r", "g"]]
+    # Captions in the frame's colour stand below it.
+    for boxes, colour in ((green, GREEN), (red, RED)):
+        for left, top, _, box_height in boxes:
+            below = picture[top + box_height + 1 : top + box_height + 25, left : left + 120]
+            assert near_colour(below, colour).any()
+
+
+def test_gallery_without_positives_is_neither_green_nor_red(photographs, tmp_path):
+    """Two of four queries, from first to last, each with its own two pictures beside it."""
+    indices = [[0, 5], [1, 4], [2, 3], [3, 2]]
+    picture = _gallery(photographs, tmp_path / "g.png", indices, None, rows=2, columns=2)
+    assert not is_colour(picture, GREEN).any()
+    assert not is_colour(picture, RED).any()
+    # Queries 0 and 3, in the colours of pictures 0 and 3; found: 0 and 5, 3 and 2.
+    levels = [is_colour(picture, (60, 20 * number + 60, 90)).sum() for number in range(6)]
+    assert levels[1] == levels[4] == 0
+    assert levels[0] == levels[3] == 2 * levels[5] == 2 * levels[2] > 0
+
+
+def test_gallery_shows_the_pictures_asked_for(photographs, tmp_path):
+    picture = _gallery(photographs, tmp_path / "gallery.png", [[4, 1]], [[4]])
+    # Query 0, then database 4 and 1, from left to right, in the colours they were written in.
+    found = [
+        np.argwhere(is_colour(picture, (60, 20 * number + 60, 90)))[:, 1].mean()
+        for number in (0, 4, 1)
+    ]
+    assert found == sorted(found)
+
+
+@pytest.mark.parametrize(
+    ("right", "rows", "expected"),
+    [
+        ([1, 0, 1, 0, 1, 0], 4, [0, 4, 1, 5]),
+        ([1, 0, 1, 0, 1, 0], 3, [0, 4, 1]),
+        ([1, 1, 1, 1, 1, 0], 4, [0, 2, 4, 5]),
+        ([0, 0, 0, 1, 0, 0], 4, [3, 0, 2, 5]),
+        ([0, 0, 0], 2, [0, 2]),
+        ([1, 1, 1], 8, [0, 1, 2]),
+        ([1, 0], 1, [0]),
+    ],
+)
+def test_gallery_takes_half_right_half_wrong(right, rows, expected):
+    assert _choose_queries(np.array(right, bool), rows) == expected
+
+
+def test_gallery_is_deterministic_and_takes_mixed_sizes(photographs, tmp_path):
+    for number, shape in enumerate(((900, 300, 3), (100, 2500, 3), (1, 1, 3))):
+        cv2.imwrite(str(photographs["database"][number]), np.full(shape, 77, np.uint8))
+    arguments = [[0, 1, 2, 3]] * 4, [[1], [], [3], [0]]
+    first, second = (
+        _gallery(photographs, tmp_path / f"{name}.png", *arguments, rows=9, columns=9)
+        for name in "ab"
+    )
+    np.testing.assert_array_equal(first, second)
+    assert len(boxes_of(first, GREEN)) == 3
+    # Pictures far from the usual shape stay within their row and column.
+    edges = (first[:4], first[-4:], first[:, :4], first[:, -4:])
+    assert all((edge == 255).all() for edge in edges)
+
+
+def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
+    path = tmp_path / "gallery.png"
+    for indices, positives, options, message in (
+        (np.zeros((0, 2), int), [], {}, r"^indices: found shape \(0, 2\)"),
+        ([[0, 6]], [[0]], {}, r"^indices: found 0 to 6, expected 0 to 5"),
+        ([[-1, 0]], [[0]], {}, r"^indices: found -1 to 0"),
+        ([[0, 1]], [[0], [1]], {}, r"^positives: found 2, expected 1"),
+        ([[0, 1]], [[0]], {"rows": 0}, r"^rows: found 0"),
+        ([[0, 1]], [[0]], {"columns": 0}, r"^columns: found 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            _gallery(photographs, path, indices, positives, **options)
+    photographs["database"][1].write_bytes(b"")
+    with pytest.raises(InputError, match=r"database.1\.png: found an empty file"):
+        _gallery(photographs, path, [[0, 1]], [[0]])
+    assert not path.exists()
+
+
+def test_names_stand_below_the_captions_as_they_are(photographs, tmp_path):
+    """Ink in the row of names where there are names; a name with dollars is drawn as any other."""
+    names = ["$x_1$"], ["a" * 200, "", *"cdef"]
+    picture = _gallery(photographs, tmp_path / "g.png", [[0, 1]], None, names=names)
+    plain = _gallery(photographs, tmp_path / "p.png", [[0, 1]], None)
+    width = picture.shape[1]
+    assert width == plain.shape[1]
+    assert picture.shape[0] == pytest.approx(plain.shape[0] + 0.14 * 120, abs=1)
+    ink = [(picture[-60:-44, left : left + 204] < 200).any(axis=(0, 2)) for left in (30, 273, 496)]
+    assert [part.any() for part in ink] == [True, True, False]
+    # 28 letters of one width fill a picture's width, and not more; five take less.
+    assert 180 < np.flatnonzero(ink[1])[-1] < 203
+    assert np.flatnonzero(ink[0])[-1] < 60
+
+
+def test_long_names_are_shortened_in_the_middle():
+    assert shortened("abcdefgh", 8) == "abcdefgh"
+    assert shortened("abcdefghi", 8) == "abcd\N{HORIZONTAL ELLIPSIS}ghi"
+    assert shortened("abcdefghi", 7) == "abc\N{HORIZONTAL ELLIPSIS}ghi"
+
+
+def test_gallery_shows_the_queries_chosen_in_their_order(photographs, tmp_path):
+    picture = _gallery(
+        photographs, tmp_path / "gallery.png", [[0], [1], [2], [3]], [[0]] * 4, chosen=[3, 1]
+    )
+    rows = {n: np.argwhere(_is_level(picture, n))[:, 0].mean() for n in (1, 3)}
+    assert rows[3] < rows[1]
+    assert not _is_level(picture, 0).any()
+
+
+def _is_level(picture, number):
+    return is_colour(picture, (60, 20 * number + 60, 90))

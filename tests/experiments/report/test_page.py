@@ -1,0 +1,255 @@
+"""The page as a browser reads it: sections, numbers, pictures, and names that are no markup."""
+
+import base64
+import dataclasses
+import html.parser
+import pathlib
+import re
+import shutil
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.metrics import Interval, precision_recall
+from crisalad_jax.evaluation.results import GroupingResult, Scores
+from crisalad_jax.experiments.report import write_report
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import MODEL
+
+DASH = "\N{EN DASH}"
+VOID = {"meta", "link", "img", "br", "hr", "input"}
+EAST = [np.array([[e, 5e6] for e in side]) for side in ([0.0, 40, 80], [3.0, 45, 9000])]
+
+
+class Page(html.parser.HTMLParser):
+    """Elements with their attributes and the text inside; every tag must be closed in its turn."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[dict[str, Any]] = []
+        self.elements: list[dict[str, Any]] = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        element = {"tag": tag, "text": "", **dict(attrs)}
+        self.elements.append(element)
+        if tag not in VOID:
+            self.open.append(element)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop()["tag"] == tag
+
+    def handle_data(self, data: str) -> None:
+        for element in self.open:
+            element["text"] += data
+
+    def all(self, tag: str, **attributes: str) -> list[dict[str, Any]]:
+        wanted = {"tag": tag, **attributes}
+        return [e for e in self.elements if all(e.get(k) == v for k, v in wanted.items())]
+
+
+def small(benchmark: Benchmark, database: int = 3, queries: int = 3) -> Benchmark:
+    """Some of the town; the last query has nothing to find, the second is retrieved wrongly."""
+    return dataclasses.replace(
+        benchmark,
+        database=benchmark.database[:database],
+        queries=(*benchmark.queries[: queries - 1], benchmark.queries[-1]),
+        positives=POSITIVES,
+        database_positions=EAST[0],
+        query_positions=EAST[1],
+    )
+
+
+POSITIVES = (np.array([0]), np.array([1]), np.array([], int))
+NEIGHBOURS = Neighbours(
+    np.array([[0, 1, 2], [2, 0, 1], [1, 2, 0]]),
+    np.array([[0.91, 0.5, 0.4], [0.82, 0.6, 0.3], [0.73, 0.2, 0.1]], np.float32),
+)
+GROUPINGS = [
+    GroupingResult(
+        "single",
+        {1: 1 / 3, 5: 2 / 3},
+        NEIGHBOURS,
+        intervals={1: Interval(0.1, 0.5), 5: Interval(0.4, 0.9)},
+        query_share=0.0,
+        precision_recall=precision_recall(*NEIGHBOURS, POSITIVES),
+        average_precision=0.4,
+        recall_at_full_precision=0.5,
+    ),
+    GroupingResult(
+        "shuffled/single",
+        {1: 0.25, 5: 0.75},
+        NEIGHBOURS,
+        spread=Scores({1: 0.0125, 5: 0.02}, None, None),
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def written(
+    benchmark: Benchmark, params: Crisalad, tmp_path_factory: pytest.TempPathFactory
+) -> pathlib.Path:
+    """The folder of a page with everything on it."""
+    out = tmp_path_factory.mktemp("report") / "deep"
+    path = write_report(
+        out,
+        small(benchmark),
+        GROUPINGS,
+        params=params,
+        config=MODEL,
+        model_name="a <b>model</b>",
+        settings={"seed": 7, "note": "</pre><script>"},
+        similarities=np.eye(3, dtype=np.float32),
+    )
+    assert path == out / "index.html"
+    return out
+
+
+@pytest.fixture(scope="module")
+def page(written: pathlib.Path) -> Page:
+    return Page((written / "index.html").read_text(encoding="utf-8"))
+
+
+def test_every_section_is_there_and_linked(page: Page):
+    names = [e["id"] for e in page.all("section")]
+    assert names == [
+        *("recall", "right", "wrong", "unmatched", "map", "similarities", "transport", "settings"),
+    ]
+    assert {e["href"] for e in page.all("a")} == {f"#{name}" for name in names}
+    assert [e["text"] for e in page.all("h1")] == ["town/test (@UTM, 25 m)"]
+    assert page.all("html")[0]["lang"] == "en"
+    assert "width=device-width" in page.all("meta", name="viewport")[0]["content"]
+
+
+def test_nothing_is_asked_for_outside_of_the_page(written: pathlib.Path, page: Page):
+    for element in page.elements:
+        for name in ("src", "href"):
+            if element.get(name) is not None:
+                assert re.match("data:|#", element[name])
+    style = page.all("style")[0]["text"]
+    assert "url(" not in style
+    assert "@import" not in style
+    assert not page.all("script")
+
+
+def test_drawings_are_the_files_beside_the_page(written: pathlib.Path, page: Page):
+    files = {path.name: path.read_bytes() for path in written.glob("*.png")}
+    held = []
+    for image in page.all("img"):
+        assert image["alt"]
+        kind, _, data = image["src"].partition(";base64,")
+        data = base64.b64decode(data, validate=True)
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert decoded.shape[:2] == (int(image["height"]), int(image["width"]))
+        if kind == "data:image/png":
+            assert data in files.values()
+            held.append(next(name for name, content in files.items() if content == data))
+        else:
+            assert kind == "data:image/webp"
+    galleries = {"gallery_right.png", "gallery_wrong.png", "gallery_unmatched.png"}
+    # Galleries are in the page as photographs, one by one. Two images are shown twice.
+    assert set(files) - set(held) <= galleries | {f for f in files if f.startswith("transport")}
+    assert {"recall_curves.png", "precision_recall.png", "positions.png"} <= set(held)
+    assert "similarities.png" in held
+    assert galleries <= set(files)
+
+
+def test_the_table_holds_the_numbers(page: Page):
+    headers = [e["text"] for e in page.all("th", scope="col")]
+    assert headers == [
+        *("grouping", "R@1", "R@5", "same place, queries / database"),
+        *("AP", "recall at 100 % precision"),
+    ]
+    assert [e["text"] for e in page.all("th", scope="row")] == ["single", "shuffled/single"]
+    assert [e["text"] for e in page.all("td")] == [
+        *(f"33.310.0{DASH}50.0", f"66.740.0{DASH}90.0", f"0.0 / {DASH}", "40.0", "50.0"),
+        *("25.0± 1.2", "75.0± 2.0", f"{DASH} / {DASH}", DASH, DASH),
+    ]
+    text = page.all("main")[0]["text"]
+    assert "every image alone" in text
+    assert "95 % interval" in text
+
+
+def test_galleries_show_what_was_retrieved_with_distances(page: Page):
+    captions = [" ".join(e["text"].split()) for e in page.all("figcaption")]
+    assert captions == [
+        *("query", "✓ 1 0.910 3 m", "✗ 2 0.500 37 m", "✗ 3 0.400 77 m"),
+        *("query", "✗ 1 0.820 35 m", "✗ 2 0.600 45 m", "✓ 3 0.300 5 m"),
+        "would be right rank 3 5 m",
+        *("query", "✗ 1 0.730 8,960 m", "✗ 2 0.200 8,920 m", "✗ 3 0.100 9,000 m"),
+    ]
+    kinds = [e["class"] for e in page.all("figure") if e["class"] != "drawing"]
+    assert kinds == [
+        *("query", "right", "wrong", "wrong"),
+        *("query", "wrong", "wrong", "right", "expected"),
+        *("query", "wrong", "wrong", "wrong"),
+    ]
+    assert [e["text"] for e in page.all("h2")][1:4] == [
+        *("Right 1 of 1", "Wrong 1 of 1", "Nothing to find 1 of 1"),
+    ]
+
+
+def test_words_from_outside_are_no_markup(page: Page):
+    assert [e["text"] for e in page.all("p", **{"class": "model"})] == ["a <b>model</b>"]
+    assert '"</pre><script>"' in page.all("pre")[0]["text"]
+
+
+def test_names_of_files_are_no_markup(
+    benchmark: Benchmark, params: Crisalad, tmp_path: pathlib.Path
+):
+    name = "<script>alert('x')</script>\"onerror=&amp;.jpg".replace("/", "")
+    shutil.copy(benchmark.queries[0], tmp_path / name)
+    some = dataclasses.replace(
+        small(benchmark),
+        root=tmp_path,
+        queries=(tmp_path / name, *benchmark.queries[1:3]),
+        query_positions=None,
+    )
+    path = write_report(
+        tmp_path / "out",
+        some,
+        [GroupingResult("any", {1: 1.0}, NEIGHBOURS)],
+        params=dataclasses.replace(params, aggregator=None, cross_image=None),
+        config=dataclasses.replace(
+            MODEL, aggregator="class-token", cross_image=CrossImageConfig(layers=0)
+        ),
+        model_name="model",
+        settings={},
+    )
+    page = Page(path.read_text(encoding="utf-8"))
+    assert not page.all("script")
+    assert not any("onerror" in key for element in page.elements for key in element)
+    assert [e["text"] for e in page.all("span", title=name)] == [name]
+    assert any(e["alt"] == f"query 0: {name}" for e in page.all("img"))
+    # Of what this model and set lack there is no section, nor a word.
+    names = [e["id"] for e in page.all("section")]
+    assert names == ["recall", "right", "wrong", "unmatched", "settings"]
+    assert "No descriptor of this model" in " ".join(page.all("main")[0]["text"].split())
+    assert [e["text"] for e in page.all("figcaption")][1].split() == ["✓", "1", "0.910"]
+
+
+def test_a_page_without_results(benchmark: Benchmark, params: Crisalad, tmp_path: pathlib.Path):
+    def write(groupings: list[GroupingResult]) -> None:
+        write_report(
+            tmp_path / "out",
+            small(benchmark),
+            groupings,
+            params=params,
+            config=MODEL,
+            model_name="model",
+            settings={},
+        )
+
+    with pytest.raises(InputError, match=r"^groupings: found none"):
+        write([])
+    with pytest.raises(InputError, match=r"^single: found recall 33 at 1, expected a fraction"):
+        write([GroupingResult("single", {1: 33}, NEIGHBOURS)])
+    assert not (tmp_path / "out").exists()

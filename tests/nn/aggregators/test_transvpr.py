@@ -1,0 +1,119 @@
+"""TransVPR's descriptor and key patches by hand; its levels against the backbone's own layers."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, attentions, key_features
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.vit import ViTConfig, vit
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.layers import Linear
+from crisalad_jax.nn.model import describe, extract_features
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import random_params
+
+CONFIG = ModelConfig(
+    image_size=(42, 56),
+    backbone=ViTConfig(dim=16, depth=3, heads=2, position_grid=3),
+    aggregator=TransVprConfig(levels=3, dim=8),
+    cross_image=CrossImageConfig(layers=0),
+)
+
+
+def start() -> TransVpr:
+    return CONFIG.aggregator.init(jax.random.key(1), CONFIG.backbone, CONFIG.grid)
+
+
+@pytest.mark.parametrize(
+    ("levels", "depth", "expected"),
+    [(3, 12, (4, 8, 12)), (2, 4, (2, 4)), (3, 5, (1, 3, 5)), (1, 7, (7,)), (3, 3, (1, 2, 3))],
+)
+def test_levels_are_evenly_apart_and_end_at_the_last(levels: int, depth: int, expected) -> None:
+    assert TransVprConfig(levels=levels).features(depth).levels == expected
+
+
+def test_more_levels_than_blocks_are_refused() -> None:
+    with pytest.raises(InputError, match=r"TransVprConfig.levels: found 6, expected at most 3"):
+        dataclasses.replace(CONFIG, aggregator=TransVprConfig(levels=6))
+
+
+def test_a_models_last_level_is_its_backbones_last_layer() -> None:
+    params = random_params(CONFIG)
+    images = jax.random.normal(jax.random.key(0), (2, 42, 56, 3))
+    features = extract_features(params, images, CONFIG)
+    assert features.patches.shape == (2, 12, 3 * 16)
+    # The same sums, compiled twice, of numbers of order 1.
+    last = vit(params.backbone, images, CONFIG.backbone)
+    np.testing.assert_allclose(features.patches[..., -16:], last.patches, atol=1e-5)
+    np.testing.assert_allclose(features.class_token, last.class_token, atol=1e-5)
+    descriptors = describe(params, images, CONFIG)
+    assert descriptors.shape == (2, 8)
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-6)
+
+
+def by_hand(params: TransVpr, patches: np.ndarray, levels: int) -> np.ndarray:
+    """Patch by patch, in float64."""
+    attention, weight = (np.asarray(x.weight, float) for x in (params.attention, params.reduction))
+    dim = patches.shape[1] // levels
+    pooled = []
+    for level in range(levels):
+        scores = [np.exp(patch @ attention[:, level]) for patch in patches]
+        total = np.zeros(dim)
+        for patch, score in zip(patches, scores, strict=True):
+            total += score / sum(scores) * patch[level * dim : (level + 1) * dim]
+        pooled.append(total)
+    joined = np.concatenate(pooled)
+    bias = np.asarray(params.reduction.bias, float)
+    found = joined / np.linalg.norm(joined) @ weight + bias
+    return found / np.linalg.norm(found)
+
+
+def test_the_descriptor_by_hand() -> None:
+    params = start()
+    assert isinstance(params, TransVpr)
+    assert params.attention.bias is None
+    patches = np.random.default_rng(0).standard_normal((12, 48))
+    features = Features(jnp.zeros(16), jnp.asarray(patches, jnp.float32))
+    tokens = CONFIG.aggregator.apply(params, features, (3, 4), key=None)
+    assert tokens.local.shape == (0, 8)
+    # float32 sums of at most 48 numbers of order 1.
+    np.testing.assert_allclose(
+        to_descriptor(tokens, CONFIG.aggregator), by_hand(params, patches, 3), atol=1e-6
+    )
+
+
+def test_attentions_are_shares_of_the_patches() -> None:
+    params = start()
+    patches = jax.random.normal(jax.random.key(2), (2, 12, 48)).astype(jnp.bfloat16)
+    weights = attentions(params, patches)
+    assert (weights.shape, weights.dtype) == ((2, 12, 3), jnp.float32)
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+
+
+def test_key_patches_by_hand() -> None:
+    """Level 0 sees patches 0 and 1, level 1 patch 2; patch 3 is in no level, 4 in too little."""
+    wanted = np.log([[1.0, 0.0001], [0.5, 0.0001], [0.0001, 1.0], [0.0001, 0.0001], [0.01, 0.01]])
+    # The first number of each level is its score; the second makes the token's direction.
+    patches = np.stack(
+        [np.array([a, 1.0, b, 0.5 + number]) for number, (a, b) in enumerate(wanted)]
+    )
+    attention = np.zeros((4, 2))
+    attention[0, 0] = attention[2, 1] = 1
+    params = TransVpr(Linear(jnp.asarray(attention), None), Linear(jnp.zeros((4, 8)), jnp.zeros(8)))
+    found = np.asarray(key_features(params, jnp.asarray(patches, jnp.float32), 2))
+    # Stretched: 1, 0.5 and 1 at the first three, 0 at patch 3, at patch 4 about 0.01 in each level,
+    # of a sum that goes to about 1 in all: just under 0.02.
+    tokens = patches[:, 2:] / np.linalg.norm(patches[:, 2:], axis=1, keepdims=True)
+    np.testing.assert_allclose(found[:3], tokens[:3], atol=1e-6)  # the middle of two is the last
+    np.testing.assert_array_equal(found[3:], 0)
+
+
+def test_patches_that_are_all_alike_have_no_key_patch_and_no_nan() -> None:
+    params = start()
+    np.testing.assert_array_equal(key_features(params, jnp.ones((12, 48)), 3), 0)

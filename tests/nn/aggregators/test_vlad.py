@@ -1,0 +1,171 @@
+"""NetVLAD and AnyLoc against loops over patches and clusters, and the block that a facet is of."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig, hard_vlad
+from crisalad_jax.nn.aggregators.netvlad import NetVlad, NetVladConfig, from_centroids, netvlad
+from crisalad_jax.nn.backbones.base import FeatureRequest, Features
+from crisalad_jax.nn.backbones.vit import ViTConfig, vit
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.layers import Linear
+from crisalad_jax.nn.model import attend_across_images, self_mask
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import random_params
+
+PATCHES = np.random.default_rng(0).normal(size=(2, 9, 6)).astype(np.float32)
+CENTROIDS = np.random.default_rng(1).normal(size=(4, 6)).astype(np.float32)
+VIT = ViTConfig(dim=32, depth=3, heads=2, position_grid=3)
+MODEL = ModelConfig(
+    image_size=(42, 56),
+    backbone=VIT,
+    aggregator=NetVladConfig(clusters=3),
+    cross_image=CrossImageConfig(layers=0),
+)
+
+
+def unit(x: np.ndarray) -> np.ndarray:
+    return x / np.linalg.norm(x)
+
+
+def test_netvlad_is_the_papers_sum() -> None:
+    """Eq. 4, patch by patch and cluster by cluster, in float64."""
+    weight = np.random.default_rng(2).normal(size=(6, 4)).astype(np.float32)
+    params = NetVlad(Linear(jnp.asarray(weight), None), jnp.asarray(CENTROIDS))
+    found = netvlad(params, jnp.asarray(PATCHES))
+    for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
+        sums = np.zeros((4, 6))
+        for patch in map(unit, image):
+            exponentials = [np.exp(weight[:, k] @ patch) for k in range(4)]
+            for k in range(4):
+                sums[k] += exponentials[k] / sum(exponentials) * (patch - CENTROIDS[k])
+        # Sums of nine numbers around 1 in float32, divided by their length.
+        np.testing.assert_allclose(clusters, [unit(row) for row in sums], atol=1e-6)
+
+
+def test_hard_vlad_takes_the_nearest_word_alone() -> None:
+    """Jegou's VLAD by loops; a word that is nearest to nothing leaves zeros."""
+    words = np.concatenate([0.3 * CENTROIDS, np.full((1, 6), 9, np.float32)])
+    found = hard_vlad(jnp.asarray(words), jnp.asarray(PATCHES))
+    for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
+        sums = np.zeros((5, 6))
+        for patch in map(unit, image):
+            nearest = min(range(5), key=lambda k: np.linalg.norm(patch - words[k]))
+            sums[nearest] += patch - words[nearest]
+        assert not sums[4].any()
+        expected = [row if not row.any() else unit(row) for row in sums]
+        np.testing.assert_allclose(clusters, expected, atol=1e-6)
+
+
+def test_the_start_shares_a_patch_out_a_hundred_to_one() -> None:
+    """The mean logarithm of the largest share over the second largest; directions stay."""
+    features = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
+    params = from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    scores = features.astype(np.float64) @ np.asarray(params.conv.weight)
+    shares = np.exp(scores) / np.exp(scores).sum(axis=1, keepdims=True)
+    largest = np.sort(shares, axis=1)
+    ratio = np.exp(np.log(largest[:, -1] / largest[:, -2]).mean())
+    # Scores of some tens in float32, whose differences' mean is exponentiated.
+    np.testing.assert_allclose(ratio, 100, rtol=1e-4)
+    np.testing.assert_array_equal(params.centroids, CENTROIDS)
+    directions = np.asarray(params.conv.weight).T
+    lengths = np.linalg.norm(directions, axis=1)
+    np.testing.assert_allclose(lengths, lengths[0], rtol=1e-6)
+    np.testing.assert_allclose(
+        directions / lengths[:, None], [unit(row) for row in CENTROIDS], atol=1e-6
+    )
+
+
+def test_a_start_from_features_that_are_all_alike_is_refused() -> None:
+    features = jnp.tile(unit(PATCHES[0, 0]), (5, 1))
+    with pytest.raises(InputError, match="found 5 that are as near to two of 2 centroids"):
+        from_centroids(features[:2], features)
+
+
+def test_without_features_centroids_are_random_and_unit() -> None:
+    for config in (MODEL.aggregator, AnyLocConfig(clusters=3, layer=1)):
+        params = config.init(jax.random.key(0), VIT, MODEL.grid)
+        assert isinstance(params, NetVlad | AnyLoc)
+        centroids = params.centroids if isinstance(params, NetVlad) else params.words
+        assert centroids.shape == (3, 32)
+        np.testing.assert_allclose(np.linalg.norm(centroids, axis=1), 1, rtol=1e-6)
+
+
+def test_a_facet_looks_at_no_block_after_its_own() -> None:
+    """All of those after it NaN, and of its own what a facet does not need."""
+    params = random_params(MODEL).backbone
+    images = jax.random.normal(jax.random.key(1), (1, 42, 56, 3))
+    spoilt = jax.tree.map(lambda leaf: leaf.at[2:].set(jnp.nan), params.blocks)
+    beyond = dataclasses.replace(
+        spoilt, mlp=jax.tree.map(lambda x: x.at[1:].set(jnp.nan), spoilt.mlp)
+    )
+
+    @functools.partial(jax.jit, static_argnums=2)
+    def run(params: Any, images: jax.Array, name: Any) -> Features:
+        return vit(params, images, VIT, AnyLocConfig(layer=1, facet=name).features(VIT.depth))
+
+    assert AnyLocConfig(layer=1).features(3) == FeatureRequest((2,), "value", norm=False)
+    for name, blocks in (("value", beyond), ("token", spoilt)):
+        found = run(dataclasses.replace(params, blocks=blocks), images, name)
+        expected = run(params, images, name)
+        assert np.isfinite(expected.patches).all()
+        np.testing.assert_array_equal(found.patches, expected.patches)
+        np.testing.assert_array_equal(found.class_token, expected.class_token)
+
+
+def test_netvlads_tokens_fit_the_encoder() -> None:
+    """It has no global token, which the encoder's switch leaves on."""
+    config = dataclasses.replace(MODEL, cross_image=CrossImageConfig(heads=4, feedforward=8))
+    params = random_params(config)
+    local = jax.random.normal(jax.random.key(1), (2, 3, 32))
+    found = attend_across_images(
+        params, Tokens(jnp.zeros((2, 0)), local), config, mask=self_mask(2)
+    )
+    assert found.shape == (2, config.descriptor_dim) == (2, 96)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-6)
+
+
+def test_a_vocabulary_knows_its_backbone() -> None:
+    config = AnyLocConfig(clusters=2, layer=1)
+    backbone = random_params(MODEL).backbone
+    words = config.from_centroids(jnp.ones((2, 32)), jnp.ones((3, 32)))
+    assert words.backbone is None
+    config.check_backbone(words, backbone, "some.safetensors")  # it may be of any
+    digests = {None}
+    others = (
+        {"cls_token": backbone.cls_token.at[0].add(1e-6)},
+        {"pos_embed_cls": backbone.cls_token, "cls_token": backbone.pos_embed_cls},
+    )
+    for each in (backbone, *(dataclasses.replace(backbone, **change) for change in others)):
+        bound = config.bind(words, each)
+        np.testing.assert_array_equal(bound.words, words.words)
+        config.check_backbone(bound, each, "some.safetensors")
+        config.check_backbone(bound, jax.tree.map(np.asarray, each), "some.safetensors")
+        digests.add(bound.backbone)
+    assert len(digests) == 4
+    with pytest.raises(InputError, match=r"^some.safetensors: found a vocabulary of another back"):
+        config.check_backbone(bound, backbone, "some.safetensors")
+
+
+def test_a_files_metadata_keep_whose_vocabulary_it_is() -> None:
+    """Beside the arrays: no cast of these can spoil it."""
+    config, words = AnyLocConfig(clusters=2), AnyLoc(jnp.ones((2, 32)))
+    assert config.metadata(words) == {}
+    assert config.with_metadata(words, {}) == words
+    bound = config.bind(words, random_params(MODEL).backbone)
+    kept = config.metadata(bound)
+    assert kept == {"backbone": bound.backbone}
+    half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), bound)
+    assert half.backbone == bound.backbone
+    assert config.with_metadata(words, kept).backbone == bound.backbone
+    # Of any other method there is nothing to keep.
+    assert MODEL.aggregator.metadata(None) == {}
+    assert MODEL.aggregator.bind(words, None) is words

@@ -1,0 +1,165 @@
+"""The backbone's parts that no golden file reaches; the rest is in parity/test_goldens.py."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.base import FeatureRequest
+from crisalad_jax.nn.backbones.vit import (
+    SwiGlu,
+    ViTConfig,
+    embed,
+    feed_forward,
+    init_vit,
+    interpolate_positions,
+    run_blocks,
+    vit,
+)
+
+CONFIG = ViTConfig(dim=16, depth=3, heads=2, position_grid=5)
+
+
+def images(*size: int, seed: int = 0) -> jax.Array:
+    return jax.random.normal(jax.random.key(seed), (*size, 3))
+
+
+@pytest.mark.parametrize("grid", [(5, 5), (4, 6), (9, 3), (12, 12), (2, 2), (37, 41)])
+@pytest.mark.parametrize("registers", [0, 4])
+def test_positions_equal_torch_interpolate(grid: tuple[int, int], registers: int) -> None:
+    """DINOv2's call: scale factors with an offset of 0.1, or antialiased to a size."""
+    positions = jax.random.normal(jax.random.key(0), (5, 5, 8))
+    config = dataclasses.replace(CONFIG, registers=registers)
+    maps = torch.tensor(np.asarray(positions)).permute(2, 0, 1)[None]
+    if grid == (5, 5):
+        expected = maps
+    elif registers:
+        expected = torch.nn.functional.interpolate(maps, size=grid, mode="bicubic", antialias=True)
+    else:
+        scale = tuple((side + 0.1) / 5 for side in grid)
+        expected = torch.nn.functional.interpolate(maps, scale_factor=scale, mode="bicubic")
+    ours = interpolate_positions(positions, grid, config)
+    assert ours.shape == (*grid, 8)
+    # Torch forms its coordinates in float32, ours are float64: 41 x 6e-8 of position, slope of 3.
+    np.testing.assert_allclose(ours, expected[0].permute(1, 2, 0), atol=1e-5)
+
+
+def test_swiglu_equals_torch() -> None:
+    config = ViTConfig(dim=12, depth=1, heads=2, ffn="swiglu", position_grid=2)
+    assert config.hidden == 32  # two thirds of 48, a multiple of 8
+    params = jax.tree.map(lambda leaf: leaf[0], init_vit(jax.random.key(0), config).blocks)
+    assert isinstance(params.mlp, SwiGlu)
+    x = 10 * jax.random.normal(jax.random.key(1), (5, 12))
+    t = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf)), params.mlp)
+    both = torch.tensor(np.asarray(x)) @ t.w12.weight + t.w12.bias
+    gate, value = both.chunk(2, dim=-1)
+    expected = (torch.nn.functional.silu(gate) * value) @ t.w3.weight + t.w3.bias
+    np.testing.assert_allclose(feed_forward(params.mlp, x), expected, atol=1e-6)
+
+
+def test_the_published_hidden_width_of_vit_g() -> None:
+    """blocks.*.mlp.w3.weight of dinov2_vitg14 is (1536, 4096)."""
+    assert ViTConfig(dim=1536, depth=1, heads=24, ffn="swiglu").hidden == 4096
+
+
+def test_patches_are_read_in_row_order() -> None:
+    """One bright pixel changes only the patch it lies in."""
+    params = init_vit(jax.random.key(0), CONFIG)
+    dark = jnp.zeros((42, 56, 3))
+    lit = dark.at[15, 29, 1].set(1.0)  # second row of patches, third column
+    change = jnp.abs(embed(params, lit, CONFIG) - embed(params, dark, CONFIG)).max(axis=1)
+    assert set(np.flatnonzero(change)) == {1 + 4 + 2}
+    row = (15 - 14) * 14 * 3 + (29 - 28) * 3 + 1
+    np.testing.assert_allclose(
+        embed(params, lit, CONFIG)[7] - embed(params, dark, CONFIG)[7],
+        params.patch_embed.weight[row],
+        atol=1e-7,  # a difference of numbers of order 0.1 in float32
+    )
+
+
+def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
+    params = init_vit(jax.random.key(0), CONFIG)
+    parts = (
+        jax.tree.map(lambda leaf: leaf[:1], params.blocks),
+        jax.tree.map(lambda leaf: leaf[1:], params.blocks),
+    )
+    cut = dataclasses.replace(params, blocks=parts)
+    ours, theirs = vit(cut, images(1, 28, 42), CONFIG), vit(params, images(1, 28, 42), CONFIG)
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
+
+
+def test_an_untrained_adapter_leaves_the_backbone_unchanged() -> None:
+    params = init_vit(jax.random.key(0), CONFIG)
+    bare_blocks = dataclasses.replace(params.blocks, adapter=None)
+    bare = dataclasses.replace(params, blocks=bare_blocks)
+    config = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="none"))
+    for a, b in zip(
+        vit(params, images(1, 28, 42), CONFIG), vit(bare, images(1, 28, 42), config), strict=True
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
+    """x + ls2 * (MLP + alpha * adapter): tripling alpha triples the adapter's share."""
+    params = init_vit(jax.random.key(0), dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5))
+    up = jax.random.normal(jax.random.key(1), params.blocks.adapter.up.weight.shape)
+    blocks = dataclasses.replace(
+        params.blocks,
+        adapter=dataclasses.replace(
+            params.blocks.adapter, up=dataclasses.replace(params.blocks.adapter.up, weight=up)
+        ),
+    )
+    params = dataclasses.replace(params, blocks=blocks)
+    tokens = jax.random.normal(jax.random.key(2), (1, 1 + 6, 16))
+    out = [
+        run_blocks(
+            params, tokens, (2, 3), dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=alpha))
+        )
+        for alpha in (0.0, 0.2, 0.6)
+    ]
+    np.testing.assert_allclose(out[2] - out[0], 3 * (out[1] - out[0]), atol=1e-5)
+    doubled = dataclasses.replace(blocks, ls2=2 * blocks.ls2)
+    config = dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=0.2))
+    more = [
+        run_blocks(dataclasses.replace(params, blocks=doubled), tokens, (2, 3), c)
+        for c in (dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=0.0)), config)
+    ]
+    np.testing.assert_allclose(more[1] - more[0], 2 * (out[1] - out[0]), atol=1e-5)
+
+
+def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None:
+    config = dataclasses.replace(CONFIG, position_init="sincos", dim=64)
+    code = init_vit(jax.random.key(0), config).pos_embed.reshape(25, 64)
+    similarity = np.asarray(code @ code.T)
+    # sin^2 + cos^2 = 1 for each of 64 / 4 frequencies, of rows and of columns.
+    np.testing.assert_allclose(np.diag(similarity), 32, rtol=1e-5)
+    assert (similarity[0, 1:] < 31.9).all()
+    assert similarity[0, 1] > similarity[0, 2] > similarity[0, 3]
+
+
+@pytest.mark.parametrize("depths", [(1, 2, 3), (2, 3), (3,)])
+def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, ...]) -> None:
+    params = init_vit(jax.random.key(0), CONFIG)
+    expected = [
+        vit(
+            dataclasses.replace(params, blocks=jax.tree.map(lambda x, d=d: x[:d], params.blocks)),
+            images(1, 28, 42),
+            CONFIG,
+        )
+        for d in depths
+    ]
+    two = tuple(
+        jax.tree.map(lambda leaf, s=s: leaf[s], params.blocks) for s in (slice(2), slice(2, 3))
+    )
+    for blocks in (params.blocks, two):  # as it stands, and as training cuts it
+        whole = dataclasses.replace(params, blocks=blocks)
+        found = vit(whole, images(1, 28, 42), CONFIG, FeatureRequest(depths))
+        # The same sums, compiled twice.
+        np.testing.assert_allclose(found.class_token, expected[-1].class_token, atol=1e-6)
+        patches = np.concatenate([features.patches for features in expected], axis=-1)
+        np.testing.assert_allclose(found.patches, patches, atol=1e-6)

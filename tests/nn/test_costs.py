@@ -1,0 +1,318 @@
+"""Costs against the paper's Table 3, counts by hand, and a second count of the program.
+
+`part_costs` counts in the program itself; here are the formulas.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import GemConfig
+from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.costs import adapter_macs, count_macs, paper_adapter_macs, part_costs
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import describe, parameter_shapes, self_mask
+from crisalad_jax.sinkhorn import SinkhornConfig
+
+
+def with_adapter(kind: str) -> ModelConfig:
+    backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=AdapterConfig(kind=kind))
+    return dataclasses.replace(PRESETS["b14"], backbone=backbone)
+
+
+def test_table_3() -> None:
+    assert paper_adapter_macs(PRESETS["b14"]) == 39_223_296
+    costs = {cost.part: cost for cost in part_costs(PRESETS["b14"])}
+    assert costs["adapters"].parameters == 12 * 741_504
+    assert paper_adapter_macs(with_adapter("multi-resolution")) == 44_236_800
+
+
+def test_one_adapter_by_hand() -> None:
+    """257 tokens down and up, 256 patches through 9 taps and a 384 x 384 product."""
+    by_hand = 257 * 768 * 384 * 2 + 256 * (9 * 384 + 384 * 384)
+    assert adapter_macs(PRESETS["b14"]) == by_hand == 190_218_240
+
+
+def test_the_other_adapters_by_hand() -> None:
+    """CricaVPR's branches: 384 -> 192, and twice 384 -> 24 and then 3 x 3 or 5 x 5 to 96."""
+    linears = 257 * 768 * 384 * 2
+    branches = 384 * 192 + 2 * 384 * 24 + (9 + 25) * 24 * 96
+    assert adapter_macs(with_adapter("multi-resolution")) == linears + 256 * branches
+    assert adapter_macs(with_adapter("mlp")) == linears
+
+
+def test_parameters_of_the_public_backbone() -> None:
+    """dinov2_vitb14's checkpoint holds 86,580,480 numbers, of them 768 of a mask token."""
+    costs = {cost.part: cost.parameters for cost in part_costs(PRESETS["b14"])}
+    assert costs["backbone blocks"] + costs["backbone embedding, norm"] == 86_580_480 - 768
+
+
+def _products(jaxpr: Any, times: int = 1) -> int:
+    """Multiply-accumulates of every dot_general, scans multiplied out."""
+    total = 0
+    for equation in jaxpr.eqns:
+        inner = (
+            times * equation.params.get("length", 1) if equation.primitive.name == "scan" else times
+        )
+        for value in equation.params.values():
+            if hasattr(value, "jaxpr"):
+                total += _products(value.jaxpr, inner)
+            elif hasattr(value, "eqns"):
+                total += _products(value, inner)
+        if equation.primitive.name == "dot_general":
+            (contracted, _), _ = equation.params["dimension_numbers"]
+            left = equation.invars[0].aval.shape
+            out = equation.outvars[0].aval.shape
+            total += times * math.prod(out) * math.prod(left[i] for i in contracted)
+    return total
+
+
+ROWS, COLUMNS, DIM = 6, 9, 32
+PATCHES = ROWS * COLUMNS
+SMALL = ModelConfig(
+    image_size=(14 * ROWS, 14 * COLUMNS),
+    backbone=ViTConfig(dim=DIM, depth=3, heads=2, position_grid=4),
+    aggregator=dataclasses.replace(PRESETS["tiny"].aggregator, clusters=8),
+    cross_image=CrossImageConfig(heads=2, feedforward=24),
+)
+PLAIN = dataclasses.replace(
+    SMALL,
+    backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="none")),
+    cross_image=CrossImageConfig(layers=0),
+)
+
+
+def salad_by_hand(transport: int = 3 * 2 * PATCHES * 8) -> int:
+    """Its three networks, the sums of patches, and two products an iteration of the transport.
+
+    The dustbin's column is summed by itself: no product.
+    """
+    hidden = 128
+    networks = DIM * hidden + hidden * 64 + PATCHES * (2 * DIM * hidden + hidden * (32 + 8))
+    return networks + PATCHES * 8 * 32 + transport
+
+
+def boq_by_hand() -> int:
+    """Of channels 128, 7 queries, 5 rows and 2 blocks; the queries' own look is made once."""
+    width, queries = 128, 7
+    layer = PATCHES * 4 * width**2 + 2 * PATCHES**2 * width + PATCHES * 2 * width * 4 * width
+    asking = PATCHES * 2 * width**2 + 2 * queries * PATCHES * width + queries * width**2
+    return PATCHES * 9 * DIM * width + 2 * (layer + asking) + 5 * 2 * queries * width
+
+
+def mixvpr_by_hand() -> int:
+    """Of channels 20, 3 rows and 3 mixers."""
+    return 3 * 2 * DIM * PATCHES**2 + PATCHES * DIM * 20 + 20 * PATCHES * 3
+
+
+AGGREGATORS: dict[str, tuple[Any, int]] = {
+    "salad": (SMALL.aggregator, salad_by_hand()),
+    "salad, 10 iterations": (
+        dataclasses.replace(SMALL.aggregator, sinkhorn=SinkhornConfig(iterations=10)),
+        salad_by_hand(10 * 2 * PATCHES * 8),
+    ),
+    # Sums of exponentials are no products.
+    "salad, log": (
+        dataclasses.replace(SMALL.aggregator, sinkhorn=SinkhornConfig(domain="log")),
+        salad_by_hand(0),
+    ),
+    # A score more of each patch.
+    "salad, token": (
+        dataclasses.replace(SMALL.aggregator, dustbin="token"),
+        salad_by_hand() + PATCHES * 128,
+    ),
+    # A row more of the transport.
+    "salad, row and column": (
+        dataclasses.replace(SMALL.aggregator, dustbin="row and column"),
+        salad_by_hand(3 * 2 * (PATCHES + 1) * 8),
+    ),
+    # No column is a dustbin; the last is kept apart all the same.
+    "salad, none": (
+        dataclasses.replace(SMALL.aggregator, dustbin="none"),
+        salad_by_hand(3 * 2 * PATCHES * 7),
+    ),
+    "gem": (GemConfig(), 0),
+    "gem-pyramid": (GemPyramidConfig(), 0),
+    "class-token": (ClassTokenConfig(), 0),
+    "conv-ap": (ConvApConfig(channels=20, side=3), 9 * DIM * 20),
+    "cosplace": (CosPlaceConfig(dim=20), DIM * 20),
+    "mixvpr": (MixVprConfig(channels=20, rows=3, depth=3), mixvpr_by_hand()),
+    "boq": (BoqConfig(channels=128, queries=7, rows=5), boq_by_hand()),
+    # Scores, and sums by them.
+    "netvlad": (NetVladConfig(clusters=5), 2 * PATCHES * DIM * 5),
+    "anyloc": (AnyLocConfig(clusters=7, layer=-1), 2 * PATCHES * DIM * 7),
+    # Three levels score each patch three times, and are summed up once; then a linear layer.
+    "transvpr": (
+        TransVprConfig(levels=3, dim=24),
+        PATCHES * 3 * DIM * 3 + PATCHES * 3 * DIM + 3 * DIM * 24,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", AGGREGATORS)
+def test_an_aggregator_by_hand(name: str) -> None:
+    part, by_hand = AGGREGATORS[name]
+    config = dataclasses.replace(PLAIN, aggregator=part)
+    costs = {cost.part: cost.macs for cost in part_costs(config)}
+    assert costs["aggregator"] == by_hand
+
+
+@pytest.mark.parametrize("ffn", ["mlp", "swiglu"])
+@pytest.mark.parametrize("registers", [0, 4])
+def test_the_backbone_by_hand(ffn: Any, registers: int) -> None:
+    """Three blocks of attention and network over all tokens; the embedding over the patches."""
+    backbone = dataclasses.replace(SMALL.backbone, ffn=ffn, registers=registers)
+    costs = {x.part: x.macs for x in part_costs(dataclasses.replace(SMALL, backbone=backbone))}
+    tokens = 1 + registers + PATCHES
+    # Two thirds of 128, up to a multiple of 8, are 88: gates and values, and one product back.
+    network = {"mlp": 2 * 128, "swiglu": 3 * 88}[ffn]
+    attention = tokens * 4 * DIM**2 + 2 * tokens**2 * DIM
+    assert costs["backbone blocks"] == 3 * (attention + tokens * DIM * network)
+    assert costs["backbone embedding, norm"] == PATCHES * 3 * 14**2 * DIM
+    narrow = DIM // 2
+    adapter = tokens * 2 * DIM * narrow + PATCHES * (9 * narrow + narrow**2)
+    assert costs["adapters"] == 3 * adapter
+
+
+@pytest.mark.parametrize("images", [1, 5])
+@pytest.mark.parametrize("global_token", [True, False])
+def test_the_encoder_by_hand(images: int, global_token: bool) -> None:
+    """Each of an image's 8 tokens of 32 numbers, and 2 of the global one's 64, sees `images`."""
+    across = dataclasses.replace(SMALL.cross_image, global_token=global_token)
+    config = dataclasses.replace(SMALL, cross_image=across)
+    costs = {cost.part: cost.macs for cost in part_costs(config, images=images)}
+    tokens = 8 + 2 * global_token
+    by_hand = 2 * tokens * (4 * 32**2 + 2 * images * 32 + 2 * 32 * 24)
+    assert costs["cross-image encoder"] == by_hand
+    assert {x.part: x.macs for x in part_costs(PLAIN)}["cross-image encoder"] == 0
+
+
+def test_b14_by_hand() -> None:
+    """The paper's model: 256 patches, 64 clusters, and their 66 tokens in the encoder."""
+    costs = {cost.part: cost.macs for cost in part_costs(PRESETS["b14"])}
+    attention = 257 * 4 * 768**2 + 2 * 257**2 * 768
+    assert costs["backbone blocks"] == 12 * (attention + 257 * 2 * 768 * 3072)
+    assert costs["adapters"] == 12 * 190_218_240
+    assert costs["backbone embedding, norm"] == 256 * 588 * 768
+    networks = 768 * 512 + 512 * 256 + 256 * (2 * 768 * 512 + 512 * (128 + 64))
+    assert costs["aggregator"] == networks + 256 * 64 * 128 + 3 * 2 * 256 * 64
+    assert costs["cross-image encoder"] == 2 * 66 * (4 * 128**2 + 2 * 128 + 2 * 128 * 2048)
+
+
+def test_parameters_are_counted_by_part() -> None:
+    shapes = parameter_shapes(SMALL)
+    total = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))
+    assert sum(cost.parameters for cost in part_costs(SMALL)) == total
+    counts = {cost.part: cost.parameters for cost in part_costs(SMALL)}
+    # Without a bias, but the two convolutions'.
+    assert counts["adapters"] == 3 * (2 * 32 * 16 + 9 * 16 + 16 + 16 * 16 + 16)
+    assert counts["aggregator"] == sum(x.size for x in jax.tree.leaves(shapes.aggregator))
+    assert [cost.part for cost in part_costs(PLAIN)] == [
+        *("backbone embedding, norm", "backbone blocks", "adapters", "aggregator"),
+        "cross-image encoder",
+    ]
+
+
+def test_what_a_program_counts() -> None:
+    """Products, convolutions, so many times a scan; of a choice the cheaper way; no sums."""
+    x, y = jnp.zeros((2, 3)), jnp.zeros((3, 4))
+    assert count_macs(jnp.matmul, x, y) == 24
+    assert count_macs(lambda x, y: (x @ y).sum() + x.sum(), x, y) == 24
+    assert count_macs(jax.jit(lambda x, y: jax.vmap(jnp.vdot, (None, 1))(x[0], y)), x, y) == 12
+
+    def scanned(x: Any, y: Any) -> Any:
+        return jax.lax.scan(lambda carry, _: (carry, carry @ y), x, length=5)[1]
+
+    assert count_macs(scanned, x, y) == 5 * 24
+    assert count_macs(jax.checkpoint(scanned), x, y) == 5 * 24
+
+    def twice(x: Any, y: Any) -> Any:
+        return x @ y + (2 * x) @ y
+
+    def chosen(way: Any, x: Any, y: Any) -> Any:
+        return jax.lax.cond(way, jnp.matmul, twice, x, y)
+
+    assert count_macs(twice, x, y) == 48
+    assert count_macs(chosen, True, x, y) == 24
+    image, kernel = jnp.zeros((1, 5, 6, 3)), jnp.zeros((3, 3, 3, 7))
+
+    def convolved(image: Any, kernel: Any) -> Any:
+        names = ("NHWC", "HWIO", "NHWC")
+        return jax.lax.conv_general_dilated(image, kernel, (1, 1), "SAME", dimension_numbers=names)
+
+    assert count_macs(convolved, image, kernel) == 5 * 6 * 9 * 3 * 7
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SMALL,
+        dataclasses.replace(
+            SMALL,
+            backbone=dataclasses.replace(
+                SMALL.backbone, ffn="swiglu", registers=4, adapter=AdapterConfig(kind="none")
+            ),
+            cross_image=CrossImageConfig(layers=0),
+        ),
+        dataclasses.replace(
+            SMALL,
+            aggregator=GemPyramidConfig(),
+            backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="mlp")),
+        ),
+        dataclasses.replace(PLAIN, aggregator=NetVladConfig()),
+        dataclasses.replace(PLAIN, aggregator=AnyLocConfig(7, -1, "value")),
+        dataclasses.replace(PLAIN, aggregator=AnyLocConfig(7, 1, "token")),
+        dataclasses.replace(PLAIN, aggregator=TransVprConfig(levels=3, dim=24)),
+        *(
+            dataclasses.replace(PLAIN, aggregator=AGGREGATORS[name][0])
+            for name in ("gem", "conv-ap", "cosplace", "mixvpr", "boq")
+        ),
+    ],
+    ids=[
+        *("adapters, encoder", "swiglu, registers, neither", "pyramid, mlp"),
+        *("netvlad", "anyloc, values", "anyloc, tokens", "transvpr"),
+        *("gem", "conv-ap", "cosplace", "mixvpr", "boq"),
+    ],
+)
+def test_count_equals_the_programs_products(config: ModelConfig) -> None:
+    images = 3
+    params = parameter_shapes(config)
+    pixels = jax.ShapeDtypeStruct((images, *config.image_size, 3), jnp.float32)
+    program = jax.make_jaxpr(lambda p, x: describe(p, x, config, mask=self_mask(images)))(
+        params, pixels
+    )
+    # Branches apart, which have no products.
+    counted = _products(program.jaxpr)
+    # Position interpolation is products too, once a batch; depthwise taps are not dot_generals.
+    rows, columns = (side // 14 for side in config.image_size)
+    grid, dim = config.backbone.position_grid, config.backbone.dim
+    orders = {
+        columns * grid * grid * dim + rows * grid * columns * dim,
+        rows * grid * grid * dim + rows * grid * columns * dim,
+    }
+    taps = 0
+    if config.backbone.adapter.kind == "depthwise":
+        taps = config.backbone.depth * rows * columns * 9 * config.backbone.adapter_dim
+    once = convolution = 0
+    if isinstance(config.aggregator, BoqConfig):
+        # Of each block's 7 queries: inputs and outputs, scores and sums, and questions. Like
+        # positions they do not depend on the image. And the 3 x 3 convolution is no dot_general.
+        once = 2 * (5 * 7 * 128**2 + 2 * 7**2 * 128)
+        convolution = rows * columns * 9 * dim * 128
+    each = sum(cost.macs for cost in part_costs(config, images=images))
+    assert counted - once - images * (each - taps - convolution) in orders

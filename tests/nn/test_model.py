@@ -1,0 +1,298 @@
+"""The whole model: shapes, unit norm, what a descriptor depends on, precision, errors."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.vit import vit
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import (
+    attend_across_images,
+    describe,
+    extract_tokens,
+    init_crisalad,
+    parameter_shapes,
+    self_mask,
+    transport_masses,
+    valid_mask,
+)
+from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.utils import compiler
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import MODEL as CONFIG
+from tests.conftest import random_params
+
+# Descriptors have entries of order 0.1; float32 sums compiled for another batch size differ by
+# some units in the last place after a few layers.
+TOLERANCE = 2e-6
+
+
+@pytest.fixture(scope="module")
+def params():
+    """With LayerNorms off their start, so that no symmetry hides an error."""
+    params = init_crisalad(jax.random.key(0), CONFIG)
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [
+        leaf + 0.05 * jax.random.normal(key, leaf.shape)
+        for leaf, key in zip(leaves, keys, strict=True)
+    ]
+    return jax.tree.unflatten(structure, noisy)
+
+
+def pictures(count: int, seed: int = 0) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    return generator.integers(0, 256, (count, 42, 56, 3), dtype=np.uint8)
+
+
+def test_batches_of_batches_are_described_by_vmap(params) -> None:
+    batches = np.stack([pictures(3), pictures(3, 1)])
+    together = jax.vmap(lambda images: describe(params, images, CONFIG))(batches)
+    for found, images in zip(together, batches, strict=True):
+        np.testing.assert_allclose(found, describe(params, images, CONFIG), atol=TOLERANCE)
+
+
+def test_second_derivatives_are_those_of_differences() -> None:
+    """Of a mean that pixels are scaled by; forward mode is refused, as the docstring says."""
+    with jax.enable_x64(True):
+        config = dataclasses.replace(CONFIG, compute_dtype="float64")
+        params = random_params(config)
+        images = np.random.default_rng(0).normal(size=(2, 42, 56, 3))
+
+        def score(scale: jax.Array) -> jax.Array:
+            return describe(params, scale * images, config)[0, :8].sum()
+
+        slope = jax.jit(jax.grad(score))
+        second = jax.jit(jax.jacrev(jax.grad(score)))(1.0)
+        # Central differences of 1e-4 miss by 1e-8 of the third derivative, which is of order 1.
+        numeric = (slope(1 + 1e-4) - slope(1 - 1e-4)) / 2e-4
+        assert abs(second) > 1e-4
+        np.testing.assert_allclose(second, numeric, rtol=1e-5, atol=1e-7)
+        with pytest.raises(TypeError, match="forward-mode"):
+            jax.jvp(score, (1.0,), (1.0,))
+
+
+def test_descriptors_are_unit_vectors(params) -> None:
+    descriptors = describe(params, pictures(4), CONFIG)
+    assert descriptors.shape == (4, 16 + 4 * 8)
+    np.testing.assert_allclose(jnp.linalg.norm(descriptors, axis=1), 1, atol=1e-6)
+
+
+def test_the_papers_descriptor_has_8448_numbers() -> None:
+    config = PRESETS["b14"]
+    params = parameter_shapes(config)
+    images = jax.ShapeDtypeStruct((2, 224, 224, 3), jnp.uint8)
+    assert jax.eval_shape(lambda p, x: describe(p, x, config), params, images).shape == (2, 8448)
+    assert config.descriptor_dim == 8448
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="how much memory a CPU's program takes")
+def test_memory_is_what_attention_needs_at_once() -> None:
+    """Scores; queries, keys and values as made; the first two as multiplied; the tokens.
+
+    The feed-forward network needs no more: GELU is written over what it reads. Nor do copies of the
+    weights: each is made when it is needed.
+    """
+    known = compiler.compiler_options("Eigen", least_memory=True)
+    if not known.keys() >= compiler._LEAST_MEMORY.keys():
+        pytest.skip("this jaxlib orders operations in its own way")
+    config = PRESETS["s14"]
+    params = parameter_shapes(config)
+    images = jax.ShapeDtypeStruct((8, 224, 224, 3), jnp.uint8)
+    memory = describe.lower(params, images, config).compile().memory_analysis()
+    scores, tokens = 8 * 6 * 257 * 257, 8 * 257 * 384
+    needed = 4 * (scores + (3 + 2 + 1) * tokens)
+    # A hundredth for the small arrays.
+    assert memory.temp_size_in_bytes <= 1.01 * needed
+
+
+@pytest.mark.parametrize("preset", ["s14", "l14", "g14"])
+def test_every_preset_composes(preset: str) -> None:
+    config = PRESETS[preset]
+    params = parameter_shapes(config)
+    images = jax.ShapeDtypeStruct((1, 224, 308, 3), jnp.uint8)
+    assert jax.eval_shape(lambda p, x: describe(p, x, config), params, images).shape == (1, 8448)
+
+
+@pytest.mark.parametrize(
+    ("aggregator", "kind", "layers", "width"),
+    [
+        ("gem-pyramid", "multi-resolution", 2, 14 * 768),  # CricaVPR
+        ("salad", "none", 0, 8448),  # DINO-SALAD
+        ("class-token", "none", 0, 768),  # DINOv2
+        ("class-token", "mlp", 1, 768),
+    ],
+)
+def test_the_other_models_compose(aggregator: str, kind: str, layers: int, width: int) -> None:
+    config = dataclasses.replace(
+        PRESETS["b14"],
+        aggregator=aggregator,
+        backbone=dataclasses.replace(PRESETS["b14"].backbone, adapter=AdapterConfig(kind=kind)),
+        cross_image=CrossImageConfig(layers=layers),
+    )
+    params = parameter_shapes(config)
+    images = jax.ShapeDtypeStruct((2, 322, 308, 3), jnp.uint8)
+    found = jax.eval_shape(lambda p, x: describe(p, x, config), params, images)
+    assert (found.shape, found.dtype) == ((2, width), jnp.float32)
+    assert config.descriptor_dim == width
+
+
+def test_padding_images_change_nothing(params) -> None:
+    images = pictures(3)
+    bare = describe(params, images, CONFIG)
+    padded = np.concatenate([images, pictures(5, seed=1)])
+    mask = valid_mask(jnp.arange(8) < 3)
+    np.testing.assert_allclose(
+        describe(params, padded, CONFIG, mask=mask)[:3], bare, atol=TOLERANCE
+    )
+    # Without the mask the five others are looked at, so the test above can fail.
+    assert np.abs(describe(params, padded, CONFIG)[:3] - bare).max() > 100 * TOLERANCE
+
+
+def test_any_order_of_the_batch_gives_the_same_descriptors(params) -> None:
+    images, order = pictures(5), np.array([3, 1, 4, 0, 2])
+    permuted = describe(params, images[order], CONFIG)
+    np.testing.assert_allclose(permuted, describe(params, images, CONFIG)[order], atol=TOLERANCE)
+
+
+def test_alone_is_a_batch_of_one(params) -> None:
+    images = pictures(4)
+    together = describe(params, images, CONFIG, mask=self_mask(4))
+    one_by_one = np.concatenate([describe(params, images[i : i + 1], CONFIG) for i in range(4)])
+    np.testing.assert_allclose(together, one_by_one, atol=TOLERANCE)
+    assert np.abs(describe(params, images, CONFIG) - together).max() > 100 * TOLERANCE
+
+
+def test_without_encoder_no_image_matters_to_another() -> None:
+    config = dataclasses.replace(CONFIG, cross_image=CrossImageConfig(layers=0))
+    bare = init_crisalad(jax.random.key(0), config)
+    assert bare.cross_image is None
+    images = pictures(4)
+    np.testing.assert_allclose(
+        describe(bare, images, config),
+        describe(bare, images, config, mask=self_mask(4)),
+        atol=TOLERANCE,
+    )
+
+
+def test_describe_is_attention_across_images_after_their_tokens(params) -> None:
+    images, mask = pictures(3), valid_mask(jnp.array([True, True, False]))
+    tokens = extract_tokens(params, images, CONFIG)
+    np.testing.assert_allclose(
+        attend_across_images(params, tokens, CONFIG, mask=mask),
+        describe(params, images, CONFIG, mask=mask),
+        atol=TOLERANCE,
+    )
+
+
+def test_bytes_are_normalised_and_floats_are_taken_as_they_are(params) -> None:
+    images = jnp.asarray(pictures(2))
+    floats = jax.vmap(lambda image: normalise(image, "imagenet"))(images)
+    np.testing.assert_allclose(
+        describe(params, floats, CONFIG), describe(params, images, CONFIG), atol=TOLERANCE
+    )
+
+
+def test_other_sides_than_the_configs_work(params) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (2, 84, 28, 3), dtype=np.uint8)
+    descriptors = describe(params, images, CONFIG)
+    np.testing.assert_allclose(jnp.linalg.norm(descriptors, axis=1), 1, atol=1e-6)
+
+
+def test_bfloat16_stays_close(params) -> None:
+    config = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
+    half, full = (describe(params, pictures(4), c) for c in (config, CONFIG))
+    assert half.dtype == jnp.float32
+    cosine = (half * full).sum(axis=1)
+    # 8 bits of mantissa through 4 layers: each rounding turns a vector by at most 2^-9.
+    assert cosine.min() > 0.999
+    assert np.abs(half - full).max() > 1e-5  # it did compute in bfloat16
+
+
+def test_dropout_is_drawn_from_the_key(params) -> None:
+    plain, first, again, other = (
+        describe(params, pictures(3), CONFIG, key=key)
+        for key in (None, jax.random.key(1), jax.random.key(1), jax.random.key(2))
+    )
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-3
+    assert np.abs(first - plain).max() > 1e-3
+
+
+def test_same_seed_same_parameters() -> None:
+    a, b, c = (named_leaves(init_crisalad(jax.random.key(seed), CONFIG)) for seed in (0, 0, 1))
+    assert all(jnp.array_equal(a[name], b[name]) for name in a)
+    weights = [
+        name for name in a if name.endswith(".weight") and "norm" not in name and ".up." not in name
+    ]
+    assert weights
+    assert all(not jnp.array_equal(a[name], c[name]) for name in weights)
+
+
+def test_names_read_like_torchs() -> None:
+    names = named_leaves(parameter_shapes(CONFIG))
+    assert names["backbone.blocks.attn.qkv.weight"].shape == (2, 32, 96)
+    assert names["backbone.blocks.mlp.fc1.bias"].shape == (2, 128)
+    assert names["aggregator.score.fc2.weight"].shape == (16, 4)
+    assert names["cross_image.layers.1.linear2.weight"].shape == (16, 8)
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((1, 43, 56, 3), "found 43 x 56, expected sides that are multiples of 14"),
+        ((1, 28, 28, 3), "found 28 x 28, which is 4 patches for 4 clusters.*42 x 42"),
+        ((1, 42, 56, 4), "expected \\(image, height, width, 3\\)"),
+        ((42, 56, 3), "expected \\(image, height, width, 3\\)"),
+    ],
+)
+def test_images_that_do_not_fit_raise_while_tracing(params, shape, message: str) -> None:
+    images = jax.ShapeDtypeStruct(shape, jnp.uint8)
+    with pytest.raises(InputError, match=message):
+        jax.eval_shape(lambda p, x: describe(p, x, CONFIG), params, images)
+
+
+def test_transport_masses_by_scaling_a_matrix_in_float64(params):
+    """Sinkhorn's algorithm as it is usually written: columns, then rows, three times."""
+    images = pictures(2)
+    pixels = jax.vmap(lambda image: normalise(image, "imagenet"))(images)
+    patches = np.asarray(vit(params.backbone, pixels, CONFIG.backbone).patches, np.float64)
+    network = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params.aggregator.score)
+    hidden = np.maximum(patches @ network.fc1.weight + network.fc1.bias, 0)
+    scores = hidden @ network.fc2.weight + network.fc2.bias
+    dustbin = np.full((*scores.shape[:-1], 1), float(params.aggregator.dust_bin))
+    kernel = np.exp(np.concatenate([scores, dustbin], axis=-1))
+    patch_count, clusters = scores.shape[1:]
+    wanted = np.append(np.ones(clusters), patch_count - clusters)
+    rows = np.ones((2, patch_count))
+    for _ in range(CONFIG.aggregator.sinkhorn.iterations):
+        columns = wanted / np.einsum("bn,bnm->bm", rows, kernel)
+        rows = 1 / np.einsum("bnm,bm->bn", kernel, columns)
+    expected = rows[..., None] * kernel * columns[:, None]
+
+    found = transport_masses(params, images, CONFIG)
+    # Float32 against float64, features of order 1 after two blocks.
+    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-6)
+    # What the dustbin takes and what is kept make the patch's mass.
+    np.testing.assert_allclose(found.sum(axis=-1), 1, rtol=1e-5)
+
+
+def test_a_model_without_salad_transports_nothing(params):
+    config = dataclasses.replace(
+        CONFIG,
+        aggregator="class-token",
+        cross_image=dataclasses.replace(CONFIG.cross_image, layers=0),
+    )
+    bare = dataclasses.replace(params, aggregator=None, cross_image=None)
+    with pytest.raises(
+        InputError, match=r"^aggregator: found class-token, expected one that transp"
+    ):
+        transport_masses(bare, pictures(2), config)

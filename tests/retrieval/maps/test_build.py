@@ -1,0 +1,163 @@
+"""Images into maps: each described alone, in any portions the same."""
+
+import pathlib
+import shutil
+
+import numpy as np
+import pytest
+
+import crisalad_jax.retrieval.maps.build
+from crisalad_jax.data.images import list_images
+from crisalad_jax.data.positions import Positions, utm_positions
+from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.maps.build import Indexed, describe_alone, index_images
+from crisalad_jax.retrieval.maps.manifest import describe_map
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import BATCH, MODEL
+
+
+@pytest.fixture
+def database(town) -> pathlib.Path:
+    return town / "images" / "test" / "database"
+
+
+def index(folder: pathlib.Path, params, images: pathlib.Path, paths=None, **more) -> Indexed:
+    description = describe_map(params, MODEL, folder / "weights", folder)
+    with open_or_new(folder, description) as target:
+        paths = list_images(images) if paths is None else paths
+        where = utm_positions([path.name for path in paths])
+        return index_images(
+            target,
+            params,
+            images,
+            paths,
+            positions=where,
+            **({"batch_size": BATCH, "quiet": True} | more),
+        )
+
+
+def open_or_new(folder: pathlib.Path, description):
+    if (folder / "map.json").exists():
+        with Map.open(folder) as found:
+            description = found.description
+    return open_for_appending(folder, description)
+
+
+def descriptors_of(target: Map) -> np.ndarray:
+    return np.concatenate(list(target.descriptors))
+
+
+def test_each_image_is_described_alone(params, database):
+    paths = list_images(database)
+    assert len(paths) % BATCH
+    parts = list(describe_alone(params, MODEL, paths, batch_size=BATCH))
+    assert [part.indices.tolist() for part in parts] == [[0, 1, 2, 3], [4, 5, 6]]
+    found = np.concatenate([part.descriptors for part in parts])
+    # Which test_evaluation compares with batches of one.
+    tokens = read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True)
+    expected = group(params, MODEL, tokens, "single", batch_size=BATCH)
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("segment", [1, 256])
+def test_appended_in_portions_or_at_once_the_bits_are_the_same(
+    params, database, tmp_path, monkeypatch, segment
+):
+    monkeypatch.setattr(crisalad_jax.retrieval.maps.build, "SEGMENT", segment)
+    paths = list_images(database)
+    whole = index(tmp_path / "whole", params, database)
+    assert whole[:5] == (7, 0, 7, 0, [])
+    for stop in (3, 4, 7):
+        portion = index(tmp_path / "parts", params, database, paths[:stop])
+    assert portion[:5] == (3, 4, 3, 4, [])
+    segments = {1: 2, 256: 1}[segment]
+    assert len(list((tmp_path / "whole" / "segments").glob("*.npy"))) == segments
+    with Map.open(tmp_path / "whole") as one, Map.open(tmp_path / "parts") as other:
+        np.testing.assert_array_equal(descriptors_of(one), descriptors_of(other))
+        assert one.images == other.images
+        assert [image.name for image in one.images] == [path.name for path in paths]
+        assert [image.position for image in one.images[:2]] == [(0.0, 5e6), (40.0, 5e6)]
+
+
+def test_an_unreadable_image_ends_it_or_is_left_out(params, database, tmp_path):
+    paths = list_images(database)
+    paths[5].write_bytes(b"no image")
+    with pytest.raises(InputError, match=f"{paths[5].name}: found 8 bytes that do not decode"):
+        index(tmp_path / "stopped", params, database)
+    result = index(tmp_path / "map", params, database, on_bad_image="skip")
+    assert result[:5] == (6, 0, 6, 0, [paths[5].name])
+    with Map.open(tmp_path / "map") as found:
+        assert len(found) == 6
+        assert found.image(paths[5].name) is None
+    assert index(tmp_path / "map", params, database, on_bad_image="skip").there == 6
+
+
+def test_another_picture_by_the_same_name_is_refused_before_any_work(params, database, tmp_path):
+    index(tmp_path / "map", params, database)
+    moved = tmp_path / "moved"
+    shutil.copytree(database, moved)
+    assert index(tmp_path / "map", params, moved).there == 7
+    changed = list_images(moved)[3]
+    changed.write_bytes(changed.read_bytes() + b"more")
+    with pytest.raises(InputError, match=rf"{changed.name}: found \d+ bytes, but the map has"):
+        index(tmp_path / "map", params, moved)
+
+
+# Whole folders
+
+
+def index_folder(folder: pathlib.Path, params, images: pathlib.Path, **options) -> Indexed:
+    """`index` as Python users call it."""
+    options = {"weights": "w.safetensors", "batch_size": BATCH, "quiet": True} | options
+    return crisalad_jax.retrieval.maps.build.index(params, MODEL, images, folder, **options)
+
+
+def test_a_folder_is_indexed_and_its_map_keeps_its_settings(params, database, tmp_path):
+    """At another size than the model's, which the second call takes from the map."""
+    folder, size = tmp_path / "map", (56, 56)
+    paths = list_images(database)
+    hidden = paths[-1].rename(tmp_path / paths[-1].name)
+    first = index_folder(folder, params, database, image_size=size, dtype="float16")
+    assert first[:5] == (6, 0, 6, 0, [])
+    hidden.rename(paths[-1])
+    second = index_folder(folder, params, database)
+    assert (second.added, second.there, second.images) == (1, 6, 7)
+    description = second.description
+    assert (description.config.image_size, description.dtype) == (size, "float16")
+    assert (description.weights, description.store) == (
+        str(pathlib.Path.cwd() / "w.safetensors"),
+        "files",
+    )
+    for options, words in (
+        (
+            {"image_size": (42, 56)},
+            r"found image size \(42, 56\), expected \(56, 56\) as in the map",
+        ),
+        ({"compute_dtype": "bfloat16"}, "found compute dtype bfloat16, expected float32"),
+        ({"dtype": "float32"}, "found dtype float32, expected float16"),
+        ({"store": "redis"}, "store: found 'redis', expected files or milvus:URI"),
+    ):
+        with pytest.raises(InputError, match=words):
+            index_folder(folder, params, database, **options)
+
+
+def test_positions_given_in_python(params, database, tmp_path):
+    """Of images that are there they stay; of none of them they are refused."""
+    name = list_images(database)[0].name
+    given = Positions(("lat", "lon"), {name: (1.0, 2.0), "other.jpg": (3.0, 4.0)})
+    found = index_folder(tmp_path / "map", params, database, positions=given)
+    assert (found.positions, found.unmatched, found.stay) == (1, ["other.jpg"], 0)
+    assert index_folder(tmp_path / "map", params, database, positions=given).stay == 1
+    strange = Positions(("lat", "lon"), {"other.jpg": (3.0, 4.0)})
+    with pytest.raises(InputError, match="positions: found none of the 7 images of"):
+        index_folder(tmp_path / "none", params, database, positions=strange)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_folder_of_unreadable_images_makes_no_map(params, tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(b"none")
+    with pytest.raises(InputError, match="found 1 images, none of them readable"):
+        index_folder(tmp_path / "map", params, tmp_path / "images", on_bad_image="skip")
+    assert not (tmp_path / "map").exists()

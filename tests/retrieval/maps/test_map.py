@@ -1,0 +1,374 @@
+"""Maps: what they say of themselves, what they refuse, and that a kill leaves them whole."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pymilvus
+import pytest
+
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.positions import Positions
+from crisalad_jax.retrieval.maps.manifest import check_model, describe_map, read_description
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.notes import Note
+from tests import killed_appends
+from tests.conftest import MODEL, random_params
+from tests.killed_appends import append_until, description, names, rows
+from tests.retrieval.maps.test_stores import brute_force
+
+ROOT = pathlib.Path(__file__).parents[3]
+LENGTH = killed_appends.LENGTH
+
+
+def killed(how: str, folder: pathlib.Path, store: str = "files", kills: int = 0, longest=0.0):
+    """Run tests/killed_appends.py; what it printed."""
+    program = [sys.executable, "-m", "tests.killed_appends", how, folder, store, kills, longest]
+    done = subprocess.run(list(map(str, program)), cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.fixture
+def folder(tmp_path) -> pathlib.Path:
+    """Of seven images, in segments of one, two and four."""
+    append_until(tmp_path / "map", 7)
+    return tmp_path / "map"
+
+
+def edit(path: pathlib.Path, **changes) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+# Killed
+
+
+@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_map_killed_at_random_moments_is_whole_and_goes_on(tmp_path, kills):
+    assert killed("random", tmp_path, kills=kills, longest=0.15) == [str(kills)]
+
+
+@pytest.mark.slow
+def test_a_map_in_milvus_that_is_killed_is_whole_and_goes_on(tmp_path):
+    assert killed("random", tmp_path, "milvus:rows.db", kills=8, longest=6.0) == ["8"]
+
+
+def test_a_map_killed_at_any_step_of_an_append_is_whole_and_goes_on(tmp_path):
+    """Also half-way through a file. So many steps there are, or the test has missed some."""
+    steps = [int(line) for line in killed("steps", tmp_path)]
+    # A file: a write, two fsyncs and a rename; of the new map three appends of two files each.
+    assert steps[0] >= 4 * (1 + 3 * 2)
+    assert steps[1] >= 4 * 2
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_map_as_it_was(tmp_path):
+    lines = killed("disk", tmp_path)
+    expected = ("map.json", "0000000003.npy", "0000000003.npy")
+    assert len(lines) == len(expected)
+    for line, name in zip(lines, expected, strict=True):
+        assert line.endswith(f"{name}: cannot be written: File too large")
+
+
+# What a map knows
+
+
+def test_what_was_appended_is_there_by_number_name_and_position(tmp_path):
+    where = Positions(("lat", "lon"), {"a.jpg": (1.25, -2.5), "c.jpg": (3.0, 4.0)})
+    with open_for_appending(tmp_path / "map", description("files")) as target:
+        target.append(["a.jpg", "b.jpg"], [10, 20], rows(0, 2), root="/x", positions=where)
+        assert len(target) == 2
+        target.append(["c.jpg"], [30], rows(2, 1), root="/y", positions=where)
+    with Map.open(tmp_path / "map") as found:
+        assert [tuple(image) for image in found.images] == [
+            ("a.jpg", 10, (1.25, -2.5), "/x"),
+            ("b.jpg", 20, None, "/x"),
+            ("c.jpg", 30, (3.0, 4.0), "/y"),
+        ]
+        assert found.axes == ("lat", "lon")
+        assert found.image("b.jpg") == found.images[1]
+        assert found.image("d.jpg") is None
+        np.testing.assert_array_equal(np.concatenate(list(found.descriptors)), rows(0, 3))
+        assert found.description == description("files")
+
+
+@pytest.mark.parametrize("k", [1, 3, 7, 100])
+def test_search_is_exact_and_gives_at_most_what_there_is(folder, k):
+    queries = rows(100, 4)
+    with Map.open(folder) as found:
+        expected = brute_force(rows(0, 7), queries, k)
+        np.testing.assert_array_equal(found.search(queries, k).indices, expected)
+
+
+def test_a_reader_sees_the_map_as_it_was_opened(folder):
+    with Map.open(folder) as before:
+        append_until(folder, 20)
+        assert len(before) == 7
+        found = before.search(rows(15, 1), 7)
+        assert set(found.indices[0].tolist()) == set(range(7))
+    with Map.open(folder) as after:
+        assert after.search(rows(15, 1), 1).indices.tolist() == [[15]]
+
+
+def test_a_moved_map_is_the_same_map(folder, tmp_path):
+    folder.rename(tmp_path / "other")
+    assert killed_appends.check(tmp_path / "other") == 7
+
+
+def test_verify_names_the_descriptors_that_changed(folder):
+    path = folder / "segments" / "0000000003.npy"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with Map.open(folder) as found, pytest.raises(InputError, match=r"0000000003: .*3 to 6 have"):
+        found.verify()
+
+
+# The model
+
+
+def test_a_description_is_read_as_it_was_written(tmp_path):
+    made = describe_map(random_params(MODEL), MODEL, tmp_path / "w.safetensors", tmp_path / "map")
+    with open_for_appending(tmp_path / "map", made) as target:
+        assert target.description == made
+    assert read_description(tmp_path / "map") == made
+    assert made.descriptor_length == MODEL.descriptor_dim
+    assert (made.grouping, made.format, made.store) == ("single", 2, "files")
+    other = describe_map(random_params(MODEL), MODEL, tmp_path / "w", tmp_path / "map")
+    assert made.collection != other.collection
+
+
+def test_another_model_is_refused_by_both_hashes():
+    made = dataclasses.replace(description("files"), model="a" * 64, weights="/w/old.safetensors")
+    check_model(made, "map", "a" * 64, "new")
+    words = r"map: found a map made by model a{12} \(/w/old\.safetensors\), but new is model b{12}$"
+    with pytest.raises(InputError, match=words):
+        check_model(made, "map", "b" * 64, "new")
+
+
+def test_a_map_of_version_0_1_takes_weights_on_trust_and_says_so():
+    made = dataclasses.replace(description("files"), model="a" * 64, format=1)
+    with pytest.warns(Note, match=r"map: found a map of crisalad-jax 0\.1, which cannot tell"):
+        check_model(made, "map", "b" * 64, "new")
+
+
+# Refused
+
+
+def test_one_process_appends_at_a_time(folder):
+    with (
+        open_for_appending(folder, description("files")),
+        pytest.raises(InputError, match="map: another process is appending to this map"),
+        open_for_appending(folder, description("files")),
+    ):
+        pass
+    append_until(folder, 8)
+
+
+@pytest.mark.parametrize("write", [False, True])
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda m: edit(m / "map.json", format=3), "found a map of format 3, expected at most 2"),
+        (lambda m: (m / "map.json").write_text('{"model'), "map.json: cannot read this map"),
+        (lambda m: edit(m / "map.json", dtype="int3"), "map.json: dtype: found 'int3', expected"),
+        (lambda m: edit(m / "map.json", store="no"), "map.json: store: found 'no', expected files"),
+        (lambda m: (m / "map.json").write_text("[]"), "map.json: found list, expected an object"),
+        (lambda m: (m / "map.json").unlink(), "map: found segments and no map.json"),
+        (
+            lambda m: (m / "segments" / "0000000001.json").write_text('{"root": "/im'),
+            "0000000001.json: not a whole record of images",
+        ),
+        (
+            lambda m: edit(m / "segments" / "0000000001.json", bytes=[7]),
+            "0000000001.json: not a whole record of images",
+        ),
+        (
+            lambda m: (m / "segments" / "0000000001.json").unlink(),
+            "0000000003.json: expected 0000000001.json before it",
+        ),
+        (
+            lambda m: (m / "segments" / "0000000001.npy").unlink(),
+            "0000000001.npy: not a whole file of descriptors: No such file",
+        ),
+    ],
+)
+def test_a_damaged_map_is_one_line(folder, spoil, words, write):
+    spoil(folder)
+    with (
+        pytest.raises(InputError) as error,
+        open_for_appending(folder, description("files")) if write else Map.open(folder),
+    ):
+        pass
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_map_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_text("x")
+    for name, words in (("file", "found a file"), ("photos", r"found a\.jpg and no map\.json")):
+        with pytest.raises(InputError, match=f"{name}: {words}"):
+            Map.open(tmp_path / name)
+        opening = open_for_appending(tmp_path / name, description("files"))
+        with pytest.raises(InputError, match=f"{name}: {words}"), opening:
+            pass
+    assert os.listdir(tmp_path / "photos") == ["a.jpg"]
+    with pytest.raises(InputError, match="none: found no map"), Map.open(tmp_path / "none"):
+        pass
+    assert not (tmp_path / "none").exists()
+
+
+def test_another_description_does_not_append(folder):
+    other = dataclasses.replace(description("files"), dtype="float16")
+    with (
+        pytest.raises(InputError, match="map: found another map than was expected"),
+        open_for_appending(folder, other),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("new", "descriptors", "words"),
+    [
+        (["7.jpg", "7.jpg"], rows(7, 2), "found 1 of 2 names twice, or in the map already"),
+        (["7.jpg", "3.jpg"], rows(7, 2), "found 1 of 2 names twice, or in the map already"),
+        (["7.jpg"], rows(7, 1)[:, :-1], r"found shape \(1, 47\), expected \(images, 48\)"),
+        (
+            ["7.jpg"],
+            2 * rows(7, 1),
+            "descriptors: row 0 is of length 2, expected finite unit vectors",
+        ),
+        (["7.jpg"], np.nan * rows(7, 1), "row 0 is not finite, expected finite unit vectors"),
+        ([], rows(7, 1)[:0], r"found shape \(0, 48\)"),
+    ],
+)
+def test_what_cannot_be_appended_changes_nothing(folder, new, descriptors, words):
+    with open_for_appending(folder, description("files")) as target:
+        with pytest.raises(InputError, match=words):
+            target.append(new, [7] * len(new), descriptors, root="/images")
+        assert len(target) == 7
+    assert killed_appends.check(folder) == 7
+    append_until(folder, 12)
+
+
+def test_positions_of_a_map_are_of_one_kind(folder):
+    with open_for_appending(folder, description("files")) as target:
+        for number, axes in ((7, ("east", "north")), (8, ("lat", "lon"))):
+            where = Positions(axes, {f"{number}.jpg": (1.0, 2.0)})
+            if number == 8:
+                with pytest.raises(InputError, match="in lat, lon, expected east, north as in the"):
+                    target.append(names(8, 1), [7], rows(8, 1), root="/", positions=where)
+            else:
+                target.append(names(7, 1), [7], rows(7, 1), root="/", positions=where)
+
+
+@pytest.mark.parametrize(
+    ("queries", "k", "words"),
+    [
+        (rows(0, 1), 0, "k: found 0, expected at least 1"),
+        (rows(0, 1)[:0], 1, r"queries: found shape \(0, 48\)"),
+        (rows(0, 1)[:, 1:], 1, r"queries: found shape \(1, 47\)"),
+        (3 * rows(0, 1), 1, "queries: row 0 is of length 3"),
+    ],
+)
+def test_queries_that_are_none_are_refused(folder, queries, k, words):
+    with Map.open(folder) as found, pytest.raises(InputError, match=words):
+        found.search(queries, k)
+
+
+def test_a_map_without_images_answers_nothing(tmp_path):
+    with open_for_appending(tmp_path / "map", description("files")) as target:
+        assert len(target) == 0
+        with pytest.raises(InputError, match="map: found a map without images"):
+            target.search(rows(0, 1), 1)
+    with pytest.raises(InputError, match="found a map without imag"), Map.open(tmp_path / "map"):
+        pass
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_map_that_fails_before_it_has_images_is_removed(tmp_path, there):
+    """Also what was written of a first addition that does not count."""
+    if there:
+        with open_for_appending(tmp_path / "map", description("files")):
+            pass
+
+    def fail() -> None:
+        with open_for_appending(tmp_path / "map", description("files")) as target:
+            target._store.add(0, rows(0, 2))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_map_that_fails_once_it_has_images_keeps_them(tmp_path):
+
+    def fail() -> None:
+        with open_for_appending(tmp_path / "map", description("files")) as target:
+            target.append(names(0, 1), [7], rows(0, 1), root="/images")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert killed_appends.check(tmp_path / "map") == 1
+
+
+def test_what_others_put_into_a_map_that_fails_is_kept(tmp_path):
+
+    def fail() -> None:
+        with open_for_appending(tmp_path / "map", description("files")):
+            (tmp_path / "map" / "notes.txt").write_text("x")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert sorted(os.listdir(tmp_path / "map")) == [".lock", "map.json", "notes.txt"]
+    append_until(tmp_path / "map", 1)
+
+
+def test_a_map_without_images_is_made_anew_as_another(tmp_path):
+    with open_for_appending(tmp_path / "map", description("files")):
+        pass
+    other = dataclasses.replace(description("files"), dtype="float16", model="1" * 64)
+    with open_for_appending(tmp_path / "map", other) as target:
+        target.append(names(0, 1), [7], rows(0, 1), root="/images")
+    assert read_description(tmp_path / "map") == other
+
+
+@pytest.mark.parametrize("value", [np.nan, 2.0])
+def test_a_row_of_a_file_that_is_no_descriptor_is_named(folder, value):
+    path = folder / "segments" / "0000000003.npy"
+    spoilt = np.load(path)
+    spoilt[2] *= value
+    np.save(path, spoilt)
+    with (
+        Map.open(folder) as found,
+        pytest.raises(InputError, match=r"0000000003\.npy: row 2 is (not finite|of length 2),"),
+    ):
+        found.search(rows(0, 2), 3)
+
+
+def test_a_map_in_milvus_that_was_killed_before_it_had_images_goes_on(tmp_path):
+    """The file is not there yet; or the collection is, but without its index."""
+    for number in range(2):
+        made = description("milvus:rows.db")
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        write_json(folder / "map.json", to_plain(made))
+        if number:
+            client = pymilvus.MilvusClient(str(folder / "rows.db"))
+            schema = client.create_schema(auto_id=False)
+            schema.add_field("id", pymilvus.DataType.INT64, is_primary=True)
+            schema.add_field("descriptor", pymilvus.DataType.FLOAT_VECTOR, dim=LENGTH)
+            client.create_collection(made.collection, schema=schema)
+            client.close()
+        append_until(folder, 4, made.store)
+        assert killed_appends.check(folder) == 4

@@ -1,0 +1,143 @@
+"""Questions to a map in Python: answers that outlive it, in any portions the same."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import crisalad_jax.retrieval.maps.query
+from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.cli.tables import answers_table
+from crisalad_jax.data.images import list_images
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.query import (
+    Answers,
+    json_lines,
+    query,
+    write_answers,
+)
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import BATCH, MODEL, random_params
+from tests.retrieval.maps.test_stores import ROUNDING
+
+
+@pytest.fixture(scope="module")
+def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
+    """The town's database and queries."""
+    images = shared / "town" / "images" / "test"
+    return images / "database", images / "queries"
+
+
+@pytest.fixture(scope="module")
+def folder(shared, params, sides, tmp_path_factory) -> pathlib.Path:
+    out = tmp_path_factory.mktemp("maps") / "map"
+    weights = shared / "weights.safetensors"
+    index(params, MODEL, sides[0], out, weights=weights, batch_size=BATCH, quiet=True)
+    return out
+
+
+def ask(folder, params, images, **options) -> Answers:
+    with Map.open(folder) as places:
+        return query(places, params, images, batch_size=BATCH, quiet=True, **options)
+
+
+@pytest.fixture(scope="module")
+def answers(folder, params, sides) -> Answers:
+    return ask(folder, params, sides[1], k=3)
+
+
+def test_answers_after_the_map_is_closed(folder, answers, sides):
+    assert answers.queries == list_images(sides[1])
+    assert answers.neighbours.indices.shape == (5, 3)
+    rows = list(answers.rows())
+    assert [path for path, _ in rows] == answers.queries
+    for (_, found), indices in zip(rows, answers.neighbours.indices, strict=True):
+        assert [answer.rank for answer in found] == [1, 2, 3]
+        assert [answer.image for answer in found] == [answers.images[i] for i in indices]
+        similarities = [answer.similarity for answer in found]
+        assert similarities == sorted(similarities, reverse=True)
+    image = rows[0][1][0].image
+    east = float(image.name.split("@")[1])
+    assert answers.position(image) == {"east": east, "north": 5e6}
+    assert answers.position(image._replace(position=None)) is None
+
+
+def test_a_file_a_folder_or_a_list_of_both(folder, params, sides, answers):
+    one = answers.queries[0]
+    assert ask(folder, params, one).queries == [one]
+    assert ask(folder, params, [one, sides[1]]).queries == [one, *answers.queries]
+    # Fewer in the map than asked for: all of them.
+    assert ask(folder, params, str(one), k=99).neighbours.indices.shape == (1, 7)
+
+
+def test_in_portions_all_the_same(folder, params, sides, answers, monkeypatch):
+    monkeypatch.setattr(crisalad_jax.retrieval.maps.query, "AT_ONCE", 1)
+    found = ask(folder, params, sides[1], k=3)
+    np.testing.assert_array_equal(found.neighbours.indices, answers.neighbours.indices)
+    np.testing.assert_allclose(
+        found.neighbours.similarities, answers.neighbours.similarities, atol=ROUNDING, rtol=0
+    )
+
+
+def test_lines_of_json(answers, tmp_path):
+    write_answers(tmp_path / "a.jsonl", answers)
+    lines = (tmp_path / "a.jsonl").read_text().splitlines()
+    assert lines == list(json_lines(answers))
+    first = json.loads(lines[0])
+    ((path, found), *_) = answers.rows()
+    assert first["query"] == path.as_posix()
+    assert first["neighbours"][1] == {
+        "rank": 2,
+        "name": found[1].image.name,
+        "similarity": round(found[1].similarity, 6),
+        "position": answers.position(found[1].image),
+    }
+
+
+def test_a_table(answers):
+    """Markup in names is text, and what has no position has a dash."""
+    image = answers.images[0]._replace(name="a[red].jpg", position=None)
+    answers = answers._replace(images=[image] * 7)
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(answers_table(answers, "title"))
+    text = console.export_text()
+    assert text.count("a[red].jpg") == 15
+    assert "east, north" in text
+    assert "title" in text
+
+
+@pytest.mark.parametrize(
+    ("images", "options", "words"),
+    [
+        ([], {}, "images: found none, expected images or folders of them"),
+        (["none.jpg"], {}, "none.jpg: cannot read"),
+        (["none.jpg"], {"k": 0}, "k: found 0, expected at least 1"),
+        (["none.jpg"], {"batch_size": 0}, "batch size: found 0"),
+    ],
+)
+def test_what_is_refused(folder, params, images, options, words):
+    with Map.open(folder) as places, pytest.raises(InputError, match=words):
+        query(places, params, images, quiet=True, **options)
+
+
+def test_the_model_of_a_map(folder, shared, params, tmp_path):
+    with Map.open(folder) as places:
+        found = places.load_params()
+        np.testing.assert_array_equal(found.backbone.cls_token, params.backbone.cls_token)
+        other = tmp_path / "other.safetensors"
+        changed = random_params(MODEL)
+        changed.backbone.__dict__["cls_token"] = changed.backbone.cls_token + 1
+        save_weights(other, changed, MODEL)
+        with pytest.raises(InputError, match=r"found a map made by model .* is model"):
+            places.load_params(other)
+
+
+def test_a_summary(folder, shared):
+    with Map.open(folder) as places:
+        summary = places.summary(verify=True)
+    assert json.loads(json.dumps(summary)) == summary | {"axes": ["east", "north"]}
+    assert (summary["images"], summary["positions"], summary["verified"]) == (7, 7, True)
+    assert summary["weights"] == str((shared / "weights.safetensors").resolve())

@@ -1,0 +1,235 @@
+"""The new order against scores of single pairs; each image is described once; bad input."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.reranking import (
+    Reranker,
+    Reranking,
+    parse_reranking,
+    patch_netvlad,
+    rerank,
+    stage,
+    transvpr,
+)
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import BATCH, MODEL, random_params
+
+PLAIN = dataclasses.replace(MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0))
+TRANSVPR = dataclasses.replace(PLAIN, aggregator=TransVprConfig(levels=2, dim=16))
+NETVLAD = dataclasses.replace(PLAIN, aggregator=NetVladConfig(clusters=4))
+
+
+def model_of(name: str) -> tuple:
+    """Random parameters of a re-ranker, its configuration and module."""
+    if name == "transvpr":
+        return random_params(TRANSVPR), TRANSVPR, transvpr
+    return random_params(NETVLAD), NETVLAD, patch_netvlad
+
+
+@pytest.fixture(scope="module")
+def first_stage() -> Neighbours:
+    """Of the town's five queries, all seven database images, in no order of use."""
+    rng = np.random.default_rng(0)
+    indices = np.stack([rng.permutation(7) for _ in range(5)])
+    similarities = -np.sort(-rng.random((5, 7)).astype(np.float32), axis=1)
+    return Neighbours(indices, similarities)
+
+
+def reranking(name: str, top: int) -> Reranking:
+    own, config, _ = model_of(name)
+    return Reranking(name, top, own, config)
+
+
+NAMES = pytest.mark.parametrize("name", ["transvpr", "patch-netvlad"])
+
+
+@NAMES
+def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark) -> None:
+    own, config, method = model_of(name)
+
+    def local(paths) -> np.ndarray:
+        images = np.stack([resize_image(read_image(p), config.image_size) for p in paths])
+        return np.asarray(method.describe(own, images[:BATCH], config)), np.asarray(
+            method.describe(own, np.resize(images[BATCH:], (BATCH, *images.shape[1:])), config)
+        )
+
+    database, queries = (
+        np.concatenate(local(paths))[: len(paths)]
+        for paths in (benchmark.database, benchmark.queries)
+    )
+    assert database.shape[1:] == method.shape(config)
+    scores = np.stack([[method.score(q, d[None], config)[0] for d in database] for q in queries])
+    assert len(np.unique(scores)) > 5
+    top = 5
+    found = rerank(
+        reranking(name, top),
+        first_stage,
+        benchmark.database,
+        benchmark.queries,
+        batch_size=BATCH,
+        quiet=True,
+    )
+    for query, row in enumerate(first_stage.indices):
+        kept = sorted(row[:top], key=lambda image, query=query: -scores[query, image])
+        np.testing.assert_array_equal(found.indices[query], [*kept, *row[top:]])
+        # The same float32 sums, vectorised over another number of candidates.
+        np.testing.assert_allclose(found.similarities[query, :top], scores[query, kept], rtol=1e-5)
+    np.testing.assert_array_equal(found.similarities[:, top:], first_stage.similarities[:, top:])
+    assert (found.indices != first_stage.indices).any()
+
+
+@NAMES
+def test_an_image_is_most_like_itself(name: str, first_stage, benchmark) -> None:
+    """Where the first stage had it last."""
+    own = benchmark.database[:5]
+    last = np.array([np.roll(np.arange(7), -1 - i) for i in range(5)])
+    neighbours = Neighbours(last, first_stage.similarities)
+    found = rerank(
+        reranking(name, 7), neighbours, benchmark.database, own, batch_size=BATCH, quiet=True
+    )
+    np.testing.assert_array_equal(found.indices[:, 0], np.arange(5))
+
+
+def test_equal_scores_keep_the_first_stages_order(first_stage, benchmark, monkeypatch) -> None:
+    monkeypatch.setattr(
+        transvpr, "score", lambda query, candidates, config: np.ones(len(candidates), np.float32)
+    )
+    found = rerank(
+        reranking("transvpr", 6),
+        first_stage,
+        benchmark.database,
+        benchmark.queries,
+        batch_size=BATCH,
+        quiet=True,
+    )
+    np.testing.assert_array_equal(found.indices, first_stage.indices)
+
+
+def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monkeypatch) -> None:
+    described, scored = [], []
+    describe, score = transvpr.describe, transvpr.score
+    monkeypatch.setattr(
+        transvpr, "describe", lambda p, x, c: described.append(x) or describe(p, x, c)
+    )
+    monkeypatch.setattr(transvpr, "score", lambda q, x, c: scored.append(x) or score(q, x, c))
+    two = Neighbours(first_stage.indices[:, :2], first_stage.similarities[:, :2])
+    candidates = len(np.unique(two.indices))
+    with Reranker(
+        reranking("transvpr", 2),
+        benchmark.database,
+        benchmark.queries,
+        batch_size=BATCH,
+        quiet=True,
+    ) as reranker:
+        folder = reranker._folder.name
+        found = reranker(two)
+        batches = -(-candidates // BATCH) + -(-5 // BATCH)
+        assert (len(described), len(scored)) == (batches, 5)
+        again = reranker(two)
+        assert (len(described), len(scored)) == (batches, 5)
+    np.testing.assert_array_equal(found.indices, again.indices)
+    assert not stage.pathlib.Path(folder).exists()
+
+
+def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
+    own = random_params(PLAIN)
+    plain = evaluate(own, PLAIN, benchmark, batch_size=BATCH, quiet=True)
+    with_own = reranking("transvpr", 3)
+    both = evaluate(own, PLAIN, benchmark, batch_size=BATCH, rerank=with_own, quiet=True)
+    assert [(r.grouping, r.rerank) for r in both] == [("any", None), ("any", "transvpr:3")]
+    assert both[0].recalls == plain[0].recalls
+    np.testing.assert_array_equal(both[0].neighbours.indices, plain[0].neighbours.indices)
+    expected = rerank(
+        with_own,
+        plain[0].neighbours,
+        benchmark.database,
+        benchmark.queries,
+        batch_size=BATCH,
+        quiet=True,
+    )
+    np.testing.assert_array_equal(both[1].neighbours.indices, expected.indices)
+    # Any order of the first three has as many right ones among them as they had.
+    assert both[1].recalls[5] == plain[0].recalls[5]
+    assert both[1].intervals.keys() == plain[0].intervals.keys()
+
+
+def test_the_first_stages_model_serves_where_it_can(benchmark) -> None:
+    own = random_params(TRANSVPR)
+    results = [
+        evaluate(own, TRANSVPR, benchmark, batch_size=BATCH, rerank=given, quiet=True)[1]
+        for given in (Reranking("transvpr", 7), Reranking("transvpr", 7, own, TRANSVPR))
+    ]
+    for a, b in zip(*(result.neighbours for result in results), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("transvpr", "found 'transvpr', expected NAME:TOPK, as in patch-netvlad:100, with one of "),
+        ("transvpr:", "expected NAME:TOPK"),
+        ("transvpr:-3", "expected NAME:TOPK"),
+        ("transvpr:" + 5000 * "1", "expected NAME:TOPK"),
+        ("transvpr:ten", "expected NAME:TOPK"),
+        ("transvpr:1", "found transvpr:1, expected at least 2 retrievals"),
+        ("superglue:10", "rerank: found 'superglue', expected one of patch-netvlad, transvpr"),
+    ],
+)
+def test_what_cannot_be_read_is_named(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        parse_reranking(text)
+
+
+def test_what_is_read() -> None:
+    assert parse_reranking("patch-netvlad:100") == Reranking("patch-netvlad", 100)
+    assert parse_reranking("transvpr:20").label == "transvpr:20"
+
+
+@pytest.mark.parametrize(
+    ("given", "config", "words"),
+    [
+        ("transvpr:3", PLAIN, "found a model with aggregator salad, expected transvpr"),
+        ("patch-netvlad:3", TRANSVPR, "aggregator transvpr, expected netvlad"),
+        ("transvpr:8", TRANSVPR, "found transvpr:8 over a database of 7 images, expected at most"),
+        (
+            "patch-netvlad:3",
+            dataclasses.replace(NETVLAD, image_size=(28, 56)),
+            "found images of 28 x 56, expected at least 42 x 42",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_found_before_any_work(
+    given: str, config: ModelConfig, words: str, benchmark, monkeypatch
+) -> None:
+    monkeypatch.setattr("crisalad_jax.retrieval.describe.read_tokens", None)
+    rerank = parse_reranking(given)
+    with pytest.raises(InputError, match=words):
+        evaluate(random_params(PLAIN), config, benchmark, rerank=rerank, quiet=True)
+
+
+def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark) -> None:
+    sides = benchmark.database, benchmark.queries
+    with pytest.raises(InputError, match="rerank: found no model"):
+        rerank(Reranking("transvpr", 3), first_stage, *sides)
+    few = Neighbours(*(part[:, :2] for part in first_stage))
+    with pytest.raises(InputError, match="found 2 neighbours of 5 queries, expected at least 3"):
+        rerank(reranking("transvpr", 3), few, *sides, batch_size=BATCH, quiet=True)
+
+
+def test_a_full_disk_is_one_line(first_stage, benchmark, monkeypatch) -> None:
+    usage = stage.shutil.disk_usage("/")._replace(free=1000)
+    monkeypatch.setattr(stage.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(InputError, match=r"GiB free, expected .* for the local features of 5 im"):
+        rerank(
+            reranking("transvpr", 3), first_stage, benchmark.database, benchmark.queries, quiet=True
+        )

@@ -1,0 +1,177 @@
+"""Approximate indexes: what they find of the exact neighbours, and what they are made from."""
+
+from collections.abc import Iterator
+
+import faiss
+import numpy as np
+import pytest
+
+from crisalad_jax.retrieval import faiss_index as approximate
+from crisalad_jax.retrieval.faiss_index import build, load_index, recall_against_exact, save_index
+from crisalad_jax.retrieval.search import search
+from crisalad_jax.utils.errors import InputError
+
+COUNT = approximate.LEAST_ROWS + 17
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """So that a graph depends on its seed alone; and threads that wait for each other in turn take
+    longer than one where cores are shared."""
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    yield
+    faiss.omp_set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def places() -> tuple[np.ndarray, np.ndarray]:
+    """Database and queries: several views of each of many places, as descriptors lie; float16
+    holds them."""
+    generator = np.random.default_rng(0)
+    centres = generator.standard_normal((400, 16))
+
+    def views(count: int) -> np.ndarray:
+        rows = centres[generator.integers(0, 400, count)]
+        rows = rows + 0.5 * generator.standard_normal(rows.shape)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        return rows.astype(np.float16).astype(np.float32)
+
+    return views(COUNT), views(50)
+
+
+@pytest.fixture(scope="module")
+def indexes(places) -> dict[str, approximate.Index]:
+    return {kind: build(kind, places[0], seed=3) for kind in approximate.KINDS}
+
+
+def test_what_is_found_are_most_of_the_exact_neighbours(places, indexes):
+    exact = search(*places, 10)
+    # Measured: 1.000 and 0.86. Chance would find 0.001.
+    for kind, least in (("hnsw", 0.99), ("ivf-pq", 0.75)):
+        found = indexes[kind].search(places[1], 10)
+        assert found.indices.dtype == np.int64
+        assert found.similarities.dtype == np.float32
+        assert (np.diff(found.similarities, axis=1) <= 0).all()
+        assert least <= recall_against_exact(found.indices, exact.indices) <= 1
+        assert indexes[kind].size == COUNT
+
+
+def test_the_similarities_of_a_graph_are_inner_products(places, indexes):
+    found = indexes["hnsw"].search(places[1], 5)
+    expected = np.einsum("qd,qkd->qk", places[1], places[0][found.indices])
+    np.testing.assert_allclose(found.similarities, expected, atol=1e-6)  # float32 sums
+
+
+def test_more_effort_finds_more(places, indexes):
+    exact = search(*places, 10).indices
+    for kind, most in (("hnsw", 400), ("ivf-pq", 10**6)):
+        little, much = (
+            recall_against_exact(indexes[kind].search(places[1], 10, effort).indices, exact)
+            for effort in (1, most)
+        )
+        assert little < much
+
+
+def test_the_parameters_are_those_that_are_documented(places, indexes):
+    lists, graph = indexes["ivf-pq"].faiss_index, indexes["hnsw"].faiss_index
+    # As many lists as give each 39 of the vectors; of 16 numbers, 8 parts of two.
+    assert (lists.nlist, lists.pq.M, lists.pq.nbits) == (COUNT // 39, 8, 8)
+    assert graph.hnsw.nb_neighbors(1) == 32
+    assert graph.hnsw.efConstruction == 128
+
+
+def test_another_seed_makes_other_lists(places, indexes):
+    other = build("ivf-pq", places[0], seed=4).search(places[1], 10)
+    assert not np.array_equal(other.similarities, indexes["ivf-pq"].search(places[1], 10)[1])
+
+
+def test_the_same_seed_makes_the_same_lists_of_a_memory_map(places, indexes, tmp_path, monkeypatch):
+    np.save(tmp_path / "database.npy", places[0].astype(np.float16))
+    mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
+    monkeypatch.setattr(approximate, "_CHUNK_BYTES", 4 * 16 * 1000)  # a thousand at a time
+    found = build("ivf-pq", mapped, seed=3).search(places[1], 10)
+    for one, expected in zip(found, indexes["ivf-pq"].search(places[1], 10), strict=True):
+        np.testing.assert_array_equal(one, expected)
+
+
+def test_a_graph_of_a_memory_map_finds_all_if_it_looks_everywhere(places, tmp_path, monkeypatch):
+    np.save(tmp_path / "database.npy", places[0][:500])
+    mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
+    monkeypatch.setattr(approximate, "_CHUNK_BYTES", 4 * 16 * 60)
+    found = build("hnsw", mapped).search(places[1], 3, effort=500)
+    np.testing.assert_array_equal(found.indices, search(mapped, places[1], 3).indices)
+
+
+@pytest.mark.parametrize("kind", approximate.KINDS)
+def test_what_is_saved_comes_back(kind, places, indexes, tmp_path):
+    path = tmp_path / "new" / "some.index"
+    save_index(path, indexes[kind])
+    again = load_index(path)
+    assert again.kind == kind
+    for found, expected in zip(
+        again.search(places[1], 4), indexes[kind].search(places[1], 4), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+    assert [one.name for one in path.parent.iterdir()] == ["some.index"]
+
+
+def test_a_database_smaller_than_k_gives_what_it_has():
+    rows = np.eye(4, dtype=np.float32)
+    found = build("hnsw", rows).search(rows[:2], 20)
+    assert found.indices.shape == (2, 4)
+    np.testing.assert_array_equal(found.indices[:, 0], [0, 1])
+
+
+def test_neighbours_that_are_not_found_are_minus_one(places, indexes):
+    """Of one list of some 39 vectors, 100 are wanted."""
+    found = indexes["ivf-pq"].search(places[1], 1000, effort=1)
+    missing = found.indices == -1
+    assert missing.any()
+    assert (found.similarities[missing] == -np.inf).all()
+    assert np.isfinite(found.similarities[~missing]).all()
+
+
+def test_bad_input_is_named(places, indexes, tmp_path):
+    database, queries = places
+    for call, words in (
+        (lambda: build("lsh", database), "^kind: found 'lsh', expected one of hnsw, ivf-pq"),
+        (lambda: build("hnsw", database[0]), r"^database: found shape \(16,\)"),
+        (lambda: build("hnsw", database * 2), "^database: row 0 is of length 2, expected finite"),
+        (
+            lambda: build("ivf-pq", database[:9983]),
+            "^database: found 9983 descriptors, expected at least 9984 to train",
+        ),
+        (
+            lambda: indexes["hnsw"].search(queries[:, :5], 3),
+            "^queries: found descriptors of length 5, expected 16",
+        ),
+        (lambda: indexes["hnsw"].search(queries, 0), "^k: found 0, expected at least 1"),
+        (lambda: indexes["ivf-pq"].search(queries, 1, 0), "^effort: found 0, expected at least 1"),
+        (lambda: load_index(tmp_path / "none"), "none: found no such file, expected a faiss index"),
+    ):
+        with pytest.raises(InputError, match=words):
+            call()
+
+
+def test_files_of_something_else_are_named(places, indexes, tmp_path):
+    path = tmp_path / "some.index"
+    faiss.write_index(faiss.IndexFlatL2(4), str(path))
+    with pytest.raises(
+        InputError, match=r"some\.index: found a IndexFlatL2, expected one of inner"
+    ):
+        load_index(path)
+    save_index(path, indexes["ivf-pq"])
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"some\.index: not a whole faiss index"):
+        load_index(path)
+
+
+def test_recall_by_hand():
+    exact = np.array([[0, 1, 2], [3, 4, 5]])
+    assert recall_against_exact(np.array([[2, 1, 0], [9, 8, -1]]), exact) == 3 / 6
+    assert recall_against_exact(exact, exact) == 1
+    with pytest.raises(
+        InputError, match=r"^found: found indices of shape \(2, 2\), expected \(2, 3"
+    ):
+        recall_against_exact(exact[:, :2], exact)

@@ -1,0 +1,343 @@
+"""Search against a float64 stable argsort, and against faiss."""
+
+import sys
+
+import faiss
+import hypothesis
+import hypothesis.strategies as st
+import ml_dtypes
+import numpy as np
+import pytest
+
+from crisalad_jax.retrieval import search as retrieval
+from crisalad_jax.retrieval.chunks import as_sides
+from crisalad_jax.utils.errors import InputError
+from tests.utils.test_compiler import in_a_program
+
+
+def _unit(rows):
+    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def _random_unit(seed, count, length):
+    rows = np.random.default_rng(seed).standard_normal((count, length))
+    return _unit(rows).astype(np.float32)
+
+
+def _brute_force(database, queries, k):
+    similarities = queries.astype(np.float64) @ database.astype(np.float64).T
+    indices = np.argsort(-similarities, axis=1, kind="stable")[:, :k]
+    return indices, np.take_along_axis(similarities, indices, axis=1)
+
+
+def _assert_ranked(found, database, queries, k):
+    """The order is the exact one, up to swaps of neighbours that float32 cannot tell apart."""
+    indices, similarities = _brute_force(database, queries, k)
+    assert found.indices.dtype == np.int64
+    assert found.similarities.dtype == np.float32
+    assert found.indices.shape == indices.shape
+    exact = queries.astype(np.float64) @ database.astype(np.float64).T
+    # 1e-6: a float32 sum of products of unit vectors errs by a few 6e-8.
+    np.testing.assert_allclose(found.similarities, similarities, atol=1e-6, rtol=0)
+    np.testing.assert_allclose(
+        np.take_along_axis(exact, found.indices, axis=1), similarities, atol=1e-6, rtol=0
+    )
+    for row in found.indices:
+        assert len(set(row.tolist())) == len(row)
+
+
+def _by_devices(
+    database: np.ndarray, queries: np.ndarray, k: int, *, chunk: int = 4096
+) -> retrieval.Neighbours:
+    """As on an accelerator; a CPU leaves it to numpy."""
+    return retrieval._search(*as_sides(database, queries), k, chunk, on_host=False)
+
+
+BOTH_WAYS = pytest.mark.parametrize(
+    "search", [pytest.param(retrieval.search, id="numpy"), pytest.param(_by_devices, id="devices")]
+)
+
+
+@BOTH_WAYS
+@pytest.mark.parametrize("chunk", [1, 7, 64, 128, 299, 300, 8192])
+def test_search_agrees_with_brute_force_for_any_chunk(search, chunk):
+    database, queries = _random_unit(0, 300, 24), _random_unit(1, 11, 24)
+    found = search(database, queries, 10, chunk=chunk)
+    # These draws have no two similarities within 1e-6 among the first 11: the order is unique.
+    indices, similarities = _brute_force(database, queries, 11)
+    assert np.diff(similarities, axis=1).max() < -1e-6
+    np.testing.assert_array_equal(found.indices, indices[:, :10])
+    _assert_ranked(found, database, queries, 10)
+
+
+def test_search_orders_as_the_l2_distance_does():
+    database, queries = _random_unit(2, 50, 8), _random_unit(3, 5, 8)
+    distances = np.linalg.norm(queries[:, None].astype(np.float64) - database[None], axis=2)
+    found = retrieval.search(database, queries, 50, chunk=16)
+    np.testing.assert_array_equal(found.indices, np.argsort(distances, axis=1))
+
+
+def test_search_walks_queries_in_chunks(monkeypatch):
+    database, queries = _random_unit(4, 40, 16), _random_unit(5, 23, 16)
+    whole = retrieval.search(database, queries, 5)
+    monkeypatch.setattr(retrieval, "_QUERY_CHUNK", 10)
+    parts = retrieval.search(database, queries, 5)
+    np.testing.assert_array_equal(parts.indices, whole.indices)
+    _assert_ranked(parts, database, queries, 5)
+
+
+@BOTH_WAYS
+@pytest.mark.parametrize("chunk", [1, 3, 100, 128, 130, 1000])
+def test_equal_rows_come_in_database_order(search, chunk):
+    # Every row stands 100 times, 5 apart, across chunk borders and at every place in a block.
+    database = np.tile(_random_unit(6, 5, 200), (100, 1))
+    queries = _random_unit(7, 3, 200)
+    found = search(database, queries, 150, chunk=chunk)
+    best = np.argsort(-(queries.astype(np.float64) @ database[:5].astype(np.float64).T), axis=1)
+    for row, (first, second, *_) in zip(found.indices, best, strict=True):
+        np.testing.assert_array_equal(row[:100], np.arange(100) * 5 + first)
+        np.testing.assert_array_equal(row[100:], np.arange(50) * 5 + second)
+
+
+def test_signed_zeros_are_a_tie():
+    # The first product underflows to -0.0.
+    database = np.array([[1, 0, -1e-30], [1, 0, 0], [1, 0, 1e-30]], np.float32)
+    found = retrieval.search(database, np.array([[0, 1, 1e-30]], np.float32), 3)
+    np.testing.assert_array_equal(found.indices, [[0, 1, 2]])
+
+
+@BOTH_WAYS
+@pytest.mark.parametrize("chunk", [2, 8192])
+def test_k_beyond_the_database_gives_every_image_and_no_padding(search, chunk):
+    # All similarities are negative: a padding row of zeros would come first.
+    database = np.array([[-1, 0], [-0.6, 0.8], [-0.8, 0.6]], np.float32)
+    found = search(database, np.array([[1, 0]], np.float32), 20, chunk=chunk)
+    np.testing.assert_array_equal(found.indices, [[1, 2, 0]])
+    np.testing.assert_array_equal(found.similarities, np.array([[-0.6, -0.8, -1]], np.float32))
+
+
+@BOTH_WAYS
+@hypothesis.settings(max_examples=40, deadline=None)
+@hypothesis.given(
+    count=st.integers(1, 40),
+    queries=st.integers(1, 6),
+    k=st.integers(1, 45),
+    chunk=st.integers(1, 45),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_small_integers_are_ranked_exactly(search, count, queries, k, chunk, seed):
+    # Rows with four of 16 entries +-0.5 are unit vectors, and their products are exact in float32:
+    # many ties, and the float64 stable argsort is the one right answer.
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((count + queries, 16), np.float32)
+    rows[:, :4] = rng.choice([-0.5, 0.5], (len(rows), 4))
+    rows = rng.permuted(rows, axis=1)
+    database, wanted = rows[:count], rows[count:]
+    found = search(database, wanted, k, chunk=chunk)
+    indices, similarities = _brute_force(database, wanted, k)
+    np.testing.assert_array_equal(found.indices, indices)
+    np.testing.assert_array_equal(found.similarities, similarities)
+
+
+def test_search_reads_a_memory_map_of_half_floats(tmp_path):
+    database, queries = _random_unit(8, 70, 12).astype(np.float16), _random_unit(9, 4, 12)
+    np.save(tmp_path / "database.npy", database)
+    mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
+    found = retrieval.search(mapped, queries, 6, chunk=32)
+    _assert_ranked(found, database, queries, 6)
+
+
+def test_search_reads_bfloat16_as_a_npy_file_holds_it(tmp_path):
+    """Which names no such type: it comes back as two bytes each."""
+    database, queries = _random_unit(8, 70, 12).astype(ml_dtypes.bfloat16), _random_unit(9, 4, 12)
+    np.save(tmp_path / "database.npy", database)
+    mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
+    assert mapped.dtype == np.dtype("V2")
+    found = retrieval.search(mapped, queries, 6, chunk=32)
+    _assert_ranked(found, database, queries, 6)
+    again = retrieval.search(database, queries, 6)
+    np.testing.assert_array_equal(found.similarities, again.similarities)
+
+
+def test_similarities_are_float64_sums_rounded_once():
+    """So they are the same bits whatever multiplies; and that is as exact as float32 can be."""
+    database, queries = _random_unit(10, 200, 700), _random_unit(11, 6, 700)
+    wanted = queries.astype(np.float64) @ database.astype(np.float64).T
+    for chunk in (16, 112, 200):
+        found = retrieval.search(database, queries, 30, chunk=chunk)
+        chosen = np.take_along_axis(wanted, found.indices, axis=1)
+        # Two float64 sums differ by 1e-15, which changes none of these roundings.
+        np.testing.assert_array_equal(found.similarities, chosen.astype(np.float32))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_duplicates_and_their_order_are_those_of_faiss(seed):
+    """More equal rows than a device names beside k, at every k; 24 queries are multiplied as one
+    matrix by faiss, 3 one by one."""
+    generator = np.random.default_rng(seed)
+    distinct = np.zeros((40, 64), np.float32)
+    # Products of these are exact in float32, squared distances too.
+    distinct[:, :16] = generator.choice([-0.25, 0.25], (40, 16))
+    distinct = generator.permuted(distinct, axis=1)
+    database = distinct[generator.integers(0, 40, 900)]
+    index = faiss.IndexFlatL2(64)
+    index.add(database)
+    for count, k in ((24, 1), (24, 20), (24, 77), (3, 20)):
+        queries = distinct[generator.integers(0, 40, count)]
+        distances, indices = index.search(queries, k)
+        found = retrieval.search(database, queries, k, chunk=128)
+        np.testing.assert_array_equal(found.indices, indices)
+        np.testing.assert_array_equal(2 - 2 * found.similarities, distances)
+
+
+def test_random_descriptors_with_copies_are_found_as_faiss_does():
+    """Recalls are functions of these indices."""
+    database, queries = _random_unit(12, 2000, 48), _random_unit(13, 60, 48)
+    database[1000:1100] = database[300:400]
+    database[1500:1540] = database[7]
+    queries[:40] = _unit(queries[:40] * 0.2 + database[300:340])
+    queries[40] = database[7]
+    index = faiss.IndexFlatL2(48)
+    index.add(database)
+    distances, indices = index.search(queries, 25)
+    # No distances closer than faiss can tell apart, other than those of copies.
+    gaps = np.diff(distances, axis=1)
+    assert gaps[gaps > 1e-6].size + (gaps == 0).sum() == gaps.size
+    found = retrieval.search(database, queries, 25, chunk=256)
+    np.testing.assert_array_equal(found.indices, indices)
+
+
+@BOTH_WAYS
+def test_rows_that_float32_products_cannot_tell_apart_are_ranked_exactly(search):
+    """Their products differ by less than a float32 product errs: a device names the wrong ones."""
+    generator = np.random.default_rng(3)
+    queries = _random_unit(17, 5, 4000)
+    noise = 1e-7 * generator.standard_normal((900, 4000))
+    database = (queries[0] + noise).astype(np.float32)
+    wanted = (queries.astype(np.float64) @ database.astype(np.float64).T).astype(np.float32)
+    found = search(database, queries, 20, chunk=450)
+    np.testing.assert_array_equal(found.indices, np.argsort(-wanted, axis=1, kind="stable")[:, :20])
+
+
+@BOTH_WAYS
+def test_all_rows_alike_are_ranked_by_index(search):
+    """As from a network that has collapsed: every row of every chunk may be among the best."""
+    database = _unit(np.ones((500, 33)) + 1e-9).astype(np.float32)
+    found = search(database, database[:40], 20, chunk=64)
+    np.testing.assert_array_equal(found.indices, np.tile(np.arange(20), (40, 1)))
+
+
+_ON_DEVICES = """
+import sys
+import jax, numpy as np
+from crisalad_jax.retrieval import search as retrieval
+assert len(jax.local_devices()) == int(sys.argv[2])
+arrays = np.load(sys.argv[1])
+for name, (k, chunk) in {"some": (20, 300), "tiny": (3, 1), "all": (700, 4096)}.items():
+    # Which a CPU leaves to numpy.
+    found = retrieval._search(
+        arrays["database"], arrays["queries"], k, chunk, on_host=False
+    )
+    np.savez(f"{sys.argv[3]}-{name}.npz", *found)
+"""
+
+
+@pytest.mark.parametrize(
+    "count",
+    [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow), 8],
+)
+def test_devices_change_no_bit(count, tmp_path):
+    database, queries = _random_unit(14, 700, 96), _random_unit(15, 30, 96)
+    database[400:500] = database[:100]
+    database[600:660] = database[3]
+    queries[0] = database[3]
+    np.savez(tmp_path / "arrays.npz", database=database, queries=queries)
+    arguments = map(str, (tmp_path / "arrays.npz", count, tmp_path / "found"))
+    in_a_program(_ON_DEVICES, tmp_path, *arguments, JAX_NUM_CPU_DEVICES=str(count))
+    for name, k in {"some": 20, "tiny": 3, "all": 700}.items():
+        found = np.load(tmp_path / f"found-{name}.npz")
+        expected = retrieval.search(database, queries, k)
+        np.testing.assert_array_equal(found["arr_0"], expected.indices)
+        np.testing.assert_array_equal(found["arr_1"], expected.similarities)
+
+
+_IN_MEMORY = """
+import pathlib, re, sys
+import jax, numpy as np
+from crisalad_jax.retrieval.search import search
+
+def most():
+    # What getrusage says begins with the memory of the program that started this one.
+    status = pathlib.Path("/proc/self/status").read_text()
+    return int(re.search("VmHWM:\\s*(\\d+) kB", status)[1])
+
+database, queries = (np.load(path, mmap_mode="r") for path in sys.argv[1:])
+search(database[:2048], queries, 5, chunk=512)
+before = most()
+search(database, queries, 5, chunk=512)
+print(most() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's account of memory")
+def test_memory_does_not_grow_with_the_database(tmp_path):
+    """10,000 and 100,000 rows of 1 KiB, of which a program that kept them would have 102 MB."""
+    generator = np.random.default_rng(0)
+    np.save(tmp_path / "queries.npy", _random_unit(1, 16, 256))
+    grown = {}
+    for count in (10_000, 100_000):
+        path = tmp_path / f"{count}.npy"
+        rows = np.lib.format.open_memmap(path, "w+", np.float32, (count, 256))
+        for start in range(0, count, 10_000):
+            part = generator.standard_normal((10_000, 256), np.float32)
+            rows[start : start + 10_000] = _unit(part)
+        del rows
+        said = in_a_program(_IN_MEMORY, tmp_path, str(path), str(tmp_path / "queries.npy"))
+        grown[count] = int(said) * 1024
+    # A chunk is 0.5 MB, the pages around it some MB; what is read in all, 92 MB more.
+    assert grown[100_000] - grown[10_000] < 12e6
+
+
+def test_a_copy_on_write_map_keeps_what_was_written_to_it(tmp_path):
+    """Its pages are never let go: what they hold is nowhere else."""
+    np.save(tmp_path / "database.npy", _random_unit(16, 4000, 16))
+    mapped = np.load(tmp_path / "database.npy", mmap_mode="c")
+    mapped[3000] = np.eye(16)[2]
+    query = np.eye(16, dtype=np.float32)[2:3]
+    for _ in range(2):
+        assert retrieval.search(mapped, query, 1, chunk=64).indices == 3000
+
+
+def test_progress_is_shown_when_asked(capfd):
+    rows = _random_unit(0, 9, 4)
+    retrieval.search(rows, rows, 1)
+    assert capfd.readouterr() == ("", "")
+    retrieval.search(rows, rows, 1, label="looking", quiet=False)
+    shown = capfd.readouterr().err
+    assert "looking" in shown
+    assert "9/9" in shown
+
+
+@pytest.mark.parametrize("name", ["database", "queries"])
+@pytest.mark.parametrize(
+    ("value", "found"), [(np.nan, "not finite"), (np.inf, "not finite"), (3, "of length")]
+)
+def test_wrong_rows_are_named(name, value, found):
+    arrays = {"database": _random_unit(0, 9, 4), "queries": _random_unit(1, 9, 4)}
+    arrays[name][6, 1] = value
+    with pytest.raises(InputError, match=rf"^{name}: row 6 is {found}"):
+        retrieval.search(**arrays, k=1, chunk=4)
+
+
+def test_wrong_shapes_and_numbers_are_named():
+    rows, none = _random_unit(0, 9, 4), np.zeros((0, 4), np.float32)
+    for arguments, message in [
+        ((none, rows, 1), r"^database: found shape \(0, 4\)"),
+        ((rows, none, 1), r"^queries: found shape \(0, 4\)"),
+        ((rows, _random_unit(1, 2, 5), 1), "^queries: found descriptors of length 5, expected 4"),
+        ((rows, rows, 0), "^k: found 0"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            retrieval.search(*arguments)
+    with pytest.raises(InputError, match=r"^chunk: found 0"):
+        retrieval.search(rows, rows, 1, chunk=0)

@@ -1,0 +1,254 @@
+"""What the benchmarks reckon with: turns, ratios, memory, waiting. No time is asserted."""
+
+import concurrent.futures
+import itertools
+import json
+import pathlib
+import sys
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.places import read_places
+from crisalad_jax.nn.costs import part_costs
+from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN
+from crisalad_jax.retrieval.descriptor_files import open_npy
+from crisalad_jax.training.recipes import recipe
+
+
+@pytest.fixture(scope="module")
+def timing(scripts: Any) -> ModuleType:
+    return scripts("timing")
+
+
+def test_a_ratio_is_of_the_same_round(timing: ModuleType) -> None:
+    """4 / 2, 9 / 3 and 8 / 8; the medians over all rounds would give 8 / 3."""
+    found = timing.ratio(timing.Timed([4.0, 9.0, 8.0]), timing.Timed([2.0, 3.0, 8.0]))
+    assert found == (2.0, 1.0, 3.0)
+    assert timing.times(found) == "2.00 (1.00 to 3.00)"
+
+
+def test_contenders_take_turns(timing: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock on which a call of one takes 1 s and of the other 3: five calls at least."""
+    now, called = 0.0, []
+
+    def call(name: str, seconds: float) -> None:
+        nonlocal now
+        now += seconds
+        called.append(name)
+
+    def sleep(seconds: float) -> None:
+        nonlocal now
+        now += seconds
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now)
+    monkeypatch.setattr(timing.time, "sleep", sleep)
+    found = timing.race({"a": lambda: call("a", 1), "b": lambda: call("b", 3)}, rounds=2, calls=5)
+    assert found == {"a": timing.Timed([1e3, 1e3]), "b": timing.Timed([3e3, 3e3])}
+    # One call that does not count, then five.
+    assert [(name, len(list(turn))) for name, turn in itertools.groupby(called)] == [
+        *(("a", 6), ("b", 6)),
+        *(("a", 6), ("b", 6)),
+    ]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there the allocator itself counts")
+def test_torchs_memory_is_the_most_at_once(timing: ModuleType) -> None:
+    """Two arrays of a million numbers at the same time, although three are made."""
+
+    def call() -> torch.Tensor:
+        first = torch.ones(1_000_000)
+        second = first + 1
+        del first
+        return second * 2
+
+    # And a few bytes for the numbers 1 and 2.
+    assert 8_000_000 <= timing.torch_memory(call) < 8_000_100
+
+
+def test_descriptors_that_differ_are_not_raced(scripts: Any) -> None:
+    bench = scripts("bench_describe")
+
+    def contender(name: str, found: Any) -> Any:
+        return bench.Contender(name, lambda: found, lambda: 0)
+
+    theirs, ours = torch.tensor([[0.6, 0.8]]), jnp.array([[0.6, 0.801]])
+    bench.check([contender("torch", theirs), contender("ours", ours)], tolerance=2e-3)
+    with pytest.raises(RuntimeError, match=r"ours: differs from torch by 1\.0e-03"):
+        bench.check([contender("torch", theirs), contender("ours", ours)], tolerance=5e-4)
+
+
+def test_only_what_no_program_hides_is_waited_for(
+    scripts: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = scripts("bench_extract")
+    watch = bench.Watch()
+    # Asked and answered: before any program, with one that ended at 5, with one still running.
+    clock = iter([0.0, 2.0, 4.0, 9.0, 9.0, 20.0])
+    monkeypatch.setattr(bench.time, "perf_counter", lambda: next(clock))
+    batches = watch.each(["first", "second"])
+    assert next(batches) == "first"
+    assert watch.waited == 2
+    watch._ended = concurrent.futures.Future()
+    watch._ended.set_result(5.0)
+    assert next(batches) == "second"
+    assert watch.waited == 2 + (9 - 5)
+    watch._ended = concurrent.futures.Future()
+    assert next(batches, None) is None
+    assert watch.waited == 6
+
+
+def test_operations_of_a_step_are_those_of_what_trains(scripts: Any) -> None:
+    """Of all three times the forward's; of adapters and head little more than twice."""
+    bench, tiny, paper = scripts("bench_train"), recipe("tiny"), recipe("b14")
+    assert (tiny.trainable, paper.trainable) == ("all", "adapters+head")
+
+    def forward(recipe: Any) -> float:
+        return 2 * 8 * sum(cost.macs for cost in part_costs(recipe.model, images=8))
+
+    assert bench.operations(tiny, 8) == 3 * forward(tiny)
+    # The head's are a twentieth of all, the embedding's less.
+    assert 1.9 * forward(paper) < bench.operations(paper, 8) < 2.2 * forward(paper)
+
+
+PROGRAM = """
+  %dot.7 = f32[9]{0} dot(%a, %b), metadata={op_name="jit(f)/jvp()/...jd,...di->...ji/dot_general"}
+  ROOT %dot.8 = f32[9]{0} dot(%a, %b), metadata={op_name="jit(f)/jvp()/dot_general"}
+  %copy_bitcast_fusion.1 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/transpose"}
+  %bitcast_dynamic-update-slice_fusion = f32[9]{0} fusion(%a, %b)
+  %add_bitcast_fusion = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/add"}
+  %wrapped_broadcast.2 = f32[9]{0} fusion(), metadata={op_name="jit(f)/broadcast_in_dim"}
+  %broadcast_add_fusion.2 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/add"}
+  %all-reduce.3 = f32[9]{0} all-reduce(%a), metadata={op_name="jit(f)/dot_general"}
+  %copy_multiply_fusion.1 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/mul"}
+  %cond.5 = f32[9]{0} conditional(%a), metadata={op_name="jit(f)/cond"}
+  %while.4 = f32[9]{0} while(%a), metadata={op_name="jit(f)/while"}
+"""
+
+
+def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
+    """Each once, the n-th for 2^n microseconds; what is not of the program, or holds it, never."""
+    bench = scripts("bench_profile")
+    names = (
+        *("dot.7", "dot.8", "copy_bitcast_fusion.1", "bitcast_dynamic-update-slice_fusion"),
+        *("add_bitcast_fusion", "wrapped_broadcast.2", "broadcast_add_fusion.2", "all-reduce.3"),
+        *("while.4", "another", "copy_multiply_fusion.1", "cond.5"),
+    )
+    events = [{"ph": "X", "name": name, "dur": 2**n} for n, name in enumerate(names)]
+    found = bench.milliseconds([*events, {"ph": "M", "name": "dot.7"}, {}], PROGRAM)
+    assert found == {
+        "between devices": 0.128,
+        "attention's products": 0.001,
+        "other products": 0.002,
+        "constants written": 0.032,
+        "copies": 0.004 + 0.008,
+        "numbers one by one, sums": 0.016 + 0.064 + 1.024,
+    }
+
+
+def test_a_tree_of_the_size_of_gsv_cities_is_one(scripts: Any, tmp_path: pathlib.Path) -> None:
+    scripts("bench_index").write_tree(tmp_path, cities=2, places=3, images=26, size=16)
+    places = read_places(tmp_path)
+    assert places.cities == ("City00", "City01")
+    assert places.image_counts.tolist() == [5, 5, 4, 4, 4, 4]
+    first = read_image(places.path(0))
+    assert first.shape == (16, 16, 3)
+    # The same place from another year, and another place; JPEG of quality 95 loses a few levels.
+    assert np.abs(read_image(places.path(1)).astype(int) - first).mean() < 5
+    assert np.abs(read_image(places.path(5)).astype(int) - first).mean() > 20
+
+
+def test_both_loaders_give_the_same_images(
+    scripts: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nothing is drawn: Pillow and OpenCV differ by a level or two of 256."""
+    bench = scripts("bench_loader")
+    monkeypatch.setattr(bench, "AUGMENT", RandAugmentConfig(operations=0))
+    bench.write_tree(tmp_path, 8, (60, 80))
+    places = read_places(tmp_path)
+    dataset = bench.Photographs(places)
+    (ours,) = bench.our_batches(places, 8)
+    mean, deviation = (np.array(x).reshape(3, 1, 1) for x in (IMAGENET_MEAN, IMAGENET_DEVIATION))
+    for image, label, index in zip(ours.images, ours.labels, ours.indices, strict=True):
+        values, place = dataset[int(index)]
+        assert place == label == index // 4
+        pixels = 255 * (values.numpy() * deviation + mean)
+        np.testing.assert_allclose(pixels.transpose(1, 2, 0), image, atol=3)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_descriptors_are_written_as_numpy_reads_them(
+    scripts: Any, tmp_path: pathlib.Path, dtype: str
+) -> None:
+    path = tmp_path / "rows.npy"
+    scripts("bench_search").write_descriptors(path, 70_000, 256, dtype)  # in two parts
+    rows = open_npy(path)
+    assert (rows.shape, rows.dtype) == ((70_000, 256), np.dtype(dtype))
+    lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
+    # bfloat16 rounds each number by up to 2^-9 of itself.
+    np.testing.assert_allclose(lengths, 1, atol=2e-3 if dtype == "bfloat16" else 1e-6)
+    assert len(np.unique(rows[:, 0].astype(np.float32))) > 500
+
+
+@pytest.mark.slow
+def test_the_search_is_measured(
+    scripts: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All three studies at a small size: what is found, not how fast."""
+    flags = (
+        f"bench_search --out {tmp_path} --rows 2000 --lengths 32 --queries 20 --rounds 1 "
+        f"--memory-rows 1000 4000 --memory-length 64 --folder {tmp_path} "
+        "--approximate-rows 10000 --approximate-length 16"
+    )
+    monkeypatch.setattr(sys, "argv", flags.split())
+    scripts("bench_search").main()
+    assert not list(tmp_path.glob("search-*"))  # the databases are gone
+    speed, memory, approximate = (
+        json.loads((tmp_path / f"{name}.json").read_text())
+        for name in ("bench_search", "search_memory", "search_approximate")
+    )
+    # Two distances that FAISS rounds to one may stand the other way round.
+    assert all(value["alike"] > 0.99 for value in speed)
+    assert [value["rows"] for value in memory] == [1000, 4000]
+    assert all(value["memory"] > 2e7 for value in memory)  # an interpreter, at least
+    recalls = {value["contender"]: value["recall"] for value in approximate}
+    assert recalls["exact"] == 1
+    assert recalls["hnsw, default"] > 0.95
+    assert recalls["ivf-pq, default"] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "words"),
+    [
+        ("bench_describe", "--batches 0", "argument --batches: found '0', expected a whole number"),
+        ("bench_describe", "--sizes 98", "argument --sizes: found '98', expected a size such as"),
+        ("bench_describe", "--sizes 99x99", "image size: found 99 x 99, expected sides that are"),
+        ("bench_train", "--rounds 0", "argument --rounds: found '0'"),
+        ("bench_train", "--page missing.md", "missing.md: found no such file, expected a page"),
+        ("bench_extract", "--images none", "argument --images: found 'none'"),
+        ("bench_profile", "--out pyproject.toml", "expected a folder that can be written to"),
+        ("bench_start", "--page README.md", "README.md: found no <!-- bench_start -->"),
+        ("bench_modes", "--page CONTRIBUTING.md", "found no <!-- bench_products -->"),
+        ("bench_index", "--images 10", "found 10 images of 46000 places, expected at least 48"),
+        ("bench_loader", "--batch 6", "found 960 images in batches of 6, expected a multiple of"),
+        ("bench_memory", "--images 190", "found 190 images, expected a multiple of 4"),
+        ("bench_overlap", "--steps 4", "found 4 steps of 48 images, expected more than 4 steps"),
+        ("bench_search", "--dtype int8", "argument --dtype: invalid choice: 'int8'"),
+        ("bench_search", "nothing", "found nothing, expected of bench_search, search_memory"),
+        ("bench_search", "--memory-rows 9000000000", "GB free, expected 304128.0 GB"),
+        ("bench_sinkhorn", "--calls -1", "argument --calls: found '-1'"),
+    ],
+)
+def test_what_cannot_be_is_said_before_the_work(scripts, monkeypatch, capsys, name, flags, words):
+    bench = scripts(name)
+    monkeypatch.setattr(sys, "argv", [name, *flags.split()])
+    with pytest.raises(SystemExit) as stop:
+        bench.main()
+    assert stop.value.code == 2
+    assert words in capsys.readouterr().err

@@ -1,0 +1,125 @@
+"""The documentation: it builds, nothing public is left out, and what it shows runs."""
+
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+import crisalad_jax as cj
+from crisalad_jax import sinkhorn
+from crisalad_jax.config.parts import REGISTRIES
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+TEXTS = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+PATH = re.compile(r"`((?:examples|scripts|tests|docs|\.ci)/[\w./-]*[\w/])`")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built site."""
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", out]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def entries(site):
+    """What stands below every heading of the reference, up to the next, by the heading's anchor."""
+    found = {}
+    for page in (site / "reference").rglob("*.html"):
+        for piece in re.split(r"(?=<h[1-6] )", page.read_text(encoding="utf-8"))[1:]:
+            anchor = re.match(r'<h[1-6] id="([^"]+)"', piece)
+            if anchor:
+                found[anchor[1]] = piece
+    return found
+
+
+def test_site_builds_without_a_dead_link(site):
+    # mkdocs.yml makes an error of every link and anchor that leads nowhere.
+    assert (site / "how-to" / "add-a-loss" / "index.html").is_file()
+    assert (site / "reference" / "sinkhorn" / "index.html").is_file()
+
+
+def _documented(entries, anchors):
+    # An entry has words of its own, not a signature alone.
+    return any("<p>" in entries.get(anchor, "") for anchor in anchors)
+
+
+def test_reference_has_every_public_name(entries):
+    missing = []
+    for name in cj.__all__:
+        anchors = [f"crisalad_jax.{name}"]
+        if getattr(sinkhorn, name, None) == getattr(cj, name):
+            anchors.append(f"crisalad_jax.sinkhorn.{name}")
+        if name not in ("sinkhorn", "__version__") and not _documented(entries, anchors):
+            missing.append(name)
+    assert not missing
+
+
+def test_reference_has_every_name_of_the_transport(entries):
+    names = sinkhorn.__all__
+    assert not [n for n in names if not _documented(entries, [f"crisalad_jax.sinkhorn.{n}"])]
+
+
+@pytest.mark.parametrize("kind", sorted(REGISTRIES))
+def test_reference_has_every_built_in_part(entries, kind):
+    classes = {anchor.rpartition(".")[2] for anchor in entries}
+    registry = REGISTRIES[kind]
+    parts = [registry.find(name) for name in registry]
+    ours = [part for part in parts if part.__module__.startswith("crisalad_jax.")]
+    assert ours
+    assert not [part.__name__ for part in ours if part.__name__ not in classes]
+
+
+def test_public_names_say_what_they_do():
+    constants = {"PRESETS", "__version__"}
+    assert not [n for n in cj.__all__ if n not in constants and not getattr(cj, n).__doc__]
+
+
+def test_a_name_left_out_would_be_found(entries):
+    assert not _documented(entries, ["crisalad_jax.no_such_name"])
+
+
+def test_readme_is_short():
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_links_outside_of_the_site_lead_somewhere(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    relative = [link.partition("#")[0] for link in LINK.findall(text) if ":" not in link]
+    assert not [link for link in relative if link and not (ROOT / link).exists()]
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_files_that_a_page_names_exist(page):
+    named = PATH.findall(page.read_text(encoding="utf-8"))
+    assert not [name for name in named if not (ROOT / name).exists()]
+
+
+@pytest.mark.slow
+def test_what_the_pages_show_runs():
+    pages = [page for page in TEXTS if "```" in page.read_text(encoding="utf-8")]
+    # Most of the time is XLA's, which need not optimise what runs once.
+    flags = "--xla_backend_optimization_level=0 " + os.environ.get("XLA_FLAGS", "")
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    program = [sys.executable, "tests/docs_blocks.py", *map(str, pages)]
+    done = subprocess.run(
+        program, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+    ran = {m[1]: int(m[2]) for m in re.finditer(r"(\S+): (\d+) blocks", done.stdout)}
+    for page in (README, *PAGES):
+        if page == README or (page.parent.name == "how-to" and page.stem.startswith("add-")):
+            assert ran[str(page)] >= 2, page

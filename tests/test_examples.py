@@ -1,0 +1,397 @@
+"""The examples: each runs, and what it computes is held against an independent source."""
+
+import ast
+import pathlib
+import subprocess
+import sys
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.config import plugins
+from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.sinkhorn import (
+    SinkhornConfig,
+    SinkhornResult,
+    SinkhornStep,
+    assign_with_dustbin,
+    solve,
+)
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+
+EXAMPLES = pathlib.Path(__file__).parents[1] / "examples"
+PLUGINS = sorted((EXAMPLES / "plugins").glob("*.py"))
+
+
+pytestmark = pytest.mark.usefixtures("own_parts")
+
+
+def example(name: str) -> ModuleType:
+    """Load an example as --plugin does."""
+    path = (EXAMPLES / f"{name}.py").resolve()
+    plugins.load_plugin(str(path))
+    return next(sys.modules[module] for module, file in plugins._FILES.items() if file == path)
+
+
+def plan_of(result: SinkhornResult) -> np.ndarray:
+    return np.asarray(jnp.exp(result.log_plan))
+
+
+# The five examples
+
+
+def test_an_example_is_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "sinkhorn_step.py"], capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    assert done.stdout.startswith("masses of the columns: 3.000, ")
+
+
+@pytest.mark.parametrize("path", [*EXAMPLES.glob("*.py"), *PLUGINS], ids=lambda path: path.stem)
+def test_every_example_says_how_it_is_run(path: pathlib.Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    words = ast.get_docstring(ast.parse(text)) or ""
+    name = path.relative_to(EXAMPLES.parent).as_posix()
+    is_script = 'if __name__ == "__main__":' in text
+    assert is_script == (path.parent == EXAMPLES)
+    assert f"python {name}" in words or not is_script
+    assert f"--plugin {name}" in words or "register" not in text
+    assert name.removeprefix("examples/") in (EXAMPLES / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_steps_columns_are_priced_where_they_are_full(capsys) -> None:
+    """The conditions of the optimum: of a concave problem they are enough."""
+    result, gradient = example("sinkhorn_step").main()
+    plan, price = plan_of(result), np.asarray(result.potentials.column)
+    np.testing.assert_allclose(plan.sum(axis=1), 1, rtol=1e-6)  # met last, to float32's rounding
+    masses = plan.sum(axis=0)
+    # A hundred iterations of a problem that converges by a digit in fewer than ten.
+    np.testing.assert_allclose(masses[0], 3, rtol=1e-5)
+    assert (masses[1:] < 2.9).all()
+    assert price[0] < -0.1
+    np.testing.assert_array_equal(price[1:], 0)
+    assert np.isfinite(gradient).all()
+    assert "3.000" in capsys.readouterr().out
+
+
+def test_the_aggregator_averages_as_numpy_does() -> None:
+    module = example("aggregator")
+    _, config, descriptors = module.main()
+    assert descriptors.shape == (2, config.descriptor_dim)
+    generator = np.random.default_rng(0)
+    patches = generator.normal(size=(2, 5, 6))
+    queries = generator.normal(size=(6, 3))
+    scores = np.exp(patches @ queries)
+    shares = scores / scores.sum(axis=1, keepdims=True)
+    expected = np.concatenate([(shares[..., h, None] * patches).sum(axis=1) for h in range(3)], 1)
+    part = module.AttentionPool(heads=3)
+    features = Features(jnp.zeros((2, 6)), jnp.asarray(patches, jnp.float32))
+    tokens = part.apply({"queries": jnp.asarray(queries)}, features, (1, 5), key=None)
+    np.testing.assert_allclose(tokens.global_token, expected, atol=1e-5)  # ten roundings of float32
+    assert tokens.local.shape == (2, 0, 18)
+
+
+def test_the_loss_is_that_of_loops() -> None:
+    module = example("loss")
+    losses = module.main()
+    assert losses == sorted(losses, reverse=True)
+    assert losses[-1] < losses[0] / 10
+    generator = np.random.default_rng(1)
+    units = generator.normal(size=(7, 4))
+    units /= np.linalg.norm(units, axis=1, keepdims=True)
+    labels = [0, 0, 0, 1, 1, 2, 2]  # the last is not valid: place 2 has no pair
+    expected = []
+    for i in range(5):
+        others = [j for j in range(6) if j != i]
+        same = [units[i] @ units[j] for j in others if labels[j] == labels[i]]
+        unlike = [units[i] @ units[j] for j in others if labels[j] != labels[i]]
+        expected.append(np.log1p(np.exp(10 * (max(unlike) - min(same)))))
+    found = module.cj.metric_loss(
+        jnp.asarray(units, jnp.float32),
+        jnp.array(labels),
+        module.cj.LossConfig(kind="soft-triplet", miner="none"),
+        valid=jnp.arange(7) < 6,
+    ).loss
+    # Gaps of a rounding of float32, times the scale of 10.
+    np.testing.assert_allclose(found, np.mean(expected), rtol=1e-5)
+
+
+def test_the_losss_gradient_is_finite_without_pairs() -> None:
+    config = example("loss").cj.LossConfig(kind="soft-triplet")
+
+    def loss(units: Any) -> Any:
+        from crisalad_jax.losses import metric_loss
+
+        return metric_loss(units, jnp.arange(3), config).loss
+
+    value, gradient = jax.value_and_grad(loss)(jnp.eye(3))
+    assert value == 0
+    np.testing.assert_array_equal(gradient, 0)
+
+
+def test_the_loop_learns_to_tell_places_apart(capsys) -> None:
+    module = example("training_loop")
+    losses, trained, _ = module.main()
+    assert len(capsys.readouterr().out.splitlines()) == len(losses) == module.STEPS
+    assert losses[-1] < losses[0] / 4
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(trained))
+
+
+def test_a_layer_is_torchs() -> None:
+    pytest.importorskip("torch")
+    differences = example("parity_layer").main()
+    assert len(differences) == 13
+    # Relative to the largest number; sums of 64 products in float32, in another order.
+    assert max(differences.values()) < 5e-6
+
+
+# The plug-ins
+
+
+@pytest.mark.parametrize("path", PLUGINS, ids=lambda path: path.stem)
+def test_a_plug_in_is_short(path: pathlib.Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) < 40
+
+
+def problem_of(epsilon: float = 1.0) -> tuple[Any, Any, Any]:
+    """Scores of two problems, over epsilon, and masses that are not all alike."""
+    scores = jax.random.normal(jax.random.key(3), (2, 12, 5)) / epsilon
+    return scores, jnp.zeros(12), jnp.log(jnp.array([1.0, 2, 2, 3, 4]))
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [("annealing", {"start": 1.0}), ("momentum", {"weight": 1.0})],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+@pytest.mark.parametrize("domain", ["scaling", "log"])
+def test_without_its_own_way_a_step_is_sinkhorns(name: str, fields: Any, domain: Any) -> None:
+    example(f"plugins/{name}")
+    step = REGISTRIES["step"].make(name, **fields)
+    plain = SinkhornConfig(domain=domain)
+    config = SinkhornConfig(step=step, domain=domain)
+
+    scores, *masses = problem_of()
+    weights = jax.random.normal(jax.random.key(4), scores.shape)
+
+    def weighted(scores: Any, how: SinkhornConfig) -> Any:
+        log_plan = solve(scores, *masses, config=how).log_plan
+        return (log_plan * weights).sum(), log_plan
+
+    (_, expected), slope = jax.value_and_grad(weighted, has_aux=True)(scores, plain)
+    (_, found), gradient = jax.value_and_grad(weighted, has_aux=True)(scores, config)
+    # Roundings of logarithms up to 5, of three iterations, in another order.
+    np.testing.assert_allclose(found, expected, atol=5e-6)
+    np.testing.assert_allclose(gradient, slope, atol=5e-6)
+
+
+def iterations_of(step: Any, epsilon: float) -> int:
+    config = SinkhornConfig(step=step, tolerance=1e-4, iterations=5000, gradient="stop")
+    result = solve(*problem_of(epsilon), config=config)
+    assert result.converged[0]
+    return int(result.iterations[0])
+
+
+def test_momentum_takes_fewer_iterations_of_a_hard_problem() -> None:
+    """Of an eigenvalue of 1 - x it makes 1 - 2x, to first order: half as many."""
+    momentum = example("plugins/momentum").Momentum
+    plain, half = (iterations_of(momentum(weight), 0.1) for weight in (1.0, 1.5))
+    assert plain == iterations_of("sinkhorn", 0.1)
+    assert plain > 100
+    assert half < 0.6 * plain
+
+
+def test_momentum_arrives_where_sinkhorn_does() -> None:
+    momentum = example("plugins/momentum").Momentum
+    converged = {"tolerance": 1e-6, "iterations": 500, "gradient": "implicit"}
+    found, expected = (
+        solve(*problem_of(), config=SinkhornConfig(step=step, **converged))
+        for step in (momentum(), SinkhornStep())
+    )
+    # Ten times the tolerance, relative.
+    np.testing.assert_allclose(plan_of(found), plan_of(expected), rtol=1e-5)
+
+
+def test_annealing_uses_the_iterations_number() -> None:
+    """Its schedule by hand, in float64; at its end it is at epsilon itself."""
+    module = example("plugins/annealing")
+    scores, log_mu, log_nu = (np.asarray(each, np.float64) for each in problem_of())
+    row = np.zeros((2, 12))
+
+    def lse(values: np.ndarray, axis: int) -> np.ndarray:
+        return np.log(np.exp(values).sum(axis=axis))
+
+    for epsilon in (8.0, 4.0, 2.0, 1.0):
+        column = epsilon * (log_nu - lse((scores + row[..., None]) / epsilon, -2))
+        row = epsilon * (log_mu - lse((scores + column[:, None]) / epsilon, -1))
+    expected = np.exp(scores + row[..., None] + column[:, None])
+    step = module.Annealing(start=8.0, iterations=3)
+    found = solve(*problem_of(), config=SinkhornConfig(step=step, iterations=4))
+    np.testing.assert_allclose(plan_of(found), expected, rtol=1e-5)  # float32, four iterations
+    cut = solve(*problem_of(), config=SinkhornConfig(step=step, iterations=1))
+    # `finish` meets the rows wherever the schedule is left; to float32's rounding.
+    np.testing.assert_allclose(plan_of(cut).sum(axis=-1), 1, rtol=1e-6)
+
+
+def project(values: np.ndarray, mass: float) -> np.ndarray:
+    """The nearest point with numbers from 0 on that sum to `mass`: by bisection of the shift."""
+    low, high = values.min() - mass, values.max()
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if np.maximum(values - middle, 0).sum() > mass else (low, middle)
+    return np.maximum(values - high, 0)
+
+
+def test_a_row_of_quadratic_transport_is_a_sparsemax() -> None:
+    offset = example("plugins/quadratic").offset
+    scores = 2 * np.random.default_rng(2).normal(size=(20, 6))
+    mass = np.linspace(0.5, 3, 20)
+    expected = np.stack([project(row, each) for row, each in zip(scores, mass, strict=True)])
+    shift = offset(jnp.asarray(scores, jnp.float32), jnp.asarray(mass, jnp.float32))
+    found = np.maximum(scores + np.asarray(shift)[:, None], 0)
+    np.testing.assert_allclose(found, expected, atol=2e-6)  # sums of six numbers up to 6, float32
+    assert (expected == 0).mean() > 0.3
+
+
+def test_quadratic_transport_is_optimal_and_sparse() -> None:
+    """Its conditions, which are enough: the positive part of a sum, with the masses asked for."""
+    example("plugins/quadratic")
+    config = SinkhornConfig(step="quadratic", iterations=200)
+    scores, log_mu, log_nu = problem_of()
+    result = solve(scores, log_mu, log_nu, config=config)
+    plan = plan_of(result)
+    np.testing.assert_allclose(plan.sum(axis=-1), 1, rtol=1e-6)  # met last, to float32's rounding
+    # Two hundred projections in turn, which converge linearly.
+    np.testing.assert_allclose(plan.sum(axis=-2), np.exp(log_nu)[None].repeat(2, 0), rtol=1e-4)
+    row, column = result.potentials
+    kept = np.maximum(scores + row[..., None] + column[:, None], 0)
+    np.testing.assert_allclose(plan, kept, atol=1e-6)  # a logarithm and back
+    assert (plan == 0).mean() > 0.3
+    assert result.finite.all()
+
+
+def test_a_learnt_epsilon_is_epsilon() -> None:
+    example("plugins/learnt_epsilon")
+    config = SinkhornConfig(step="learnt-epsilon", iterations=20)
+    params = {"log_epsilon": jnp.log(jnp.float32(0.3))}
+    found = solve(*problem_of(), config=config, step_params=params)
+    expected = solve(*problem_of(), epsilon=0.3, config=SinkhornConfig(iterations=20))
+    # Scores up to 10 over epsilon, in float32.
+    np.testing.assert_allclose(plan_of(found), plan_of(expected), rtol=5e-5)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"iterations": 4},
+        {"iterations": 500, "tolerance": 1e-12, "gradient": "implicit"},
+    ],
+    ids=["unrolled", "implicit"],
+)
+def test_a_learnt_epsilons_gradient_is_a_finite_difference(how: Any) -> None:
+    example("plugins/learnt_epsilon")
+    with jax.enable_x64(True):
+        scores, log_mu, log_nu = (jnp.asarray(each, jnp.float64) for each in problem_of())
+        config = SinkhornConfig(step="learnt-epsilon", **how)
+
+        def value(log_epsilon: Any) -> Any:
+            params = {"log_epsilon": log_epsilon}
+            result = solve(scores, log_mu, log_nu, config=config, step_params=params)
+            return (jnp.exp(result.log_plan) * scores).sum()
+
+        at, by = jnp.asarray(-0.5), 1e-4
+        difference = (value(at + by) - value(at - by)) / (2 * by)
+        gradient = jax.grad(value)(at)
+    assert abs(gradient) > 0.1
+    np.testing.assert_allclose(gradient, difference, rtol=1e-6)  # the square of the difference
+
+
+def test_a_dustbin_network_of_zeros_is_a_constant() -> None:
+    """Columns are relaxed: else a constant would change nothing at all."""
+    module = example("plugins/learnt_dustbin")
+    part = module.NetworkDustbin(hidden=3)
+    params = part.init(jax.random.key(0), 7)
+    scores, patches = (jax.random.normal(jax.random.key(k), (2, 9, n)) for k, n in ((1, 4), (2, 7)))
+    relaxed = {"column_tau": 0.7}
+    found = assign_with_dustbin(scores, params, part, patches=patches, **relaxed)
+    expected = assign_with_dustbin(scores, jnp.float32(1), "column", **relaxed)
+    np.testing.assert_array_equal(found.log_plan, expected.log_plan)
+    other = assign_with_dustbin(scores, jnp.float32(2), "column", **relaxed)
+    assert abs(other.log_plan - expected.log_plan).max() > 0.1
+    # And else it is the score that numpy's network gives each patch.
+    params |= {"out": jnp.array([1.0, -2, 0.5])}
+    hidden = np.maximum(np.asarray(patches) @ np.asarray(params["hidden"]), 0)
+    column = jnp.asarray(hidden @ np.asarray(params["out"]) + 1)
+    found = assign_with_dustbin(scores, params, part, patches=patches)
+    expected = assign_with_dustbin(scores, column, "token")
+    np.testing.assert_allclose(found.log_plan, expected.log_plan, atol=1e-5)  # float32's products
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"sinkhorn": "learnt-epsilon"},
+        {"sinkhorn": "momentum"},
+        pytest.param({"sinkhorn": "annealing"}, marks=pytest.mark.slow),
+        pytest.param({"sinkhorn": "quadratic"}, marks=pytest.mark.slow),
+        {"dustbin": "network"},
+    ],
+    ids=lambda fields: next(iter(fields.values())),
+)
+def test_gradients_are_finite_in_a_model(fields: Any) -> None:
+    """Of all that SALAD learns; what a plug-in learns has a gradient, too."""
+    for path in PLUGINS:
+        example(f"plugins/{path.stem}")
+    if "sinkhorn" in fields:
+        fields = {"sinkhorn": SinkhornConfig(step=fields["sinkhorn"])}
+    salad = SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, **fields)
+    params = salad.init(jax.random.key(0), ViTConfig(dim=12), (3, 3))
+    keys = jax.random.split(jax.random.key(1))
+    features = Features(
+        *(jax.random.normal(k, (2, *n, 12)) for k, n in zip(keys, ((), (9,)), strict=True))
+    )
+    weights = jax.random.normal(jax.random.key(2), (2, 4, 8))
+
+    @jax.jit
+    def value(params: Any) -> Any:
+        tokens = salad.apply(params, features, (3, 3), key=None)
+        return (tokens.local * weights).sum(), tokens.transport
+
+    (_, statistics), gradient = jax.value_and_grad(value, has_aux=True)(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((gradient, statistics)))
+    learnt = {
+        n: leaf for n, leaf in named_leaves(gradient).items() if "log_eps" in n or ".out" in n
+    }
+    assert all(abs(leaf).max() > 1e-4 for leaf in learnt.values())
+    assert abs(gradient.score.fc2.weight).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["annealing", "quadratic"])
+def test_steps_of_balanced_problems_refuse_others(name: str) -> None:
+    example(f"plugins/{name}")
+    with pytest.raises(InputError, match=f"^step {name}: found a tau below 1, expected 1"):
+        solve(*problem_of(), row_tau=0.5, config=SinkhornConfig(step=name))
+
+
+def test_annealing_that_never_cools_is_told() -> None:
+    """A fixed point by optimistix takes every step for the first."""
+    example("plugins/annealing")
+    how = {"gradient": "optimistix", "tolerance": 1e-4, "iterations": 100}
+    result = solve(*problem_of(), config=SinkhornConfig(step="annealing", **how))
+    assert not result.converged.any()
+
+
+def test_a_step_that_learns_asks_for_its_parameters() -> None:
+    example("plugins/learnt_epsilon")
+    words = "^step learnt-epsilon: found no step_params, expected those of its init_params, {'log_e"
+    with pytest.raises(InputError, match=words):
+        solve(*problem_of(), config=SinkhornConfig(step="learnt-epsilon"))

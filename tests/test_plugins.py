@@ -1,0 +1,477 @@
+"""Plug-ins from --plugin to the tables, and what is said of those that are wrong."""
+
+import dataclasses
+import json
+import pathlib
+import shutil
+import subprocess
+import sys
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import crisalad_jax as cj
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.config import source
+from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.plugins import load_plugin
+from crisalad_jax.losses import LossConfig, metric_loss
+from crisalad_jax.nn.model import describe
+from crisalad_jax.sinkhorn import SinkhornConfig, solve
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+from tests.cli.test_cli import Capture, fails, succeeds
+from tests.conftest import BATCH, MODEL, random_params, write_city, write_town
+
+ROOT = pathlib.Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+WITHOUT_ENCODER = dataclasses.replace(
+    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
+)
+
+
+pytestmark = pytest.mark.usefixtures("own_parts")
+
+
+# Bad input, in the library and through the command line
+
+BROKEN = {
+    "raises": ("import os\nraise RuntimeError('no licence\\nfound')\n",
+        "cannot be loaded: it raises RuntimeError in line 2: no licence found"),
+    "imports": ("import no_such_module\n",
+        "cannot be loaded: it raises ModuleNotFoundError in line 1: No module named 'no_such_mo"),
+    "syntax": ("x = 1\ndef broken(:\n", "cannot be loaded: it raises SyntaxError in line 2: "),
+    "bytes": ("x = '\udcff'\n", "cannot be loaded: it raises SyntaxError"),
+    "taken": ("""
+import crisalad_jax as cj
+
+@cj.register_step("newton")
+def mine(problem, potentials):
+    return potentials
+""", "register_step: found the name 'newton' taken by crisalad_jax.transport.steps.NewtonStep, "
+        "expected another name for mine"),
+    "thawed": ("""
+import dataclasses
+import crisalad_jax as cj
+
+@cj.register_loss("thawed")
+@dataclasses.dataclass
+class Thawed:
+    scale: float = 1.0
+""", "register_loss 'thawed': found Thawed, which is no frozen dataclass, expected @dataclasses."),
+    "bare": ("""
+import crisalad_jax as cj
+
+@cj.register_aggregator("bare")
+class Bare(cj.Aggregator):
+    def token_shape(self, dim):
+        return cj.TokenShape(dim, 0, dim)
+""", "register_aggregator 'bare': found Bare, which is no frozen dataclass, expected @"),
+    "recipe": ("""
+import crisalad_jax as cj
+
+@cj.register_recipe("salad")
+def mine(model, preset):
+    return cj.TrainConfig(model=model)
+""", "register_recipe 'salad': found the name taken by crisalad_jax.training.recipes.salad, exp"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_file_that_cannot_be_loaded(name: str, tmp_path: pathlib.Path, capfd: Capture) -> None:
+    text, words = BROKEN[name]
+    path = tmp_path / "mine.py"
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(InputError) as error:
+        load_plugin(str(path))
+    assert str(error.value).startswith(f"plugin {path}: {words}")
+    assert "\n" not in str(error.value)
+    # Not half loaded: it is read again.
+    fails(capfd, "info", "--plugin", path, words=(f"plugin {path}: {words}",))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("none.py", "plugin none.py: found no such file, expected FILE.py or MODULE"),
+        ("none.none", "plugin none.none: found no such module, expected FILE.py or MODULE"),
+        ("", "plugin : found no such module, expected FILE.py or MODULE"),
+    ],
+)
+def test_a_file_or_module_that_is_not_there(given: str, words: str, capfd: Capture) -> None:
+    with pytest.raises(InputError) as error:
+        load_plugin(given)
+    assert str(error.value) == words
+    fails(capfd, "info", f"--plugin={given}", words=(words,))
+
+
+def test_in_a_process_of_its_own(tmp_path: pathlib.Path) -> None:
+    """One line and code 2, whatever the interpreter would say of a file that is no program."""
+    path = tmp_path / "mine.py"
+    path.write_text(BROKEN["syntax"][0])
+    command = [sys.executable, "-m", "crisalad_jax", "info", "--plugin", path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"crisalad: plugin {path}: cannot be loaded: it raises SyntaxErr")
+    assert done.stderr.count("\n") == 1
+
+
+STEPS = """
+import dataclasses
+import jax.numpy as jnp
+import crisalad_jax as cj
+
+@cj.register_step("short")
+def short(problem, potentials):
+    return potentials._replace(row=potentials.row[..., :2])
+
+@cj.register_step("not-a-number")
+def not_a_number(problem, potentials):
+    return potentials._replace(row=jnp.log(potentials.row - 1))
+
+@cj.register_step("nothing")
+def nothing(problem, potentials):
+    pass
+
+@cj.register_step("wide-plan")
+@dataclasses.dataclass(frozen=True)
+class WidePlan(cj.sinkhorn.Step):
+    def step(self, problem, potentials, state, iteration):
+        return potentials, state
+
+    def log_plan(self, problem, potentials):
+        return jnp.zeros((7, 7))
+
+@cj.register_step("other-problem")
+@dataclasses.dataclass(frozen=True)
+class OtherProblem(WidePlan):
+    def prepare(self, problem, params):
+        return problem.kernel
+"""
+BAD_STEPS = {
+    "short": "found to return Potentials(row=ShapeDtypeStruct(shape=({}2",
+    "nothing": "found to return None, expected Potentials(row=ShapeDtypeStruct(shape=(",
+    "wide-plan": "found a log_plan of ShapeDtypeStruct(shape=(7, 7), dtype=float32), expected one",
+    "other-problem": "found to prepare ShapeDtypeStruct(shape=(",
+}
+
+
+def save_with_step(path: pathlib.Path, name: str) -> None:
+    """Write a model whose transport has a step of this name."""
+    salad = dataclasses.replace(MODEL.aggregator, sinkhorn=SinkhornConfig(step=name))
+    config = dataclasses.replace(WITHOUT_ENCODER, aggregator=salad)
+    save_weights(path, random_params(config), config)
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("name", BAD_STEPS)
+def test_a_step_that_returns_something_else(
+    name: str, tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
+) -> None:
+    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
+    plugin.write_text(STEPS)
+    load_plugin(str(plugin))
+    words = f"step {name}: {BAD_STEPS[name]}"
+    with pytest.raises(InputError) as error:
+        solve(
+            jnp.zeros((6, 3)), jnp.zeros(6), jnp.log(jnp.full(3, 2.0)), config=SinkhornConfig(name)
+        )
+    assert str(error.value).startswith(words.format(""))
+    assert "\n" not in str(error.value)
+    save_with_step(weights, name)
+    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", BATCH)
+    words = f"crisalad: {words.format(f'{BATCH}, ')}"
+    fails(capfd, *data, "--plugin", plugin, "--quiet", words=(words,))
+
+
+def test_a_step_that_makes_nan(
+    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
+) -> None:
+    """The library's result says so, and an evaluation refuses the descriptors."""
+    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
+    plugin.write_text(STEPS)
+    load_plugin(str(plugin))
+    config = SinkhornConfig("not-a-number")
+    result = solve(jnp.zeros((6, 3)), jnp.zeros(6), jnp.log(jnp.full(3, 2.0)), config=config)
+    assert not result.finite
+    assert not result.converged
+    save_with_step(weights, "not-a-number")
+    more = ("--weights", weights, "--plugin", plugin, "--quiet")
+    data = ("evaluate", "--data", shared / "town", "--batch-size", BATCH)
+    fails(
+        capfd, *data, *more, words=("queries: row 0 is not finite, expected finite unit vectors",)
+    )
+
+
+AGGREGATORS = """
+import dataclasses
+import jax.numpy as jnp
+import crisalad_jax as cj
+
+class Average(cj.Aggregator):
+    def token_shape(self, dim):
+        return cj.TokenShape(dim, 0, dim)
+
+    def apply(self, params, features, grid, *, key):
+        return self.outputs(features.patches.mean(axis=-2))
+
+@cj.register_aggregator("bare-array")
+@dataclasses.dataclass(frozen=True)
+class BareArray(Average):
+    def outputs(self, mean):
+        return mean
+
+@cj.register_aggregator("narrow")
+@dataclasses.dataclass(frozen=True)
+class Narrow(Average):
+    def outputs(self, mean):
+        return cj.Tokens.of_global(mean[..., 1:])
+
+@cj.register_aggregator("by-patch")
+def by_patch(features):
+    return features.patches
+"""
+BAD_AGGREGATORS = {
+    "bare-array": "found to return an array of shape (2, 32), expected Tokens",
+    "narrow": "found to return a global token of shape (2, 31) and local tokens of (2, 0, 31), "
+    "expected (2, 32) and (2, 0, 32), as its token_shape says",
+    "by-patch": "found to return a global token of shape (2, 0) and local tokens of (2, 12, 32), "
+    "expected (2, 0) and (2, 256, 32), as its token_shape says",
+}
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("name", BAD_AGGREGATORS)
+def test_an_aggregator_that_returns_something_else(
+    name: str, tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
+) -> None:
+    plugin, weights = tmp_path / "mine.py", tmp_path / "w.safetensors"
+    plugin.write_text(AGGREGATORS)
+    load_plugin(str(plugin))
+    config = dataclasses.replace(WITHOUT_ENCODER, aggregator=name)
+    params = random_params(config)
+    with pytest.raises(InputError) as error:
+        describe(params, np.zeros((2, *config.image_size, 3), np.uint8), config)
+    words = f"aggregator {name}: {BAD_AGGREGATORS[name]}"
+    assert str(error.value) == words
+    save_weights(weights, params, config)
+    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", 2)
+    fails(capfd, *data, "--plugin", plugin, "--quiet", words=(f"crisalad: {words}",))
+
+
+LOSSES = """
+import crisalad_jax as cj
+
+@cj.register_loss("each")
+def each(batch):
+    return batch.similarities.sum(axis=1)
+
+@cj.register_loss("words")
+def words(batch):
+    return "small"
+
+@cj.register_loss("silent")
+def silent(descriptors, labels):
+    pass
+"""
+BAD_LOSSES = {
+    "each": "found to return shape (6,), expected a single number",
+    "words": "found to return str, expected a single number",
+    "silent": "found to return NoneType, expected a single number",
+}
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("name", BAD_LOSSES)
+def test_a_loss_that_is_no_number(
+    name: str, tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
+) -> None:
+    plugin, out = tmp_path / "mine.py", tmp_path / "out"
+    plugin.write_text(LOSSES)
+    load_plugin(str(plugin))
+    words = f"loss {name}: {BAD_LOSSES[name]}"
+    with pytest.raises(InputError) as error:
+        metric_loss(jnp.eye(6), jnp.arange(6) // 2, LossConfig(kind=name))
+    assert str(error.value) == words
+    run = ("train", "--data", shared / "city", "--out", out, "--config", shared / "recipe.json")
+    more = ("--weights", shared / "weights.safetensors", "--plugin", plugin, "--quiet")
+    fails(capfd, *run, *more, "--loss.kind", name, words=(f"crisalad: {words}",))
+
+
+def test_a_plug_in_that_ends_the_program_is_refused(tmp_path: pathlib.Path) -> None:
+    file = tmp_path / "ends.py"
+    file.write_text("import sys\n\nsys.exit(0)\n")
+    with pytest.raises(InputError, match=r"cannot be loaded: it raises SystemExit in line 3: 0$"):
+        load_plugin(str(file))
+
+
+def test_a_folder_is_no_plug_in(tmp_path: pathlib.Path, monkeypatch) -> None:
+    (tmp_path / "crisalad_some_folder").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"found no such module, expected FILE.py or MODULE"):
+        load_plugin("crisalad_some_folder")
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [(jnp.zeros((2, 3, 4)), r"an array of shape \(2, 3, 4\)"), (None, "NoneType"), (1.0, "float")],
+)
+def test_a_function_that_makes_no_tokens_is_named(returned: Any, words: str) -> None:
+    @cj.register_aggregator("wrong-tokens")
+    def wrong_tokens(features):
+        return returned
+
+    with pytest.raises(
+        InputError, match=f"^aggregator wrong_tokens: found to return {words}, expected a vector"
+    ):
+        cj.ModelConfig(aggregator="wrong-tokens").descriptor_dim  # noqa: B018
+
+
+def test_weights_that_need_a_part_that_is_not_there(
+    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, monkeypatch
+) -> None:
+    weights, steps = tmp_path / "w.safetensors", REGISTRIES["step"]
+    built_in = dict(steps._parts)
+    load_plugin(str(EXAMPLES / "plugins" / "momentum.py"))
+    save_with_step(weights, "momentum")
+    monkeypatch.setattr(steps, "_parts", built_in)
+    with pytest.raises(InputError) as error:
+        load_weights(weights)
+    words = f"{weights} (metadata): step: found 'momentum', expected one of dual-softmax, newton, "
+    assert str(error.value).startswith(words)
+    assert "is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin" in str(error.value)
+    data = ("evaluate", "--data", shared / "town", "--weights", weights)
+    fails(capfd, *data, words=(words, "is a plug-in missing?"))
+
+
+# From training to the table
+
+
+def copies(folder: pathlib.Path, *names: str) -> list[pathlib.Path]:
+    """Examples in a folder where a test may change them."""
+    return [
+        pathlib.Path(shutil.copy(EXAMPLES / f"{name}.py", folder / f"{name.split('/')[-1]}.py"))
+        for name in names
+    ]
+
+
+CHOSEN = (
+    *("--model.aggregator.sinkhorn.step", "learnt-epsilon"),
+    *("--model.aggregator.dustbin", "network", "--loss.kind", "soft-triplet"),
+)
+"""Three plug-ins in one model."""
+NAMES = ("plugins/learnt_epsilon", "plugins/learnt_dustbin", "loss")
+
+
+def test_a_step_a_dustbin_and_a_loss_are_trained_saved_and_told(
+    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
+) -> None:
+    files = copies(tmp_path, *NAMES)
+    run = ("train", "--data", shared / "city", "--out", tmp_path / "run", "--quiet")
+    config = ("--config", shared / "recipe.json", "--epochs", 1, *CHOSEN)
+    succeeds(capfd, *run, *config, "--plugin", *files)
+    weights = tmp_path / "run" / "last.safetensors"
+    params, model = cj.load(weights)
+    salad: Any = model.aggregator
+    assert salad.sinkhorn.step == REGISTRIES["step"].make("learnt-epsilon")
+    assert salad.dustbin.part_name == "network"
+    learnt = named_leaves(params.aggregator)
+    # Two steps of AdamW at a rate of 1e-3 and of what a linear decay leaves of it.
+    assert 1e-4 < abs(learnt["step.log_epsilon"]) < 3e-3
+    assert 1e-4 < abs(learnt["dust_bin.out"]).max() < 3e-3
+    told = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert told["loss"]["kind"] == {"name": "soft-triplet", "scale": 10.0}
+    # Another source behind the name is told, and nothing else is.
+    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--plugin", *files)
+    rest = ("--batch-size", BATCH, "--grouping", "single", "--quiet")
+    assert "R@1" in succeeds(capfd, *data, *rest)
+    files[0].write_text(files[0].read_text().replace("jnp.exp(", "jnp.exp(0.5 * "))
+    source._file_digest.cache_clear()
+    load_plugin(str(files[0]))  # nothing: it is there
+    from crisalad_jax.cli import main
+
+    assert main([str(each) for each in (*data, *rest)]) == 0
+    assert capfd.readouterr().err == (
+        f"crisalad: note: {weights}: found another source of aggregator.sinkhorn.step "
+        "learnt-epsilon than these weights were written with; descriptors may differ\n"
+    )
+
+
+@pytest.mark.slow
+def test_plug_ins_all_the_way_in_processes_of_their_own(tmp_path: pathlib.Path, scripts) -> None:
+    """Trained, validated, evaluated, compared by two seeds, exported, and run from there."""
+    city, town = write_city(tmp_path / "city"), write_town(tmp_path / "town")
+    files = copies(tmp_path, *NAMES, "plugins/momentum", "aggregator")
+
+    def crisalad(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "crisalad_jax", *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == code, done.stderr
+        print(f"$ crisalad {arguments[0]}\n{done.stdout}{done.stderr}")
+        return done
+
+    plug = ("--plugin", *files)
+    how = (
+        "--preset",
+        "tiny",
+        *CHOSEN,
+        "--epochs",
+        4,
+        "--validate-every",
+        2,
+        "--places-per-batch",
+        4,
+    )
+    trained = crisalad(
+        *("train", "--data", city, "--val", town, "--out", tmp_path / "run", "--quiet"),
+        *(*how, *plug),
+    )
+    assert "best Recall@5" in trained.stdout
+    weights = tmp_path / "run" / "last.safetensors"
+    data = ("--data", town, "--weights", weights, "--grouping", "single", "--quiet")
+    crisalad("evaluate", *data, *plug, "--json", tmp_path / "table.json")
+    missing = crisalad("evaluate", *data, code=2).stderr
+    assert "found 'network', expected one of column, mass, none" in missing
+    assert missing.count("\n") == 1
+
+    compared = tmp_path / "compared"
+    crisalad(
+        *("compare", "--methods", "crisalad,step:momentum,attention-pool", "--preset", "tiny"),
+        *("--seeds", 2, "--epochs", 4, "--train", city, "--test", town, "--out", compared),
+        *("--quiet", *plug),
+    )
+    rows = json.loads((compared / "results.json").read_text())["rows"]
+    assert [row["name"] for row in rows] == ["crisalad", "step:momentum", "attention-pool"]
+    for name in ("crisalad", "step-momentum", "attention-pool"):
+        for seed in (0, 1):
+            assert (compared / name / f"seed-{seed}" / "run" / "last.safetensors").is_file()
+    print((compared / "table.md").read_text())
+
+    crisalad(
+        *("export", "--weights", weights, "--out", tmp_path / "program", "--platforms", "cpu"),
+        *plug,
+    )
+    images = town / "images" / "test" / "database"
+    exported = tmp_path / "exported.npy"
+    run_exported = scripts("run_exported")
+    script = [sys.executable, ROOT / "scripts" / "run_exported.py", tmp_path / "program"]
+    subprocess.run([*script, "--images", images, "--out", exported], check=True)
+    crisalad(
+        *("extract", "--weights", weights, "--images", images, "--out", tmp_path / "own.npy"),
+        *("--grouping", "single", "--quiet", *plug),
+    )
+    found, expected = np.load(exported), np.load(tmp_path / "own.npy")
+    print(f"exported against extracted: {np.abs(found - expected).max():.1e}")
+    # The script's pictures are Pillow's, whose pixels differ from OpenCV's by a level at times.
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    # The program itself makes the same sums, in float32, in another order.
+    manifest = json.loads((tmp_path / "program" / "manifest.json").read_text())
+    program = run_exported.load(tmp_path / "program", manifest)
+    (batch,) = cj.image_batches(sorted(images.iterdir()), image_size=(98, 98), batch_size=7)
+    np.testing.assert_allclose(program(batch.images), expected, atol=1e-5)
+
+    files[0].write_text(files[0].read_text().replace("jnp.exp(", "jnp.exp(0.5 * "))
+    note = crisalad("evaluate", *data, *plug).stderr
+    assert "found another source of aggregator.sinkhorn.step learnt-epsilon than these" in note

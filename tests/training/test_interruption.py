@@ -1,0 +1,226 @@
+"""Runs that are killed, told to stop, or out of room: what they leave, and that they go on.
+
+Each run is a program of its own, with a state saved after every step, so that a kill often meets a
+save.
+"""
+
+import dataclasses
+import os
+import pathlib
+import random
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+import pytest
+
+from tests.conftest import RECIPE
+from tests.training.test_loop import metrics_of
+
+ROOT = pathlib.Path(__file__).parents[2]
+EPOCHS = 4
+CONFIG = dataclasses.replace(RECIPE, epochs=EPOCHS, patience=None, keep_best=2)
+PROGRAM = """
+import pathlib, sys
+
+import crisalad_jax.training.loop
+import crisalad_jax.training.run
+from crisalad_jax.utils import compiler
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.places import read_places
+from crisalad_jax.utils.errors import InputError, Stopped
+from tests.training.test_interruption import CONFIG
+
+city, town, out = map(pathlib.Path, sys.argv[1:4])
+compiler.set_up()
+crisalad_jax.training.run.SAVE_SECONDS = -1.0
+workers = 0
+for statement in sys.argv[4:]:
+    exec(statement)
+try:
+    crisalad_jax.training.loop.fit(
+        CONFIG,
+        read_places(city, min_images=2),
+        out,
+        validation=open_benchmark(town),
+        num_workers=workers,
+        quiet=True,
+    )
+except InputError as error:
+    sys.exit(str(error))
+except Stopped as stopped:
+    print(stopped)
+    sys.exit(128 + stopped.number)
+"""
+
+
+@pytest.fixture(scope="module")
+def start(shared: pathlib.Path, tmp_path_factory):
+    """Start the program on a run's folder; compiled programs are kept between the starts."""
+    cache = tmp_path_factory.mktemp("cache")
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
+
+    def go(out: pathlib.Path, *statements: str, **options: Any) -> subprocess.Popen[str]:
+        command = [
+            sys.executable,
+            "-c",
+            PROGRAM,
+            *map(str, (shared / "city", shared / "town", out)),
+        ]
+        return subprocess.Popen(
+            [*command, *statements],
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **options,
+        )
+
+    return go
+
+
+@pytest.fixture(scope="module")
+def whole(start, tmp_path_factory) -> pathlib.Path:
+    """A run that nothing interrupts."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    program = start(out)
+    _, errors = program.communicate()
+    assert program.returncode == 0, errors
+    return out
+
+
+def lines_in(out: pathlib.Path) -> int:
+    log = out / "metrics.jsonl"
+    return log.read_bytes().count(b"\n") if log.exists() else 0
+
+
+def wait_for_lines(program: subprocess.Popen[str], out: pathlib.Path, count: int) -> None:
+    while program.poll() is None and lines_in(out) < count:
+        time.sleep(0.002)
+
+
+def assert_same_end(found: pathlib.Path, expected: pathlib.Path) -> None:
+    assert metrics_of(found) == metrics_of(expected)
+    weights = sorted(path.relative_to(expected) for path in expected.rglob("*.safetensors"))
+    assert len(weights) == 4  # last, best, and the best two by name
+    assert sorted(path.relative_to(found) for path in found.rglob("*.safetensors")) == weights
+    for name in weights:
+        assert (found / name).read_bytes() == (expected / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tmp_path, kills):
+    generator = random.Random(kills)
+    out, killed = tmp_path / "run", 0
+    while killed < kills:
+        program = start(out)
+        wait_for_lines(program, out, lines_in(out) + 1)
+        # A step and its save take some hundredths of a second, a start some seconds.
+        time.sleep(generator.uniform(0, 0.5))
+        if program.poll() is None:
+            program.kill()
+            killed += 1
+        program.communicate()
+        if program.returncode == 0:
+            assert_same_end(out, whole)
+            out = tmp_path / f"run{killed}"
+    program = start(out)
+    _, errors = program.communicate()
+    assert program.returncode == 0, errors
+    assert_same_end(out, whole)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.slow
+def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_path, number):
+    out = tmp_path / "run"
+    # Without these saves, what is resumed from was saved because of the signal.
+    seldom = "crisalad_jax.training.run.SAVE_SECONDS = 1e9"
+    program = start(out, seldom)
+    wait_for_lines(program, out, 4)
+    program.send_signal(number)
+    said, errors = program.communicate()
+    assert program.returncode == 128 + number, errors
+    step = metrics_of(out)[-1]["step"]
+    assert f"after step {step}; the same command goes on" in said
+    assert max(int(path.name) for path in (out / "state").iterdir()) == step
+    program = start(out)
+    _, errors = program.communicate()
+    assert program.returncode == 0, errors
+    assert_same_end(out, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.0, 0.5, 2.0, 4.0])
+def test_a_signal_to_all_processes_saves_first_even_while_readers_start(
+    start, whole, tmp_path, seconds
+):
+    """As a scheduler sends it: to those that read images too, which start anew each epoch."""
+    out = tmp_path / "run"
+    program = start(out, "workers = 2", start_new_session=True)
+    wait_for_lines(program, out, 2)  # steps of the first epoch
+    time.sleep(seconds)
+    os.killpg(program.pid, signal.SIGTERM)
+    said, errors = program.communicate()
+    assert program.returncode == 128 + signal.SIGTERM, errors
+    assert "the same command goes on" in said
+    program = start(out)
+    _, errors = program.communicate()
+    assert program.returncode == 0, errors
+    assert_same_end(out, whole)
+
+
+@pytest.mark.slow
+def test_a_signal_during_a_validation_does_not_wait_for_its_end(start, whole, tmp_path):
+    """The validation is repeated, and is in the log once."""
+    slow = (
+        "real = crisalad_jax.training.run.evaluate\n"
+        "def evaluate(*arguments, **more):\n"
+        "    print('validating', flush=True)\n"
+        "    import time; time.sleep(60)\n"
+        "crisalad_jax.training.run.evaluate = evaluate"
+    )
+    out = tmp_path / "run"
+    program = start(out, slow)
+    assert program.stdout is not None
+    assert program.stdout.readline() == "validating\n"
+    began = time.monotonic()
+    program.terminate()
+    _, errors = program.communicate()
+    assert time.monotonic() - began < 50  # the sleep was cut short
+    assert program.returncode == 128 + signal.SIGTERM, errors
+    program = start(out)
+    _, errors = program.communicate()
+    assert program.returncode == 0, errors
+    assert_same_end(out, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kilobytes", [1, 230])
+def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
+    start, whole, tmp_path, kilobytes
+):
+    """No file may grow beyond so much: weights, or states, or the log does not fit."""
+    limit = (
+        "import jax; jax.config.update('jax_compilation_cache_dir', None); "
+        "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        f"limit = {kilobytes} * 1024; resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))"
+    )
+    out = tmp_path / "run"
+    program = start(out)
+    wait_for_lines(program, out, 3)
+    program.kill()
+    program.communicate()
+    program = start(out, limit)
+    _, errors = program.communicate()
+    assert program.returncode == 1
+    last = errors.strip().splitlines()[-1]
+    assert last.startswith(str(out)), errors
+    assert "cannot be written" in last or "cannot write" in last
+    program = start(out)
+    _, errors = program.communicate()
+    assert program.returncode == 0, errors
+    assert_same_end(out, whole)

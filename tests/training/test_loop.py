@@ -1,0 +1,584 @@
+"""A run and its files: resumed bit for bit, stopped early, stopped by NaN, claimed by one run."""
+
+import dataclasses
+import json
+import pathlib
+import re
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tensorboardX.proto import event_pb2
+
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.config.io import read_config
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.evaluation.evaluate import GroupingResult, evaluate
+from crisalad_jax.nn.config import with_aggregator
+from crisalad_jax.nn.model import Crisalad, extract_tokens
+from crisalad_jax.nn.tokens import Tokens, TransportStatistics
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.training import run as run_module
+from crisalad_jax.training import run_files
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.log import MetricsLog, read_metrics
+from crisalad_jax.training.loop import FitResult, fit
+from crisalad_jax.training.run_files import claim_run
+from crisalad_jax.training.step import train_step
+from crisalad_jax.training.trainable import merge_params
+from crisalad_jax.utils import distributed
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import temporary_beside
+from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.signals import SignalState
+from tests.conftest import RECIPE, STEPS, random_params
+
+ENDLESS = dataclasses.replace(RECIPE, patience=None)
+
+
+class Interrupted(Exception):
+    """Stands for a kill: nothing is saved on its way out."""
+
+
+@pytest.fixture(scope="module")
+def places(shared: pathlib.Path) -> Places:
+    return read_places(shared / "city", min_images=2)
+
+
+def metrics_of(out: pathlib.Path) -> list[dict]:
+    """All that a run logs, except for its times."""
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    times = "images_per_second", "waited_for_images"
+    return [{k: v for k, v in line.items() if k not in times} for line in lines]
+
+
+def assert_same_params(found: Crisalad, expected: Crisalad) -> None:
+    found_leaves, expected_leaves = named_leaves(found), named_leaves(expected)
+    assert found_leaves.keys() == expected_leaves.keys()
+    for name, leaf in found_leaves.items():
+        np.testing.assert_array_equal(leaf, expected_leaves[name], err_msg=name)
+
+
+def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
+    assert metrics_of(found) == metrics_of(expected)
+    for name in ("last.safetensors", "best.safetensors"):
+        assert_same_params(load_weights(found / name)[0], load_weights(expected / name)[0])
+
+
+def open_run(config, places, out, params, validation=None) -> run_module.Run:
+    return run_module.Run(config, places, out, params, validation)
+
+
+def fail_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> None:
+    """Let the given call, counted from 1, of a function that `fit` uses end the process."""
+    module = run_files if name == "save_weights" else run_module
+    function = getattr(module, name)
+    calls = []
+
+    def counted(*args, **kwargs):
+        calls.append(None)
+        if len(calls) == call:
+            raise Interrupted
+        return function(*args, **kwargs)
+
+    monkeypatch.setattr(module, name, counted)
+
+
+def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
+    assert {path.name for path in run.iterdir()} == {
+        "config.json",
+        "metrics.jsonl",
+        "tensorboard",
+        "state",
+        "last.safetensors",
+        "best.safetensors",
+    }
+    assert read_config(TrainConfig, run / "config.json") == ENDLESS
+    lines = metrics_of(run)
+    steps = [line for line in lines if "loss" in line]
+    assert [(line["step"], line["epoch"]) for line in steps] == [
+        (1, 1),
+        (2, 1),
+        (3, 2),
+        (4, 2),
+        (5, 3),
+        (6, 3),
+    ]
+    # Linear from 1e-3 to 0 over six steps; float32 keeps seven digits.
+    np.testing.assert_allclose(
+        [line["learning_rate"] for line in steps], 1e-3 * (1 - np.arange(6) / 6), rtol=1e-6
+    )
+    validations = [line for line in lines if "R@5" in line]
+    assert [(line["step"], line["epoch"]) for line in validations] == [(2, 1), (4, 2), (6, 3)]
+    params, config = load_weights(run / "last.safetensors")
+    (result,) = evaluate(params, config, benchmark, groupings=("single",), quiet=True)
+    size = config.image_size
+    queries = np.stack([resize_image(read_image(q), size) for q in benchmark.queries])
+    transport = extract_tokens(params, queries, config).transport
+    assert transport is not None
+    watched = {name: float(each.mean()) for name, each in transport._asdict().items()}
+    assert validations[-1] == {
+        "step": 6,
+        "epoch": 3,
+        **{f"R@{k}": recall for k, recall in result.recalls.items()},
+        # Of a batch of another size: float32 rounding of means of numbers below 100.
+        **{name: pytest.approx(value, rel=1e-5) for name, value in watched.items()},
+    }
+    assert all(set(TransportStatistics._fields) < line.keys() for line in steps)
+
+
+def test_tensorboard_has_the_same_numbers(run: pathlib.Path):
+    """Records: 8 bytes of length, 4 of its checksum, an event, 4 of its checksum."""
+    (path,) = (run / "tensorboard").iterdir()
+    data, position, found = path.read_bytes(), 0, {}
+    while position < len(data):
+        length = int.from_bytes(data[position : position + 8], "little")
+        event = event_pb2.Event.FromString(data[position + 12 : position + 12 + length])
+        position += length + 16
+        for value in event.summary.value:
+            found[event.step, value.tag] = value.simple_value
+    expected = {}
+    for line in read_metrics(run / "metrics.jsonl"):
+        # The name of the set without what tags may not have: town/test (@UTM, 25 m).
+        before = "" if "loss" in line else "town/test___UTM__25_m_/"
+        for name, value in line.items():
+            if name not in ("step", "epoch"):
+                # TensorBoard's values are float32.
+                expected[line["step"], before + name.replace("@", "")] = np.float32(value)
+    assert found == expected
+
+
+def test_training_changes_every_parameter_and_leaves_the_initial_ones_to_the_caller(
+    run: pathlib.Path, params: Crisalad
+):
+    trained, _ = load_weights(run / "last.safetensors")
+    before, after = named_leaves(params), named_leaves(trained)
+    for name, leaf in before.items():
+        assert not leaf.is_deleted()
+        if leaf.size:  # what has no gradient (see `Salad`) still decays
+            assert not np.array_equal(leaf, after[name]), name
+
+
+@pytest.mark.parametrize(
+    ("function", "call", "saved_step"),
+    [
+        ("train_step", 4, 3),
+        # The last step of an epoch is done and saved, its validation is not, and is to come first.
+        ("evaluate", 2, 4),
+        ("save_weights", 5, 2),  # before the state that would follow
+    ],
+)
+def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
+    tmp_path, places, params, benchmark, run, monkeypatch, function, call, saved_step
+):
+    def go() -> FitResult:
+        return fit(
+            ENDLESS, places, tmp_path / "run", validation=benchmark, initial=params, quiet=True
+        )
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "SAVE_SECONDS", -1.0)
+        fail_at(patch, function, call)
+        with pytest.raises(Interrupted):
+            go()
+    assert max(int(p.name) for p in (tmp_path / "run" / "state").iterdir()) == saved_step
+    result = go()
+    assert_same_run(tmp_path / "run", run)
+    assert result.steps == STEPS
+    assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
+
+
+def test_a_finished_run_is_not_trained_further(
+    tmp_path, places, params, benchmark, run, monkeypatch
+):
+    shutil.copytree(run, tmp_path / "run")
+    fail_at(monkeypatch, "train_step", 1)
+    fail_at(monkeypatch, "evaluate", 1)
+    result = fit(
+        ENDLESS, places, tmp_path / "run", validation=benchmark, initial=params, quiet=True
+    )
+    assert result.steps == STEPS
+    assert result.best_recall == max(line.get("R@5", 0) for line in metrics_of(run))
+    assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
+    assert_same_run(tmp_path / "run", run)
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, recalls_at_5: list[float]) -> list[Crisalad]:
+    """Validations that find these recalls; returned: the parameters that each was asked about."""
+    seen = []
+
+    def fake(params, config, benchmark, *, groupings, cache, quiet):
+        assert groupings == ("single",)
+        seen.append(jax.device_get(params))
+        recall = recalls_at_5[len(seen) - 1]
+        neighbours = Neighbours(np.zeros((1, 1), np.int64), np.zeros((1, 1), np.float32))
+        return [GroupingResult("single", {1: 1 - recall, 5: recall, 10: 1.0}, neighbours)]
+
+    monkeypatch.setattr(run_module, "evaluate", fake)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("found", "validations", "best", "stopped"),
+    [
+        ([0.5, 0.4, 0.5], 3, 0, True),  # equal is not better
+        ([0.5, 0.6, 0.55], 3, 1, False),
+        ([0.5, 0.4, 0.6], 3, 2, False),  # gain starts the count again
+    ],
+)
+def test_early_stop_and_best_weights(
+    tmp_path, places, params, benchmark, monkeypatch, found, validations, best, stopped
+):
+    seen = scripted(monkeypatch, found)
+    result = fit(RECIPE, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert len(seen) == validations
+    assert result.stopped_early == stopped
+    assert result.best_recall == found[best]
+    assert_same_params(load_weights(tmp_path / "best.safetensors")[0], seen[best])
+    assert_same_params(load_weights(tmp_path / "last.safetensors")[0], seen[-1])
+
+
+def test_early_stop_ends_training_and_stays_so(tmp_path, places, params, benchmark, monkeypatch):
+    impatient = dataclasses.replace(RECIPE, patience=1)
+    scripted(monkeypatch, [0.5, 0.5])
+    result = fit(impatient, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert (result.steps, result.stopped_early) == (4, True)
+    again = fit(impatient, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert (again.steps, again.stopped_early) == (4, True)
+    assert [line["step"] for line in metrics_of(tmp_path) if "loss" in line] == [1, 2, 3, 4]
+
+
+def test_validations_come_every_so_many_epochs_and_at_the_end(
+    tmp_path, places, params, benchmark, monkeypatch
+):
+    seen = scripted(monkeypatch, [0.5, 0.5])
+    config = dataclasses.replace(RECIPE, validate_every=2)
+    fit(config, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert [line["epoch"] for line in metrics_of(tmp_path) if "R@5" in line] == [2, 3]
+    assert len(seen) == 2
+
+
+def test_a_validation_watches_the_transport_on_the_first_queries(
+    tmp_path, places, params, benchmark, monkeypatch
+):
+    seen = []
+
+    def tell(params, images, model):
+        seen.append(images)
+        each = TransportStatistics(*jnp.array([[0.0, 0.5], [0.5, 0.5], [3.0, 5.0]]))
+        return Tokens(jnp.zeros((2, 0)), jnp.zeros((2, 0, 0)), each)
+
+    monkeypatch.setattr(run_module, "extract_tokens", tell)
+    monkeypatch.setattr(run_module, "WATCHED_QUERIES", 2)
+    scripted(monkeypatch, [0.5])
+    run = open_run(RECIPE, places, tmp_path, params, benchmark)
+    run.validate(SignalState())
+    run.close()
+    first = [resize_image(read_image(q), RECIPE.model.image_size) for q in benchmark.queries[:2]]
+    np.testing.assert_array_equal(seen, [first])
+    (line,) = metrics_of(tmp_path)
+    logged = [line[name] for name in TransportStatistics._fields]
+    assert logged == [0.25, 0.5, 4.0]
+
+
+def test_without_salad_a_validation_has_no_transport_to_watch(
+    tmp_path, places, benchmark, monkeypatch
+):
+    scripted(monkeypatch, [0.5])
+    model = with_aggregator(RECIPE.model, "class-token", "tiny")
+    config = dataclasses.replace(RECIPE, model=model)
+    run = open_run(config, places, tmp_path, random_params(model), benchmark)
+    run.validate(SignalState())
+    run.close()
+    (line,) = metrics_of(tmp_path)
+    assert line.keys() == {"step", "epoch", "R@1", "R@5", "R@10"}
+
+
+@pytest.mark.slow
+def test_nothing_is_compiled_after_the_first_step_and_validation(
+    tmp_path, places, params, benchmark, monkeypatch
+):
+    compiled, after_step = [], []
+
+    def count(name: str, *_: object, **__: object) -> None:
+        if name.endswith("backend_compile_duration"):
+            compiled.append(name)
+
+    def step(*args):
+        result = train_step(*args)
+        after_step.append(len(compiled))
+        return result
+
+    jax.clear_caches()
+    jax.monitoring.register_event_duration_secs_listener(count)
+    monkeypatch.setattr(run_module, "train_step", step)
+    fit(ENDLESS, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    jax.monitoring.unregister_event_duration_listener(count)
+    assert len(after_step) == STEPS
+    assert 0 < after_step[0] == after_step[1] < after_step[2]  # a validation is between
+    assert len(compiled) == after_step[2]
+
+
+def test_without_validation_there_is_no_best_and_images_may_come_from_a_process(
+    tmp_path, places, params, run
+):
+    result = fit(RECIPE, places, tmp_path, initial=params, num_workers=1, quiet=True)
+    assert (result.steps, result.best_recall, result.stopped_early) == (STEPS, None, False)
+    # As a run that is validated and reads by threads, to the bit.
+    assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
+    assert not (tmp_path / "best.safetensors").exists()
+
+
+def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
+    tmp_path, places, params, monkeypatch
+):
+    """The step after it has begun when its loss is read, and must change nothing."""
+    config = dataclasses.replace(RECIPE, trainable="adapters+head")
+    good = []
+
+    def step(state, frozen, *args):
+        if len(good) == 2:
+            frozen = jax.tree.map(lambda leaf: leaf * np.nan, frozen)
+        state, metrics = train_step(state, frozen, *args)
+        good.append(jax.device_get(merge_params(state.trainable, frozen, config.model)))
+        return state, metrics
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "train_step", step)
+        with pytest.raises(InputError, match=r"loss nan.* at step 3,.* after step 2 is kept"):
+            fit(config, places, tmp_path, initial=params, quiet=True)
+    assert len(good) == 4
+    assert [line["step"] for line in metrics_of(tmp_path)] == [1, 2]
+    last, _ = load_weights(tmp_path / "last.safetensors")
+    assert_same_params(last, good[1])
+    assert_same_params(last, good[3])
+    # The state is whole: the run goes on from it.
+    assert fit(config, places, tmp_path, initial=params, quiet=True).steps == STEPS
+
+
+def test_a_step_is_started_before_the_one_before_is_read(tmp_path, places, params, monkeypatch):
+    """Or the devices would wait while its numbers are fetched and logged."""
+    events = []
+
+    def step(*args):
+        events.append("step")
+        return train_step(*args)
+
+    def log_step(self, values, *, of=""):
+        events.append(f"line {values['step']}")
+
+    monkeypatch.setattr(run_module, "train_step", step)
+    monkeypatch.setattr(run_files.RunFiles, "log_step", log_step)
+    fit(RECIPE, places, tmp_path, initial=params, quiet=True)
+    assert events[:4] == ["step", "step", "line 1", "line 2"]  # an epoch has two
+
+
+def test_processes_agree_once_before_a_step(tmp_path, places, params, monkeypatch):
+    config = dataclasses.replace(RECIPE, epochs=1)
+    agreements = []
+
+    def step(*args):
+        agreements.append(0)
+        return train_step(*args)
+
+    def all_max(*numbers):
+        if agreements:
+            agreements[-1] += 1
+        return numbers
+
+    monkeypatch.setattr(run_module, "train_step", step)
+    monkeypatch.setattr(distributed, "all_max", all_max)
+    fit(config, places, tmp_path, initial=params, quiet=True)
+    assert agreements[:-1] == [1]
+
+
+def test_an_error_of_the_system_that_is_none_of_writing_is_not_told_as_one(
+    tmp_path, places, params, monkeypatch
+):
+    def batches_of(*args, **options):
+        raise OSError("network is unreachable")
+        yield
+
+    monkeypatch.setattr(run_module, "batches_of", batches_of)
+    with pytest.raises(OSError, match=r"^network is unreachable$"):
+        fit(RECIPE, places, tmp_path, initial=params, quiet=True)
+
+
+def test_a_log_that_cannot_be_written_is_told_with_the_way_on(
+    tmp_path, places, params, monkeypatch
+):
+    def write(self, values, *, of=""):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(MetricsLog, "write", write)
+    words = f"{tmp_path}: cannot write: No space left on device; "
+    with pytest.raises(InputError, match=f"^{re.escape(words)}"):
+        fit(RECIPE, places, tmp_path, initial=params, quiet=True)
+
+
+def test_a_plan_without_mass_has_no_statistics_and_ends_nothing(
+    tmp_path, places, params, monkeypatch
+):
+    def step(*args):
+        state, metrics = train_step(*args)
+        transport = metrics.transport._replace(dustbin_share=np.float32(np.nan))
+        return state, metrics._replace(transport=transport)
+
+    monkeypatch.setattr(run_module, "train_step", step)
+    assert fit(RECIPE, places, tmp_path, initial=params, quiet=True).steps == STEPS
+    for line in metrics_of(tmp_path):
+        assert "dustbin_share" not in line
+        assert line["column_error"] >= 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"num_workers": -1}, "num_workers: found -1, expected at least 0"),
+        ({"shard_state": True}, "shard_state: found one device"),
+    ],
+)
+def test_arguments_that_cannot_be_leave_no_folder(tmp_path, places, params, arguments, words):
+    out = tmp_path / "run"
+    with pytest.raises(InputError, match=words):
+        fit(RECIPE, places, out, initial=params, quiet=True, **arguments)
+    assert not out.exists()
+
+
+def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, params):
+    places = read_places(city, min_images=2)
+    bad = np.arange(0, len(places.files), 5)
+    for image in bad:
+        places.path(image).write_bytes(b"")
+    drawn = [
+        epoch_batches(
+            places, places_per_batch=3, images_per_place=2, order="within-city", seed=5, epoch=epoch
+        )
+        for epoch in range(3)
+    ]
+    expected = np.isin(np.concatenate(drawn).reshape(STEPS, 6), bad).sum(axis=1)
+    assert expected.sum() > 0
+    result = fit(RECIPE, places, tmp_path / "run", initial=params, on_bad_image="skip", quiet=True)
+    assert result.skipped_images == expected.sum()
+    assert [line["skipped_images"] for line in metrics_of(tmp_path / "run")] == expected.tolist()
+    assert (
+        fit(
+            RECIPE, places, tmp_path / "run", initial=params, on_bad_image="skip", quiet=True
+        ).skipped_images
+        == expected.sum()
+    )
+
+
+def test_a_skipped_image_has_no_influence(tmp_path, city, params):
+    """Which bytes an unreadable file holds must not show in the weights."""
+    places = read_places(city, min_images=2)
+    runs = []
+    for content in (b"", b"not an image"):
+        for image in range(0, len(places.files), 5):
+            places.path(image).write_bytes(content)
+        out = tmp_path / f"run{len(content)}"
+        fit(RECIPE, places, out, initial=params, on_bad_image="skip", quiet=True)
+        runs.append(load_weights(out / "last.safetensors")[0])
+    assert_same_params(*runs)
+
+
+def test_what_does_not_fit_is_found_before_anything_is_written(tmp_path, places, params):
+    for change, words in (
+        ({"trainable": "last-3-blocks+head"}, "last 3 blocks"),
+        ({"places_per_batch": 9}, "8 places"),
+        ({"images_per_place": 4, "min_images": 4}, "images_per_place 4"),
+    ):
+        config = dataclasses.replace(RECIPE, **change)
+        with pytest.raises(InputError, match=words):
+            fit(config, places, tmp_path / "run", initial=params, quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("trainable", ["adapters+head", "all"])
+def test_a_run_is_gone_on_with_only_from_the_same_weights(tmp_path, places, params, trainable):
+    config = dataclasses.replace(RECIPE, trainable=trainable)
+    run = open_run(config, places, tmp_path, params)
+    run.save()
+    run.close()
+    other = jax.tree.map(lambda leaf: leaf + 1, params)
+    with pytest.raises(InputError, match=f"{tmp_path}: the run started from other weights"):
+        open_run(config, places, tmp_path, other)
+
+
+def test_a_run_is_gone_on_with_only_on_the_same_places(tmp_path, places, params):
+    run = open_run(RECIPE, places, tmp_path, params)
+    run.save()
+    run.close()
+    other = dataclasses.replace(places, files=(*places.files[:-1], "Images/Brill/another.jpg"))
+    with pytest.raises(InputError, match=f"{tmp_path}: the run started from other places"):
+        open_run(RECIPE, other, tmp_path, params)
+
+
+def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, places, params):
+    run = open_run(RECIPE, places, tmp_path, params)
+    run.save()
+    run.step = 2
+    run.save()
+    run.close()
+    for path in (tmp_path / "state" / "2" / "state").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[:3])
+    with pytest.raises(InputError, match=r"damaged.*delete it to go on from step 0") as error:
+        open_run(RECIPE, places, tmp_path, params)
+    assert str(error.value).startswith(str(tmp_path / "state" / "2"))
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_belongs_to_one_configuration(tmp_path):
+    claim_run(tmp_path / "new" / "run", RECIPE)
+    claim_run(tmp_path / "new" / "run", RECIPE)
+    with pytest.raises(InputError, match=r"seed: found 6, expected 5.*another folder"):
+        claim_run(tmp_path / "new" / "run", dataclasses.replace(RECIPE, seed=6))
+
+
+def test_a_folder_of_other_files_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("words")
+    with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
+        claim_run(tmp_path, RECIPE)
+    with pytest.raises(InputError, match=r"thesis\.tex: found files but no run"):
+        claim_run(tmp_path / "thesis.tex", RECIPE)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_hidden_files_of_the_user_outlive_a_run(tmp_path, places, params):
+    """A run once removed every hidden file of its folder."""
+    hidden = {".env": "secret", ".gitignore": "*", ".bashrc": "alias"}
+    run = tmp_path / "run"
+    claim_run(run, RECIPE)
+    cut_off = temporary_beside(run / "last.safetensors")
+    for name, text in (hidden | {cut_off.name: "cut off"}).items():
+        (run / name).write_text(text)
+    opened = open_run(RECIPE, places, run, params)
+    opened.save()
+    opened.close()
+    assert {p.name: p.read_text() for p in run.glob(".*")} == hidden
+
+
+@pytest.mark.parametrize("name", [".bashrc", ".git"])
+def test_a_folder_of_hidden_files_is_no_empty_folder(tmp_path, name):
+    """A home folder may hold nothing else."""
+    (tmp_path / name).write_text("words")
+    with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
+        claim_run(tmp_path, RECIPE)
+
+
+def test_the_log_drops_what_will_be_repeated_and_a_line_cut_off(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    first, second, third = ({"step": step, "loss": 0.5} for step in (1, 2, 3))
+    validations = [{"step": 1, "R@5": 0.5}, {"step": 2, "R@5": 0.6}]
+    lines = [first, validations[0], second, validations[1], third]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"st')
+    log = MetricsLog(tmp_path, keep_up_to=2, validated=1)
+    log.write({"step": 3, "loss": 0.1})
+    log.close()
+    assert read_metrics(path) == [first, validations[0], second, {"step": 3, "loss": 0.1}]

@@ -1,0 +1,314 @@
+"""The same run on 1, 2, 4 and 8 devices, and in two processes that meet on this machine."""
+
+import dataclasses
+import os
+import pathlib
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.utils import distributed as processes
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import RECIPE
+
+ROOT = pathlib.Path(__file__).parents[2]
+# Eight images a step, two steps an epoch: ten steps.
+CONFIG = dataclasses.replace(
+    RECIPE, trainable="adapters+head", places_per_batch=4, epochs=5, patience=None
+)
+# Ten steps of a tiny model take XLA longer to optimise than to run.
+COMPILED_SOON = {**os.environ, "XLA_FLAGS": "--xla_backend_optimization_level=0"}
+DEVICES = """
+import dataclasses, pathlib, sys
+from unittest import mock
+import jax
+from crisalad_jax.training import run as module
+from crisalad_jax.training.loop import fit
+from crisalad_jax.utils import devices as spreading
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.places import read_places
+from tests.training.test_processes import CONFIG
+
+shared, out = map(pathlib.Path, sys.argv[1:3])
+part = sys.argv[3]
+places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
+devices, step, seen = jax.devices(), module.train_step, set()
+compiled, after_step = [], []
+
+def count(name, *_, **__):
+    if name.endswith("backend_compile_duration"):
+        compiled.append(name)
+
+jax.monitoring.register_event_duration_secs_listener(count)
+
+def train_step(state, frozen, images, *rest):
+    state, metrics = step(state, frozen, images, *rest)
+    parts = [leaf for leaf in jax.tree.leaves(state) if not leaf.is_fully_replicated]
+    seen.add((len(images.sharding.device_set), len(parts) > 50))
+    after_step.append(len(compiled))
+    return state, metrics
+
+def run(name, config, count, **options):
+    with (
+        mock.patch.object(jax, "local_devices", lambda **_: devices[:count]),
+        mock.patch.object(module, "train_step", train_step),
+    ):
+        trained = fit(config, places, out / name, quiet=True, **options).params
+    ((spread, split),) = seen
+    print(name, spread, split, len(trained.backbone.blocks.ls1.sharding.device_set))
+    seen.clear()
+
+if part == "counts":
+    for count in (1, 2, 4, 8):
+        # A validation owes nothing to the devices of the steps: that of the processes is compared.
+        run(str(count), CONFIG, count, validation=town if count == 1 else None)
+    sys.exit()
+spreading.SHARD_FROM = 64  # numbers: this model has no larger arrays
+after_step.clear()
+run("split", CONFIG, 8, shard_state=True)
+print("compiled after the first step of ten:", after_step[9] - after_step[0])
+run("all", dataclasses.replace(CONFIG, trainable="all", epochs=1), 8)
+"""
+
+
+@pytest.fixture(scope="module")
+def by_devices(shared: pathlib.Path, tmp_path_factory) -> pathlib.Path:
+    """A run on each number of devices, in folders named by it; what comes back is on one."""
+    out = tmp_path_factory.mktemp("devices")
+    said = run_by_devices(shared, out, "counts")
+    assert said == ["1 1 False 1", "2 2 False 1", "4 4 False 1", "8 8 False 1"]
+    return out
+
+
+def run_by_devices(shared: pathlib.Path, out: pathlib.Path, part: str) -> list[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", DEVICES, str(shared), str(out), part],
+        cwd=ROOT,
+        env={**COMPILED_SOON, "JAX_NUM_CPU_DEVICES": "8"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("localhost", 0))
+        return listener.getsockname()[1]
+
+
+COMMAND_LINE = """
+import sys
+from crisalad_jax import cli
+from crisalad_jax.utils import devices
+devices.SHARD_FROM = 64
+sys.exit(cli.main())
+"""
+
+
+def start(
+    shared: pathlib.Path, out: pathlib.Path, *more: str, both: tuple[str, ...] = ()
+) -> list[subprocess.Popen[str]]:
+    """The command line, in two processes; `more` flags are for the second."""
+    config = out.with_suffix(".json")
+    write_json(config, to_plain(CONFIG))
+    meet = f"localhost:{free_port()}"
+    return [
+        subprocess.Popen(
+            [
+                *(sys.executable, "-c", COMMAND_LINE, "train", "--config", str(config)),
+                *("--data", str(shared / "city"), "--val", str(shared / "town")),
+                *("--out", str(out), "--coordinator", meet),
+                *("--processes", "2", "--process", str(index), "--quiet", *both),
+                *(more if index == 1 else ()),
+            ],
+            cwd=ROOT,
+            # What is said of virtual devices does not count here: see `processes.join_processes`.
+            env={**COMPILED_SOON, "JAX_NUM_CPU_DEVICES": "2"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for index in range(2)
+    ]
+
+
+def ends(programs: list[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+    """Exit codes, and all that was printed."""
+    return [
+        (program.returncode, out + errors)
+        for program, (out, errors) in [(p, p.communicate(timeout=300)) for p in programs]
+    ]
+
+
+STEP = ("step", "epoch", "loss", "easy_anchor_fraction", "learning_rate", "skipped_images")
+RECALLS = ("step", "epoch", "R@1", "R@5", "R@10", "R@20")
+
+
+def logged(out: pathlib.Path, names: tuple[str, ...]) -> list[list[float]]:
+    lines = read_metrics(out / "metrics.jsonl")
+    return [[line[name] for name in names] for line in lines if names[-1] in line]
+
+
+# Their gradient is 0 but for rounding, of which Adam makes steps of full length: the transport's
+# potentials take up what is added to a cluster's scores, a softmax what is added to its keys.
+FREE = ("aggregator.score.fc2.bias", "aggregator.dust_bin")
+KEYS = re.compile(r"cross_image\.layers\.\d\.attn\.qkv\.bias")
+
+
+def trained(out: pathlib.Path) -> dict[str, np.ndarray]:
+    """Arrays of the last weights whose steps their gradients decide."""
+    found = {}
+    for name, leaf in named_leaves(load_weights(out / "last.safetensors")[0]).items():
+        array = np.asarray(leaf)
+        if KEYS.fullmatch(name):
+            queries, _, values = np.split(array, 3)
+            found |= {f"{name}, queries": queries, f"{name}, values": values}
+        elif name not in FREE:
+            found[name] = array
+    return found
+
+
+def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
+    """Ten steps' losses and the parameters after them, each within 1e-5 of its own size.
+
+    Sums are taken in another order: the largest error seen is 3e-6, of `adapter.up`, whose weights
+    began at 0.
+    """
+    np.testing.assert_allclose(logged(found, STEP), logged(expected, STEP), rtol=1e-5)
+    # Of gradients, which the loss's exponents of 50 times a similarity round more: 1.1e-5 seen.
+    norms = (logged(run, ("gradient_norm",)) for run in (found, expected))
+    np.testing.assert_allclose(*norms, rtol=3e-5)
+    assert len(logged(found, STEP)) == 10
+    ours, theirs = trained(found), trained(expected)
+    assert ours.keys() == theirs.keys()
+    for name, array in ours.items():
+        error = np.linalg.norm(array - theirs[name])
+        assert error <= 1e-5 * np.linalg.norm(theirs[name]), name
+
+
+@pytest.mark.parametrize("name", ["2", "4", "8"])
+def test_devices_do_not_change_a_run(by_devices: pathlib.Path, name: str):
+    assert_same_run(by_devices / name, by_devices / "1")
+
+
+@pytest.mark.slow
+def test_a_split_state_does_not_change_a_run(shared, by_devices, tmp_path):
+    """Nor is anything compiled once it runs. Where all trains a CPU's devices do not share it."""
+    assert run_by_devices(shared, tmp_path, "split") == [
+        *("split 8 True 1", "compiled after the first step of ten: 0", "all 1 False 1"),
+    ]
+    assert_same_run(tmp_path / "split", by_devices / "1")
+
+
+def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
+    out = tmp_path / "run"
+    codes = ends(start(shared, out))
+    assert [code for code, _ in codes] == [0, 0], codes
+    assert_same_run(out, by_devices / "1")
+    assert logged(out, RECALLS) == logged(by_devices / "1", RECALLS)
+    assert len(logged(out, RECALLS)) == 5
+
+
+@pytest.mark.parametrize(
+    ("more", "what"),
+    [
+        (("--data", "{smaller}"), "places"),
+        (("--epochs", "9"), "configuration"),
+        (("--split-state",), "--split-state"),
+    ],
+)
+@pytest.mark.slow
+def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
+    smaller, out = shutil.copytree(shared / "city", tmp_path / "smaller"), tmp_path / "run"
+    (smaller / "Dataframes" / "Brill.csv").unlink()
+    more = [flag.format(smaller=smaller) for flag in more]
+    for code, words in ends(start(shared, out, *more)):
+        assert code == 2, words
+        assert f"processes: found other {what} in process 1 than in 0, expected the same" in words
+    assert not out.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [(("--data", "none"), "crisalad: none"), (("--image-size", "43", "43"), "found 43")],
+)
+def test_what_fails_in_one_process_before_training_ends_both(shared, tmp_path, more, words):
+    found = ends(start(shared, tmp_path / "run", *more))
+    assert [code for code, _ in found] == [2, 2], found
+    assert "crisalad: processes: another one failed; see what it says" in found[0][1]
+    assert words in found[1][1]
+
+
+@pytest.mark.slow
+def test_an_image_that_one_process_cannot_read_ends_both(shared, tmp_path):
+    town = shutil.copytree(shared, tmp_path / "shared")
+    broken = sorted((town / "city").rglob("*.jpg"))[:3]  # all of a place
+    for path in broken:
+        path.write_bytes(b"no picture")
+    found = ends(start(town, tmp_path / "run"))
+    assert [code for code, _ in found] == [2, 2], found
+    words = sorted(words.splitlines()[-1] for _, words in found)
+    assert any(words[0].startswith(f"crisalad: {path}: found 10 bytes") for path in broken)
+    assert words[1] == "crisalad: processes: another one failed; see what it says"
+
+
+def wait_for_steps(programs: list[subprocess.Popen[str]], out: pathlib.Path) -> None:
+    log = out / "metrics.jsonl"
+    while not (log.exists() and log.read_bytes().count(b"\n") > 2):
+        assert programs[0].poll() is None, ends(programs)
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [0, 1])
+def test_where_one_process_is_killed_the_other_ends_and_both_go_on(
+    shared, by_devices, tmp_path, killed
+):
+    out = tmp_path / "run"
+    programs = start(shared, out)
+    wait_for_steps(programs, out)
+    programs[killed].kill()
+    codes = [code for code, _ in ends(programs)]
+    assert codes[killed] == -signal.SIGKILL
+    assert codes[1 - killed] != 0
+    assert [code for code, _ in ends(start(shared, out))] == [0, 0]
+    assert_same_run(out, by_devices / "1")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("both", [(), ("--split-state", "--workers", "1")], ids=str)
+def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path, both):
+    out = tmp_path / "run"
+    programs = start(shared, out, both=both)
+    wait_for_steps(programs, out)
+    programs[1].send_signal(signal.SIGTERM)
+    for code, words in ends(programs):
+        assert code == 128 + signal.SIGTERM, words
+        assert "the same command goes on" in words
+    assert len(logged(out, STEP)) < 10
+    assert [code for code, _ in ends(start(shared, out, both=both))] == [0, 0]
+    assert_same_run(out, by_devices / "1")
+
+
+@pytest.mark.parametrize(
+    "given",
+    [("auto", 2, None), ("host:1", None, 0), ("host:1", 2, 2), ("host:1", 2, -1), ("host", 2, 0)],
+)
+def test_processes_that_make_no_sense_are_refused(given):
+    with pytest.raises(InputError, match=r"^processes: found .* expected"):
+        processes.join_processes(*given)

@@ -1,0 +1,548 @@
+"""What trains, the optimiser against torch, and one compiled step."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.losses import LossConfig, metric_loss
+from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.layers import dropout
+from crisalad_jax.nn.model import Crisalad, describe, extract_tokens, init_crisalad
+from crisalad_jax.sinkhorn import SinkhornConfig, SinkhornStep
+from crisalad_jax.training.config import OptimiserConfig
+from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
+from crisalad_jax.training.step import StepConfig, cast_frozen, init_train_state, train_step
+from crisalad_jax.training.trainable import merge_params, split_params
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import MODEL as CONFIG
+from tests.conftest import assert_equal, random_params
+from tests.nn.test_model import pictures
+
+# No dropout, so that a step can be compared with one taken by hand.
+MODEL = dataclasses.replace(
+    CONFIG,
+    aggregator=dataclasses.replace(CONFIG.aggregator, dropout=0.0),
+    cross_image=dataclasses.replace(CONFIG.cross_image, dropout=0.0),
+)
+STEP = StepConfig(
+    MODEL,
+    LossConfig(kind=MultiSimilarityConfig(base=0.5)),
+    OptimiserConfig(learning_rate=1e-3),
+    10,
+)
+LABELS = jnp.array([0, 0, 1, 1, 2, 2])
+VALID = np.ones(6, bool)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return init_crisalad(jax.random.key(0), MODEL)
+
+
+def fresh(params):
+    """A copy, since a step takes over the buffers of its state."""
+    return jax.tree.map(jnp.copy, params)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trainable", ["adapters+head", "last-1-blocks+head", "all"])
+def test_batch_norm_statistics_never_train(trainable: str) -> None:
+    adapter = AdapterConfig(kind="multi-resolution")
+    config = dataclasses.replace(
+        MODEL, backbone=dataclasses.replace(MODEL.backbone, adapter=adapter)
+    )
+    names = named_leaves(
+        split_params(init_crisalad(jax.random.key(0), config), config, trainable)[0]
+    )
+    assert any(".adapter.branch1.norm.weight" in name for name in names)
+    assert not any("running" in name for name in names)
+
+
+@pytest.mark.parametrize(
+    ("trainable", "prefixes"),
+    [
+        (
+            "adapters+head",
+            (
+                *("aggregator.", "cross_image."),
+                "backbone.blocks.0.adapter.",
+                "backbone.blocks.1.adapter.",
+            ),
+        ),
+        (
+            "last-1-blocks+head",
+            ("aggregator.", "cross_image.", "backbone.norm.", "backbone.blocks.1."),
+        ),
+        (
+            "last-0-blocks+head",
+            ("aggregator.", "cross_image.", "backbone.norm.", "backbone.blocks.1."),
+        ),
+        ("all", ("",)),
+    ],
+)
+def test_what_trains_is_chosen_by_name(params, trainable: str, prefixes: tuple[str, ...]) -> None:
+    chosen, frozen = split_params(params, MODEL, trainable)
+    trained, fixed = named_leaves(chosen), named_leaves(frozen)
+    assert not trained.keys() & fixed.keys()
+    assert all(name.startswith(prefixes) for name in trained)
+    assert not any(name.startswith(prefixes) for name in fixed)
+    assert trained
+    whole = named_leaves(merge_params(chosen, frozen, MODEL))
+    for name, leaf in named_leaves(params).items():
+        np.testing.assert_array_equal(whole[name], leaf)
+
+
+def test_blocks_are_counted_from_the_end(params) -> None:
+    trainable, frozen = split_params(params, MODEL, "last-1-blocks+head")
+    for tree, block in ((frozen, "0"), (trainable, "1")):
+        weight = named_leaves(tree)[f"backbone.blocks.{block}.attn.qkv.weight"]
+        index = int(block)
+        np.testing.assert_array_equal(
+            weight, params.backbone.blocks.attn.qkv.weight[index : index + 1]
+        )
+    nothing, _ = split_params(params, MODEL, "last-0-blocks+head")
+    sizes = [leaf.size for name, leaf in named_leaves(nothing).items() if ".blocks." in name]
+    assert sum(sizes) == 0
+
+
+@pytest.mark.parametrize(
+    ("trainable", "message"),
+    [("tail", "found 'tail', expected head"), ("last-3-blocks+head", "at most 2")],
+)
+def test_unknown_parts_raise(params, trainable: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        split_params(params, MODEL, trainable)
+
+
+@pytest.mark.parametrize(
+    "trainable",
+    [
+        "adapters+head",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("last-1-blocks+head", "all")),
+    ],
+)
+def test_a_step_changes_what_trains_and_nothing_else(params, trainable: str) -> None:
+    state, frozen = init_train_state(fresh(params), trainable, STEP)
+    trainable_names = named_leaves(state.trainable).keys()
+    # The optimiser's two moments stand beside trainable leaves only.
+    moments = [n for n in named_leaves(state.optimiser) if ".mu." in n or ".nu." in n]
+    assert len(moments) == 2 * len(trainable_names)
+    before = named_leaves(fresh(state.trainable))
+    frozen_before = named_leaves(fresh(frozen))
+    state, metrics = train_step(state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    assert state.step == 1
+    assert metrics.gradient_norm > 0
+    # The dustbin's score has no effect (sinkhorn.py), but weight decay moves it.
+    after = named_leaves(state.trainable)
+    still = {name for name in after if jnp.array_equal(after[name], before[name])}
+    # Biases that start at 0 and have no gradient, and empty registers, may stay.
+    assert not {name for name in still if name.endswith("weight") and after[name].size}
+    for name, leaf in named_leaves(frozen).items():
+        np.testing.assert_array_equal(leaf, frozen_before[name])
+
+
+def test_frozen_parameters_get_no_gradient_buffers(params) -> None:
+    """The compiled step of adapters+head makes no array of a frozen block weight's stacked shape
+    but the weights themselves: no gradient, no moment."""
+    state, frozen = init_train_state(fresh(params), "adapters+head", STEP)
+    new_state, _ = jax.eval_shape(
+        lambda s, f: train_step(s, f, pictures(6), LABELS, VALID, jax.random.key(0), STEP),
+        state,
+        frozen,
+    )
+    assert named_leaves(new_state.trainable).keys() == named_leaves(state.trainable).keys()
+    program = jax.make_jaxpr(
+        lambda s, f: train_step(s, f, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    )(state, frozen)
+
+    def made(jaxpr) -> list[tuple[int, ...]]:
+        shapes = []
+        for equation in jaxpr.eqns:
+            shapes += [v.aval.shape for v in equation.outvars]
+            for value in equation.params.values():
+                if hasattr(value, "jaxpr"):
+                    shapes += made(value.jaxpr)
+                elif hasattr(value, "eqns"):
+                    shapes += made(value)
+        return shapes
+
+    # Of a part of the stack, which is cut in two.
+    shape = (1, *params.backbone.blocks.mlp.fc1.weight.shape[1:])
+    assert shape not in made(program.jaxpr)
+    everything, nothing = init_train_state(fresh(params), "last-1-blocks+head", STEP)
+    program = jax.make_jaxpr(
+        lambda s, f: train_step(s, f, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    )(everything, nothing)
+    assert shape in made(program.jaxpr)  # so the search above can find one
+
+
+@pytest.mark.slow
+def test_the_step_is_adamw_on_the_losss_gradient(params) -> None:
+    """Loss and update recomputed outside the step, the update by torch.optim.AdamW."""
+    images = pictures(6)
+    state, frozen = init_train_state(fresh(params), "all", STEP)
+    stepped, metrics = train_step(state, frozen, images, LABELS, VALID, jax.random.key(0), STEP)
+
+    def loss(p):
+        return metric_loss(describe(p, images, MODEL), LABELS, STEP.loss).loss
+
+    value, gradient = jax.value_and_grad(loss)(params)
+    np.testing.assert_allclose(metrics.loss, value, rtol=1e-5)
+    tensors = {n: torch.tensor(np.asarray(v)) for n, v in named_leaves(params).items()}
+    for name, g in named_leaves(gradient).items():
+        tensors[name].grad = torch.tensor(np.asarray(g))
+    torch.optim.AdamW(tensors.values(), lr=1e-3, weight_decay=0.01).step()
+    after = named_leaves(stepped.trainable)
+    for name in after:
+        # Adam's first step is lr times the gradient's sign: where the gradient is rounding noise
+        # around 0, so is its sign. Elsewhere the two agree to the last places.
+        g = np.abs(np.asarray(named_leaves(gradient)[name]))
+        sure = g > 1e-6
+        np.testing.assert_allclose(
+            np.asarray(after[name])[sure], tensors[name].numpy()[sure], atol=2e-6, err_msg=name
+        )
+
+
+def test_several_steps_of_the_optimiser_equal_torch() -> None:
+    """Five steps of AdamW under linear decay, clipped, on given gradients."""
+    config = OptimiserConfig(
+        learning_rate=0.1, end_lr_fraction=0.2, weight_decay=0.05, b2=0.9, clip_norm=1.0
+    )
+    start, *gradients = np.random.default_rng(0).standard_normal((6, 7))
+    tensor = torch.tensor(start, requires_grad=True)
+    theirs = torch.optim.AdamW([tensor], lr=0.1, betas=(0.9, 0.9), weight_decay=0.05)
+    linear = torch.optim.lr_scheduler.LinearLR(theirs, 1.0, 0.2, total_iters=5)
+    for gradient in gradients:
+        tensor.grad = torch.tensor(gradient)
+        torch.nn.utils.clip_grad_norm_([tensor], 1.0)
+        theirs.step()
+        linear.step()
+    ours = optimised(config, start, gradients)
+    # Torch clips to a norm less by 1e-6 of itself, of which Adam's eps lets a hundredth by.
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.1])
+def test_adam_with_steps_down_equals_torch(decay: float) -> None:
+    """Nine steps of two an epoch, down to a half every three epochs: CricaVPR's, and with decay."""
+    config = OptimiserConfig(
+        kind="adam", learning_rate=0.1, schedule="step", step_epochs=3, weight_decay=decay
+    )
+    start, *gradients = np.random.default_rng(0).standard_normal((10, 7))
+    tensor = torch.tensor(start, requires_grad=True)
+    theirs = torch.optim.Adam([tensor], lr=0.1, weight_decay=decay)
+    down = torch.optim.lr_scheduler.StepLR(theirs, step_size=3, gamma=0.5)
+    for step, gradient in enumerate(gradients):
+        tensor.grad = torch.tensor(gradient)
+        theirs.step()
+        if step % 2 == 1:
+            down.step()
+    ours = optimised(config, start, gradients, steps_per_epoch=2)
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
+
+
+def optimised(
+    config: OptimiserConfig,
+    start: np.ndarray,
+    gradients: list[np.ndarray],
+    *,
+    steps_per_epoch: int = 1,
+) -> np.ndarray:
+    """The array after a step for each gradient, in float64.
+
+    In float32 Adam's 1 - b2 = 0.001 is right to 6e-5 only, which would hide a small mistake.
+    """
+    with jax.enable_x64(True):
+        optimiser = make_optimiser(config, steps=len(gradients), steps_per_epoch=steps_per_epoch)
+        array = jnp.asarray(start)
+        state = optimiser.init(array)
+        for gradient in gradients:
+            updates, state = optimiser.update(jnp.asarray(gradient), state, array)
+            array = array + updates
+        return np.asarray(array)
+
+
+def test_a_linear_decay_may_end_before_the_run() -> None:
+    config = OptimiserConfig(learning_rate=1.0, end_lr_fraction=0.2, decay_steps=4)
+    schedule = learning_rate_schedule(config, 10)
+    parameter = torch.nn.Parameter(torch.zeros(1))
+    theirs = torch.optim.SGD([parameter], lr=1.0)
+    decay = torch.optim.lr_scheduler.LinearLR(theirs, 1.0, 0.2, total_iters=4)
+    for step in range(8):
+        np.testing.assert_allclose(schedule(step), decay.get_last_lr()[0], rtol=1e-6)
+        theirs.step()
+        decay.step()
+
+
+def test_schedule_by_hand() -> None:
+    schedule = learning_rate_schedule(
+        OptimiserConfig(learning_rate=1.0, end_lr_fraction=0.1, warmup_steps=4), 14
+    )
+    found = [float(schedule(step)) for step in (0, 1, 3, 4, 9, 14)]
+    np.testing.assert_allclose(found, [0.25, 0.5, 1.0, 1.0, 0.55, 0.1], atol=1e-6)
+    paper = learning_rate_schedule(OptimiserConfig(), 10)
+    np.testing.assert_allclose([float(paper(s)) for s in (0, 5, 10)], [6e-5, 3e-5, 0], atol=1e-10)
+
+
+def test_invalid_images_change_no_gradient(params) -> None:
+    images, valid = pictures(6), np.array([True] * 4 + [False] * 2)
+    results = []
+    for seed in (1, 2):
+        images[4:] = pictures(2, seed)
+        state, frozen = init_train_state(fresh(params), "all", STEP)
+        state, metrics = train_step(state, frozen, images, LABELS, valid, jax.random.key(0), STEP)
+        results.append((float(metrics.loss), float(metrics.gradient_norm)))
+    np.testing.assert_allclose(*results, rtol=1e-5)
+    state, frozen = init_train_state(fresh(params), "all", STEP)
+    _, all_valid = train_step(state, frozen, images, LABELS, VALID, jax.random.key(0), STEP)
+    assert abs(float(all_valid.loss) - results[0][0]) > 1e-3
+
+
+def test_a_step_that_is_not_finite_keeps_the_state(params) -> None:
+    broken = dataclasses.replace(
+        params, aggregator=dataclasses.replace(params.aggregator, dust_bin=jnp.float32(jnp.nan))
+    )
+    state, frozen = init_train_state(fresh(broken), "adapters+head", STEP)
+    before = named_leaves(fresh(state.trainable))
+    state, metrics = train_step(state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    assert not jnp.isfinite(metrics.loss)
+    assert state.step == 0
+    for name, leaf in named_leaves(state.trainable).items():
+        np.testing.assert_array_equal(leaf, before[name])
+
+
+def test_a_finite_loss_with_an_infinite_gradient_keeps_the_state(params) -> None:
+    """Below a hidden unit of 1e25 weights of 1e-25 give tokens of order 1, with slopes of 1e25."""
+    network = params.aggregator.token_features
+    scaled = dataclasses.replace(
+        network,
+        fc1=dataclasses.replace(network.fc1, bias=network.fc1.bias.at[0].set(1e25)),
+        fc2=dataclasses.replace(network.fc2, weight=network.fc2.weight.at[0].multiply(1e-25)),
+    )
+    steep = dataclasses.replace(
+        params, aggregator=dataclasses.replace(params.aggregator, token_features=scaled)
+    )
+    state, frozen = init_train_state(fresh(steep), "adapters+head", STEP)
+    before = named_leaves(fresh(state.trainable))
+    state, metrics = train_step(state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), STEP)
+    assert jnp.isfinite(metrics.loss)
+    assert not jnp.isfinite(metrics.gradient_norm)
+    assert state.step == 0
+    for name, leaf in named_leaves(state.trainable).items():
+        np.testing.assert_array_equal(leaf, before[name])
+
+
+def test_an_infinite_loss_with_a_finite_gradient_keeps_the_state(params) -> None:
+    """Over a tiny alpha the positives' logarithms overflow; alpha leaves their slopes."""
+    loss = LossConfig(kind=MultiSimilarityConfig(alpha=1.2e-38))
+    config, labels = dataclasses.replace(STEP, loss=loss), jnp.array([0, 0, 0, 1, 1, 1])
+    state, frozen = init_train_state(fresh(params), "adapters+head", config)
+    before = named_leaves(fresh(state.trainable))
+    state, metrics = train_step(
+        state, frozen, pictures(6), labels, VALID, jax.random.key(0), config
+    )
+    assert jnp.isposinf(metrics.loss)
+    assert jnp.isfinite(metrics.gradient_norm)
+    assert state.step == 0
+    for name, leaf in named_leaves(state.trainable).items():
+        np.testing.assert_array_equal(leaf, before[name])
+
+
+def test_same_key_same_bits_and_dropout_changes_with_the_step() -> None:
+    config = dataclasses.replace(STEP, model=CONFIG)
+    start = init_crisalad(jax.random.key(0), CONFIG)
+
+    def losses(key: int, steps: int = 2) -> list[float]:
+        state, frozen = init_train_state(fresh(start), "adapters+head", config)
+        found = []
+        for _ in range(steps):
+            state, metrics = train_step(
+                state, frozen, pictures(6), LABELS, VALID, jax.random.key(key), config
+            )
+            found.append(float(metrics.loss))
+        return found
+
+    assert losses(0) == losses(0)
+    assert losses(0, 1) != losses(1, 1)
+
+    def loss_at(step: int) -> float:
+        state, frozen = init_train_state(fresh(start), "adapters+head", config)
+        state = state._replace(step=jnp.int32(step))
+        key = jax.random.key(0)
+        return float(train_step(state, frozen, pictures(6), LABELS, VALID, key, config)[1].loss)
+
+    # The same parameters, batch and key: only the step's number tells the two draws apart.
+    assert loss_at(1) != loss_at(0) == losses(0, 1)[0]
+
+
+def gradient_of(config: ModelConfig, micro_batch: int | None, key: jax.Array | None):
+    start = random_params(config)
+
+    def loss(params: Crisalad) -> jax.Array:
+        found = describe(params, images, config, key=key, micro_batch=micro_batch)
+        return metric_loss(found, LABELS, STEP.loss).loss
+
+    images = pictures(6)
+    return jax.jit(jax.value_and_grad(loss))(start)
+
+
+WIDE = dataclasses.replace(CONFIG, compute_dtype="float64")
+
+
+@pytest.fixture(scope="module")
+def whole_batch():
+    """Loss and gradient of all images at once, with dropout."""
+    with jax.enable_x64(True):
+        return gradient_of(WIDE, None, jax.random.key(3))
+
+
+@pytest.mark.parametrize(
+    ("micro_batch", "remat"),
+    [
+        (2, "full"),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in ((None, "full"), (None, "none"), (1, "dots"), (3, "dots"))
+        ),
+    ],
+)
+def test_micro_batches_and_remat_change_no_gradient(
+    whole_batch, micro_batch: int | None, remat: str
+) -> None:
+    """Dropout included; encoder, miner and loss see the whole batch."""
+    with jax.enable_x64(True):
+        config = dataclasses.replace(WIDE, remat=remat)
+        value, found = gradient_of(config, micro_batch, jax.random.key(3))
+    whole, expected = whole_batch
+    np.testing.assert_allclose(value, whole, rtol=1e-12)
+    found, expected = named_leaves(found), named_leaves(expected)
+    total = np.sqrt(sum(np.sum(np.square(leaf)) for leaf in expected.values()))
+    assert total > 0.1
+    for name, leaf in expected.items():
+        # Parameters are float32, and so are their gradients, each part's rounded once; a thousandth
+        # of the whole is what those have whose terms cancel.
+        bound = 3e-7 * max(np.linalg.norm(leaf), 1e-3 * total)
+        assert np.linalg.norm(found[name] - leaf) < bound, name
+
+
+def test_each_image_draws_its_own_dropout(params) -> None:
+    """Another image's place in the batch, and how many there are, do not change it."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    x = jnp.ones((3, 5, 7))
+    together = dropout(x, 0.5, key=keys)
+    assert 0 < float((together == 0).mean()) < 1
+    for one, key in zip(together, keys, strict=True):
+        np.testing.assert_array_equal(one, dropout(x[0], 0.5, key=key))
+
+
+@pytest.mark.parametrize("micro_batch", [None, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_step_tells_of_the_transport_of_valid_images(params, micro_batch) -> None:
+    config = dataclasses.replace(STEP, micro_batch=micro_batch)
+    state, frozen = init_train_state(fresh(params), "adapters+head", config)
+    valid = np.array([1, 1, 1, 0, 1, 0], bool)
+    _, metrics = train_step(state, frozen, pictures(6), LABELS, valid, jax.random.key(0), config)
+    expected = extract_tokens(params, pictures(6)[valid], MODEL).transport
+    assert expected is not None
+    for name, each in expected._asdict().items():
+        # Means of four numbers of order 1, computed in batches of another size.
+        np.testing.assert_allclose(getattr(metrics.transport, name), each.mean(), rtol=1e-5)
+    assert 0 < float(metrics.transport.dustbin_share) < 1
+
+
+def test_a_micro_batch_divides_the_batch(params) -> None:
+    with pytest.raises(
+        InputError, match=r"^micro_batch: found 4, expected a divisor of .* 6 images"
+    ):
+        describe(params, pictures(6), MODEL, micro_batch=4)
+
+
+@pytest.mark.slow
+def test_frozen_weights_in_half_the_memory_change_no_bit() -> None:
+    """In bfloat16 they are multiplied in that type anyway."""
+    model = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
+    config = dataclasses.replace(STEP, model=model)
+    results = []
+    for change in (lambda frozen, _: frozen, cast_frozen):
+        state, frozen = init_train_state(random_params(model), "adapters+head", config)
+        frozen = change(frozen, model)
+        state, metrics = train_step(
+            state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), config
+        )
+        results.append((state, metrics))
+    kinds = {name: leaf.dtype for name, leaf in named_leaves(frozen).items()}
+    assert kinds["backbone.blocks.1.mlp.fc1.weight"] == jnp.bfloat16
+    assert {kind for name, kind in kinds.items() if "norm" in name} == {jnp.dtype("float32")}
+    assert_equal(*results)
+
+
+def test_training_learns(params) -> None:
+    """Thirty steps on one batch of six pictures lower its loss."""
+    config = dataclasses.replace(STEP, steps=100)
+    state, frozen = init_train_state(fresh(params), "all", config)
+    found = []
+    for _ in range(30):
+        state, metrics = train_step(
+            state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), config
+        )
+        found.append(float(metrics.loss))
+    assert found[-1] < found[0] - 0.2
+
+
+CONVERGED = {"tolerance": 1e-4, "iterations": 200, "gradient": "implicit"}
+VARIANTS: list[dict] = [
+    {"domain": "log"},
+    {"iterations": 10, "step": SinkhornStep(relaxation=1.5)},
+    {"dustbin": "none"},
+    {"dustbin": "row and column"},
+    {"dustbin": "token"},
+    {"dustbin": "mass"},
+    {"column_tau": 0.9},
+    {"gradient": "stop"},
+    {"step": "softmax"},
+    {"step": "dual-softmax"},
+    CONVERGED,
+    CONVERGED | {"anderson_memory": 5, "row_tau": 0.9, "column_tau": 0.9},
+    CONVERGED | {"step": "newton"},
+    CONVERGED | {"gradient": "optimistix"},
+]
+
+
+QUICK = ({"dustbin": "mass"}, CONVERGED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "fields",
+    [
+        pytest.param(fields, id=str(fields), marks=() if fields in QUICK else pytest.mark.slow)
+        for fields in VARIANTS
+    ],
+)
+def test_every_transport_trains(fields: dict) -> None:
+    """Ten steps on one batch move the score network and lower the loss."""
+    problem = {
+        name: fields[name] for name in fields if name in ("dustbin", "row_tau", "column_tau")
+    }
+    solver = {name: value for name, value in fields.items() if name not in problem}
+    salad = dataclasses.replace(MODEL.aggregator, sinkhorn=SinkhornConfig(**solver), **problem)
+    model = dataclasses.replace(MODEL, aggregator=salad)
+    config = dataclasses.replace(STEP, model=model, steps=100)
+    start = init_crisalad(jax.random.key(0), config.model)
+    state, frozen = init_train_state(fresh(start), "adapters+head", config)
+    losses = []
+    for _ in range(10):
+        state, metrics = train_step(
+            state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), config
+        )
+        losses.append(float(metrics.loss))
+    assert losses[-1] < losses[0] - 0.02
+    trained = merge_params(state.trainable, frozen, config.model).aggregator
+    moved = np.abs(trained.score.fc1.weight - start.aggregator.score.fc1.weight).max()
+    assert moved > 1e-3  # ten steps of Adam at 1e-3

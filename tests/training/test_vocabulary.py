@@ -1,0 +1,223 @@
+"""Vocabularies: fixed points of k-means on features that are read here again; what is refused."""
+
+import dataclasses
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.places import read_places
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig
+from crisalad_jax.nn.aggregators.netvlad import NetVlad, NetVladConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad, unit_features
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.trainable import split_params
+from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
+from tests.cli.test_cli import extract, fails
+from tests.conftest import BATCH, MODEL, RECIPE, assert_equal, random_params
+
+ANYLOC = dataclasses.replace(
+    MODEL,
+    aggregator=AnyLocConfig(clusters=4, layer=0, facet="key"),
+    cross_image=CrossImageConfig(layers=0),
+)
+NETVLAD = dataclasses.replace(ANYLOC, aggregator=NetVladConfig(clusters=4))
+CONFIGS = pytest.mark.parametrize("config", [ANYLOC, NETVLAD], ids=["anyloc", "netvlad"])
+
+
+@pytest.fixture(scope="module")
+def fresh() -> Crisalad:
+    """AnyLoc without a vocabulary."""
+    params = random_params(ANYLOC)
+    return dataclasses.replace(params, aggregator=AnyLoc(jnp.ones((4, 32))))
+
+
+@pytest.fixture(scope="module")
+def paths(shared: pathlib.Path) -> list[pathlib.Path]:
+    return list_images(shared / "town")
+
+
+@pytest.fixture(scope="module")
+def built(fresh: Crisalad, paths: list[pathlib.Path]) -> Crisalad:
+    return with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH)
+
+
+def centroids_of(params: Crisalad) -> np.ndarray:
+    aggregator = params.aggregator
+    assert isinstance(aggregator, AnyLoc | NetVlad)
+    return np.asarray(aggregator.words if isinstance(aggregator, AnyLoc) else aggregator.centroids)
+
+
+@CONFIGS
+def test_a_centroid_is_the_mean_of_the_features_nearest_to_it(config, fresh, paths) -> None:
+    """Of all features of all images: with 12 patches an image, none are left out."""
+    centroids = centroids_of(with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH))
+    images = np.stack([resize_image(read_image(path), config.image_size) for path in paths])
+    batches = images.reshape(-1, BATCH, *images.shape[1:])
+    found = [np.asarray(unit_features(fresh, jnp.asarray(batch), config)) for batch in batches]
+    features = np.concatenate(found).reshape(-1, 32).astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(features, axis=1), 1, rtol=1e-6)
+    distances = np.linalg.norm(features[:, None] - centroids, axis=2)
+    nearest = distances.argmin(axis=1)
+    assert set(nearest) == set(range(4))
+    means = [features[nearest == k].mean(axis=0) for k in range(4)]
+    # Means of at most 144 float32 numbers; a round more of k-means would not move them.
+    np.testing.assert_allclose(centroids, means, atol=1e-6)
+
+
+def test_a_seed_draws_images_and_centroids(fresh, paths, built) -> None:
+    again = with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH)
+    assert_equal(again, built)
+    fewer = with_vocabulary(fresh, ANYLOC, paths, images=5, seed=3, batch_size=BATCH)
+    others = with_vocabulary(fresh, ANYLOC, paths, images=5, seed=4, batch_size=BATCH)
+    some = [centroids_of(params) for params in (built, fewer, others)]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        assert not np.array_equal(some[i], some[j])
+    assert_equal(dataclasses.replace(built, aggregator=fresh.aggregator), fresh)
+
+
+def test_who_needs_one() -> None:
+    assert needs_vocabulary(ANYLOC)
+    assert needs_vocabulary(NETVLAD)
+    assert not needs_vocabulary(MODEL)
+
+
+def test_what_does_not_fit_is_said_before_images_are_read(fresh, tmp_path) -> None:
+    nowhere = [tmp_path / "none.jpg"]
+    many = dataclasses.replace(ANYLOC, aggregator=AnyLocConfig(clusters=13, layer=0))
+    for config, options, words in (
+        (MODEL, {}, "aggregator: found salad, which has no vocabulary, expected .*anyloc, netvlad"),
+        (many, {}, "images: found 1, which is 12 features, expected at least 13"),
+        (ANYLOC, {"images": 0}, "images: found 0, expected at least 1"),
+        (ANYLOC, {"seed": -1}, "seed: found -1, expected at least 0"),
+        (ANYLOC, {"batch_size": 0}, "batch_size: found 0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            with_vocabulary(fresh, config, nowhere, **{"batch_size": BATCH} | options)
+
+
+def test_unreadable_images_stop_or_are_left_out(fresh, paths, built, tmp_path) -> None:
+    bad = tmp_path / "bad.jpg"
+    bad.write_bytes(b"no image")
+    with pytest.raises(InputError, match=f"{bad}: found 8 bytes that do not decode"):
+        with_vocabulary(fresh, ANYLOC, [*paths, bad], batch_size=BATCH)
+    options = {"seed": 3, "batch_size": BATCH, "on_bad_image": "skip"}
+    assert_equal(with_vocabulary(fresh, ANYLOC, [*paths, bad], **options), built)
+    with pytest.raises(InputError, match="found 0 features in those that can be read, expected at"):
+        with_vocabulary(fresh, ANYLOC, [bad], **options)
+
+
+def test_features_that_are_not_finite_are_refused(fresh, paths) -> None:
+    spoilt = dataclasses.replace(fresh.backbone, cls_token=jnp.full(32, jnp.nan))
+    broken = dataclasses.replace(fresh, backbone=spoilt)
+    token = AnyLocConfig(clusters=4, layer=-1, facet="token")
+    with pytest.raises(InputError, match="features: found NaN or infinity"):
+        with_vocabulary(
+            broken, dataclasses.replace(ANYLOC, aggregator=token), paths[:BATCH], batch_size=BATCH
+        )
+
+
+# Whose it is
+
+
+def other(backbone):
+    return dataclasses.replace(backbone, cls_token=backbone.cls_token + 1)
+
+
+def test_a_vocabulary_of_another_backbone_is_refused(capfd, built, shared, tmp_path) -> None:
+    path = tmp_path / "w.safetensors"
+    mixed = dataclasses.replace(built, backbone=other(built.backbone))
+    with pytest.raises(InputError, match=f"{path}: found a vocabulary of another backbone"):
+        save_weights(path, mixed, ANYLOC)
+    assert not path.exists()
+
+    save_weights(path, built, ANYLOC)
+    found, _ = load_weights(path)
+    assert_equal(found, built)
+    arrays = safetensors.numpy.load_file(path)
+    with safetensors.safe_open(path, framework="numpy") as file:
+        metadata = file.metadata()
+    arrays["backbone.cls_token"] = arrays["backbone.cls_token"] + 1
+    safetensors.numpy.save_file(arrays, path, metadata=metadata)
+    start = extract(shared, shared / "town", tmp_path / "d.npy")
+    start = tuple(path if part == shared / "weights.safetensors" else part for part in start)
+    fails(capfd, *start, words=(f"{path}: found a vocabulary of another backbone, expected one",))
+
+
+def test_words_that_nobody_built_go_with_any_backbone(fresh, tmp_path) -> None:
+    mixed = dataclasses.replace(fresh, backbone=other(fresh.backbone))
+    save_weights(tmp_path / "w.safetensors", mixed, ANYLOC)
+    assert_equal(load_weights(tmp_path / "w.safetensors")[0], mixed)
+
+
+# In training
+
+
+@pytest.fixture
+def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random parameters by numpy: to compile `init_crisalad` takes longer."""
+    name = "crisalad_jax.training.start.init_crisalad"
+    monkeypatch.setattr(name, lambda _, config: random_params(config))
+
+
+@pytest.mark.usefixtures("quick_start")
+def test_training_netvlad_starts_from_the_training_images(
+    capfd, shared, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same start in every call, which is what lets a run go on; given weights stay."""
+    config = dataclasses.replace(RECIPE, model=NETVLAD)
+    write_json(tmp_path / "recipe.json", to_plain(config))
+    starts = []
+
+    def stop(*_, initial=None, **__):
+        starts.append(initial)
+        raise InputError("far enough")
+
+    monkeypatch.setattr("crisalad_jax.experiments.train.fit", stop)
+    command = ("train", "--data", shared / "city", "--config", tmp_path / "recipe.json")
+    weights = shared / "weights.safetensors"
+    for _ in range(2):
+        begin = (*command, "--out", tmp_path / "run", "--backbone", weights, "--quiet")
+        fails(capfd, *begin, words=("far enough",))
+    places = read_places(shared / "city", min_images=2)
+    images = [places.path(image) for image in range(len(places.files))]
+    expected = with_vocabulary(starts[0], NETVLAD, images, seed=config.seed)
+    assert_equal(starts[0], expected)
+    assert_equal(starts[1], expected)
+    assert_equal(starts[0].backbone, load_weights(weights)[0].backbone)
+
+    save_weights(tmp_path / "w.safetensors", random_params(NETVLAD), NETVLAD)
+    begin = (*command, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
+    fails(capfd, *begin, "--quiet", words=("far enough",))
+    assert_equal(starts[2], load_weights(tmp_path / "w.safetensors")[0])
+
+    # What holds something else is said before images are read for the centroids.
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    monkeypatch.setattr("crisalad_jax.training.start.with_vocabulary", None)
+    begin = (*command, "--out", tmp_path / "full", "--backbone", weights, "--quiet")
+    fails(capfd, *begin, words=("full: found files but no run",))
+
+
+def test_anyloc_does_not_train(capfd, fresh, shared, tmp_path) -> None:
+    trainable, _ = split_params(fresh, ANYLOC, "head")
+    assert not jax.tree.leaves(trainable)
+    config = dataclasses.replace(RECIPE, model=ANYLOC)
+    words = "aggregator: found anyloc, with which nothing trains, expected another"
+    with pytest.raises(InputError, match=words):
+        fit(config, read_places(shared / "city", min_images=2), tmp_path / "run")
+    write_json(tmp_path / "recipe.json", to_plain(config))
+    command = ("train", "--data", tmp_path / "none", "--config", tmp_path / "recipe.json")
+    fails(capfd, *command, "--out", tmp_path / "run", words=(words,))
+    assert not (tmp_path / "run").exists()

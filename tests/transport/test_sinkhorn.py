@@ -1,0 +1,1010 @@
+"""Transport plans against their defining properties, numpy and torch, in float32.
+
+Other libraries' plans and all exact gradients are in test_sinkhorn_float64.py, bad input in
+test_sinkhorn_input.py, the published outputs and gradients in parity/test_goldens.py.
+"""
+
+import dataclasses
+import functools
+import itertools
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from crisalad_jax.sinkhorn import (
+    NewtonStep,
+    Potentials,
+    Problem,
+    SinkhornConfig,
+    SinkhornResult,
+    SinkhornStep,
+    Step,
+    append_dustbin,
+    assign_with_dustbin,
+    log_marginals,
+    marginal_error,
+    register_step,
+    solve,
+)
+from crisalad_jax.utils.errors import InputError
+
+
+def scores_of(seed: int, *shape: int, scale: float = 1.0) -> jax.Array:
+    return scale * jax.random.normal(jax.random.key(seed), shape)
+
+
+def implicit(**fields: Any) -> SinkhornConfig:
+    standard: dict[str, Any] = {"gradient": "implicit", "tolerance": 1e-5, "iterations": 300}
+    return SinkhornConfig(**{**standard, **fields})
+
+
+def take(step: Step, problem: Problem, at: Potentials) -> Potentials:
+    """One iteration of a step that has no state."""
+    return step.step(problem, at, None, jnp.zeros((), int))[0]
+
+
+def plan_of(result: SinkhornResult) -> np.ndarray:
+    return np.exp(np.asarray(result.log_plan, np.float64))
+
+
+# The published algorithm
+
+
+def published(scores: np.ndarray, dustbin: float, epsilon: float, count: int) -> np.ndarray:
+    """SALAD's log_otp_solver, written out in torch from the paper: (K, N), clusters first."""
+    kernel = torch.from_numpy(np.asarray(scores, np.float64)).T / epsilon
+    clusters, rows = kernel.shape
+    kernel = torch.cat([kernel, torch.full((1, rows), dustbin / epsilon)])
+    log_a = torch.zeros(clusters + 1)
+    log_a[-1] = np.log(rows - clusters)
+    u, v = torch.zeros(clusters + 1), torch.zeros(rows)
+    for _ in range(count):
+        u = log_a - torch.logsumexp(kernel + v, dim=1)
+        v = -torch.logsumexp(kernel + u[:, None], dim=0)
+    return torch.exp(kernel + u[:, None] + v).T.numpy()
+
+
+@pytest.mark.parametrize("domain", ["scaling", "log"])
+@pytest.mark.parametrize("count", [1, 3, 12])
+def test_equals_the_published_iterations(domain: Any, count: int) -> None:
+    scores = scores_of(0, 9, 4, scale=2.0)
+    config = SinkhornConfig(iterations=count, domain=domain)
+    result = assign_with_dustbin(scores, jnp.float32(1.3), epsilon=0.7, config=config)
+    expected = published(np.asarray(scores), 1.3, 0.7, count)
+    # Logarithms of order 10 in float32.
+    np.testing.assert_allclose(plan_of(result), expected, rtol=1e-5)
+    assert result.iterations == count
+
+
+def test_defaults_are_the_published_ones() -> None:
+    scores = scores_of(1, 2, 9, 4, scale=3.0)
+    result = assign_with_dustbin(scores, jnp.float32(-0.4))
+    for one, plan in zip(np.asarray(scores), plan_of(result), strict=True):
+        # As above.
+        np.testing.assert_allclose(plan, published(one, -0.4, 1.0, 3), rtol=1e-5)
+    np.testing.assert_array_equal(result.iterations, [3, 3])
+    assert result.finite.all()
+    # Nothing was asked of them.
+    assert not result.converged.any()
+
+
+@pytest.mark.parametrize("fields", [{}, {"row_tau": 0.7}, {"column_tau": 0.7}], ids=str)
+def test_over_relaxed_iterations_by_hand(fields: Any) -> None:
+    scores, w = np.asarray(scores_of(2, 7, 3), np.float64), 1.5
+    row_tau, column_tau = fields.get("row_tau", 1.0), fields.get("column_tau", 1.0)
+    mu, nu = np.linspace(0.5, 1.5, 7), np.array([2.0, 4.0, 1.0])
+    row, column = np.zeros(7), np.zeros(3)
+    for _ in range(2):
+        target = column_tau * (np.log(nu) - np.log(np.exp(scores + row[:, None]).sum(axis=0)))
+        column = (1 - w) * column + w * target
+        target = row_tau * (np.log(mu) - np.log(np.exp(scores + column).sum(axis=1)))
+        row = (1 - w) * row + w * target
+    # And in the end the rows are met, so that no plan is too large for a float.
+    row = row_tau * (np.log(mu) - np.log(np.exp(scores + column).sum(axis=1)))
+    config = SinkhornConfig(step=SinkhornStep(relaxation=w), iterations=2)
+    log_mu, log_nu = jnp.log(jnp.asarray(mu)), jnp.log(jnp.asarray(nu))
+    result = solve(jnp.asarray(scores), log_mu, log_nu, config=config, **fields)
+    # Rounding of logarithms.
+    np.testing.assert_allclose(plan_of(result), np.exp(scores + row[:, None] + column), rtol=1e-5)
+
+
+def test_over_relaxation_never_makes_the_dual_fall() -> None:
+    """Where the step of 1.9 everywhere does: of columns with far too little mass."""
+    scores = np.asarray(scores_of(0, 30, 5, scale=4.0), np.float64)
+    log_mu, log_nu = np.zeros(30), np.log([1.0, 1, 1, 1, 26])
+
+    def dual(row: np.ndarray, column: np.ndarray) -> float:
+        plan = np.exp(scores + row[:, None] + column)
+        return row.sum() + np.exp(log_nu) @ column - plan.sum()
+
+    def duals(step: Callable[[Problem, Potentials], Potentials]) -> np.ndarray:
+        problem = Problem.of(*(jnp.asarray(x, jnp.float32) for x in (scores, log_mu, log_nu)))
+        at, found = Potentials(jnp.zeros(30), jnp.zeros(5)), []
+        for _ in range(20):
+            at = step(problem, at)
+            found.append(dual(*(np.asarray(x, np.float64) for x in at)))
+        return np.array(found)
+
+    def unguarded(problem: Problem, at: Potentials) -> Potentials:
+        column = problem.log_nu - problem.over_rows(at.row)
+        column = at.column + 1.9 * (column - at.column)
+        row = problem.log_mu - problem.over_columns(column)
+        return Potentials(at.row + 1.9 * (row - at.row), column)
+
+    # Rounding of float32 potentials of order 10, times masses of 30.
+    assert (np.diff(duals(functools.partial(take, SinkhornStep(relaxation=1.9)))) > -1e-4).all()
+    assert (np.diff(duals(unguarded)) < -1).any()
+
+
+# Diagnostics
+
+
+def test_converged_plan_meets_both_marginals_and_reports_it() -> None:
+    result = assign_with_dustbin(
+        scores_of(0, 2, 20, 6), jnp.float32(0), config=SinkhornConfig(iterations=200)
+    )
+    plan = plan_of(result)
+    # What float32 potentials allow at convergence.
+    np.testing.assert_allclose(plan.sum(axis=2), 1, atol=1e-5)
+    np.testing.assert_allclose(plan.sum(axis=1), [[1] * 6 + [14]] * 2, rtol=1e-5)
+    assert result.row_error.shape == result.column_error.shape == (2,)
+    assert (result.row_error < 1e-5).all()
+    assert (result.column_error < 1e-5).all()
+
+
+def test_three_iterations_leave_sharp_scores_unbalanced_and_say_so() -> None:
+    result = assign_with_dustbin(scores_of(0, 50, 8, scale=10.0), jnp.float32(1))
+    masses = plan_of(result).sum(axis=0)
+    relative = np.abs(masses / np.array([1] * 8 + [42]) - 1).max()
+    np.testing.assert_allclose(result.column_error, relative, rtol=1e-4)
+    assert result.column_error > 0.01
+    assert result.row_error < 1e-5  # rows are met last
+
+
+def test_marginal_error_by_hand() -> None:
+    plan = jnp.log(jnp.array([[0.5, 0.25], [0.5, 1.0]]))
+    rows, columns = marginal_error(plan, jnp.log(jnp.array([1.0, 2.0])), jnp.log(jnp.ones(2)))
+    # Rounding of logarithms.
+    np.testing.assert_allclose(rows, 0.25, atol=1e-6)
+    np.testing.assert_allclose(columns, 0.25, atol=1e-6)
+    rows, columns = marginal_error(plan, jnp.log(jnp.array([0.5, 1.5])), jnp.log(jnp.ones(2)))
+    np.testing.assert_allclose(rows, 0.5, atol=1e-6)
+
+
+def test_iterations_are_counted_until_nothing_changes_more() -> None:
+    """The count of a loop in numpy that stops at the same change."""
+    scores = np.asarray(scores_of(4, 30, 5, scale=3.0), np.float64)
+    full = np.concatenate([scores, np.zeros((30, 1))], axis=1)
+    log_nu = np.log([1, 1, 1, 1, 1, 25.0])
+    row, column, changes = np.zeros(30), np.zeros(6), []
+    for _ in range(60):
+        old_row, old_column = row, column
+        column = log_nu - np.log(np.exp(full + row[:, None]).sum(axis=0))
+        row = -np.log(np.exp(full + column).sum(axis=1))
+        shift = np.average(column - old_column, weights=np.exp(log_nu))
+        moved = row - old_row + shift, column - old_column - shift
+        changes.append(max(np.abs(move).max() for move in moved))
+    for tolerance in (1e-1, 1e-3):
+        expected = int(np.argmax(np.array(changes) <= tolerance)) + 1
+        assert 3 < expected < 60
+        for config in (implicit(tolerance=tolerance), implicit(tolerance=tolerance, domain="log")):
+            result = assign_with_dustbin(
+                jnp.asarray(scores, jnp.float32), jnp.float32(0), config=config
+            )
+            assert result.iterations == expected
+            assert result.converged
+            assert result.column_error <= tolerance
+
+
+def test_the_tolerance_bounds_the_error_that_is_left() -> None:
+    for seed in range(3):
+        for tolerance in (0.1, 1e-3):
+            scores = scores_of(seed, 16, 40, 6, scale=5.0)
+            result = assign_with_dustbin(
+                scores, jnp.float32(0), config=implicit(tolerance=tolerance, iterations=2000)
+            )
+            assert result.converged.all()
+            # The change is of logarithms: exp(0.1) is 0.105 from 1. And rounding.
+            assert (result.column_error <= np.expm1(tolerance) + 1e-5).all()
+
+
+def test_a_change_of_the_rows_alone_goes_on_too() -> None:
+    """Flat scores and even columns: the first step moves rows only, and the second nothing."""
+    mu = np.array([0.25, 0.5, 1.0, 2.25])
+    for domain in ("scaling", "log"):
+        config = implicit(domain=domain)
+        result = solve(jnp.zeros((4, 4)), jnp.log(mu), jnp.zeros(4), config=config)
+        assert result.iterations == 2
+        # Rounding of logarithms of order 1.
+        np.testing.assert_allclose(plan_of(result), np.stack([mu / 4] * 4, axis=1), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SinkhornConfig(),
+        SinkhornConfig(domain="log"),
+        implicit(tolerance=1e-3),
+        SinkhornConfig(step="softmax"),
+    ],
+    ids=["scaling", "log", "tolerance", "softmax"],
+)
+def test_what_is_not_finite_says_so_and_has_not_converged(config: SinkhornConfig) -> None:
+    """Under `jit`, where no value can be refused; its neighbour in the batch has."""
+    scores = scores_of(0, 2, 12, 4)
+
+    @jax.jit
+    def flags(scores: jax.Array) -> Any:
+        result = assign_with_dustbin(scores, jnp.float32(1), config=config)
+        return result.finite, result.converged
+
+    # Without a tolerance nothing is known of convergence.
+    known = np.array(config.tolerance is not None)
+    for bad in (0.0, jnp.nan, jnp.inf):
+        expected = [True, bool(bad == 0)]
+        finite, converged = flags(scores.at[1, 3, 2].set(bad))
+        np.testing.assert_array_equal(finite, expected)
+        np.testing.assert_array_equal(converged, expected & known)
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"step": "newton"},
+        {"gradient": "optimistix"},
+        pytest.param({"anderson_memory": 4}, marks=SLOW),
+        pytest.param({"gradient": "stop"}, marks=SLOW),
+    ],
+    ids=str,
+)
+def test_too_small_a_budget_is_reported_and_can_raise(fields: Any) -> None:
+    scores = scores_of(0, 2, 30, 5, scale=20.0).at[1].multiply(0.001)
+    config = implicit(iterations=4, **fields)
+    result = assign_with_dustbin(scores, jnp.float32(0), config=config)
+    np.testing.assert_array_equal(result.converged, [False, True])
+    assert result.iterations[0] == 4
+    assert result.iterations[1] < 4
+    assert result.column_error[0] > 1e-4
+    strict = dataclasses.replace(config, throw=True)
+    assert assign_with_dustbin(0.001 * scores, jnp.float32(0), config=strict).converged.all()
+    message = "no convergence to 1e-05 in 4 iterations"
+    with pytest.raises(InputError, match=f"^sinkhorn: found {message} for 1 of 2 problems$"):
+        assign_with_dustbin(scores, jnp.float32(0), config=strict)
+    if not fields:
+        with pytest.raises(RuntimeError, match=message):
+            jax.block_until_ready(
+                jax.jit(lambda x: assign_with_dustbin(x, jnp.float32(0), config=strict))(scores)
+            )
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"anderson_memory": 6},
+        {"step": SinkhornStep(relaxation=1.7)},
+        pytest.param({"step": "newton"}, marks=SLOW),
+    ],
+    ids=str,
+)
+def test_acceleration_accelerates(fields: Any) -> None:
+    """Sharp scores, where the plain iteration takes hundreds."""
+    scores = scores_of(1, 4, 40, 6, scale=6.0)
+    plain = assign_with_dustbin(
+        scores, jnp.float32(0), config=implicit(tolerance=1e-3, iterations=2000)
+    )
+    fast = assign_with_dustbin(
+        scores, jnp.float32(0), config=implicit(tolerance=1e-3, iterations=2000, **fields)
+    )
+    assert plain.converged.all()
+    assert fast.converged.all()
+    assert fast.iterations.sum() < 0.7 * plain.iterations.sum()
+    # The tolerance, for a plain iteration a good part of the distance that is left.
+    np.testing.assert_allclose(plan_of(fast), plan_of(plain), atol=3e-2)
+
+
+def test_newtons_steps_by_hand() -> None:
+    """Sharp scores, for which full steps alone would raise the error: the best of the lengths."""
+    scores = [np.asarray(scores_of(seed, 12, 5, scale=4.0), np.float64) for seed in (3, 5, 6, 7)]
+    mu, nu, taken = np.ones(12), np.array([1.0, 1, 1, 1, 8]), set()
+
+    def masses(one: np.ndarray, column: np.ndarray) -> np.ndarray:
+        shares = np.exp(one + column)
+        return mu[:, None] * shares / shares.sum(axis=1, keepdims=True)
+
+    def error(one: np.ndarray, column: np.ndarray) -> float:
+        return np.abs(np.log(masses(one, column).sum(axis=0) / nu)).max()
+
+    def move(one: np.ndarray, column: np.ndarray) -> np.ndarray:
+        plan = masses(one, column)
+        found = plan.sum(axis=0)
+        hessian = np.diag(found) - plan.T @ (plan / mu[:, None])
+        # A constant changes nothing: the last unknown is 0.
+        step = np.append(np.linalg.solve(hessian[:-1, :-1], (nu - found)[:-1]), 0)
+        tries = [column + length * step for length in (1, 1 / 2, 1 / 4, 1 / 16)]
+        tries.append(column + np.log(nu / found))  # Sinkhorn's own
+        best = int(np.argmin([error(one, tried) for tried in tries]))
+        taken.add(best)
+        return tries[best]
+
+    columns = [np.zeros(5)] * 4
+    left = [error(*pair) for pair in zip(scores, columns, strict=True)]
+    with jax.enable_x64(True):
+        log_mu, log_nu = np.zeros((4, 12)), np.log([nu] * 4)
+        problem = Problem.of(*map(jnp.asarray, (np.stack(scores), log_mu, log_nu)))
+        at = Potentials(jnp.zeros((4, 12)), jnp.zeros((4, 5)))
+        step = jax.jit(functools.partial(take, NewtonStep()))
+        for _ in range(3):
+            at = step(problem, at)
+            columns = [move(*pair) for pair in zip(scores, columns, strict=True)]
+            # Rounding of float64 potentials of 10, amplified tenfold by each of three systems.
+            np.testing.assert_allclose(at.column, columns, atol=1e-10)
+            before, left = left, [error(*pair) for pair in zip(scores, at.column, strict=True)]
+            assert (np.array(left) < before).all()
+    assert taken == {0, 1, 2, 4}
+
+
+def test_anderson_by_hand() -> None:
+    """Six steps in numpy, in float64; from the fourth the oldest of three images is forgotten."""
+    generator = np.random.default_rng(0)
+    scores = generator.standard_normal((9, 5))
+    mu, nu = np.linspace(0.5, 1.5, 9), np.array([1.0, 2, 1, 1, 4])
+    start, images, moves = np.zeros(14), [], []
+    for _ in range(6):
+        column = np.log(nu) - np.log(np.exp(scores + start[:9, None]).sum(axis=0))
+        row = np.log(mu) - np.log(np.exp(scores + column).sum(axis=1))
+        images = [*images, np.append(row, column)][-3:]
+        moves = [*moves, images[-1] - start][-3:]
+        # Weights that sum to 1 and leave the shortest mixture of the moves: the last by the others.
+        others = np.array([move - moves[-1] for move in moves[:-1]]).reshape(-1, 14).T
+        weights = np.linalg.lstsq(others, -moves[-1], rcond=None)[0]
+        start = np.append(weights, 1 - weights.sum()) @ np.array(images)
+    expected = scores + images[-1][:9, None] + images[-1][9:]
+    with jax.enable_x64(True):
+        config = SinkhornConfig(anderson_memory=3, iterations=6, domain="log")
+        found = solve(jnp.asarray(scores), jnp.log(mu), jnp.log(nu), config=config)
+        # Normal equations square the condition number of the moves, some 1e3: 1e6 of 1e-16.
+        np.testing.assert_allclose(found.log_plan, expected, atol=1e-9)
+
+
+@register_step("test-sinkhorn-plus-one")
+def _plus_one(problem: Problem, at: Potentials) -> Potentials:
+    return Potentials(at.row + 1, at.column)
+
+
+def test_anderson_takes_the_mean_where_all_moves_are_alike() -> None:
+    """Whose system is singular: a step that adds 1 to every row, from 0 to 1, 2, and from 1.5."""
+    config = SinkhornConfig(
+        step="test-sinkhorn-plus-one", anderson_memory=2, iterations=3, domain="log"
+    )
+    zeros = jnp.zeros(4)
+    found = solve(jnp.zeros((4, 4)), zeros, zeros, config=config)
+    # A system of condition number 2 / eps, but of exact numbers: weights to a few eps.
+    np.testing.assert_allclose(found.potentials.row, 2.5, rtol=1e-6)
+
+
+def test_anderson_is_the_plain_iteration_where_moves_are_too_long_to_square() -> None:
+    scores, log_mu, log_nu = scores_of(2, 12, 5, scale=1e25), *log_marginals(12, 4)
+    plans = [
+        solve(
+            scores,
+            log_mu,
+            log_nu,
+            config=SinkhornConfig(anderson_memory=size, iterations=4, domain="log"),
+        )
+        for size in (0, 3)
+    ]
+    assert jnp.isfinite(plans[0].log_plan).all()
+    # The potentials: plans of float32 scores of 1e25 are all rounding. The very same code.
+    for plain, ours in zip(*(plan.potentials for plan in plans), strict=True):
+        assert jnp.abs(plain).max() > 1e20
+        np.testing.assert_array_equal(ours, plain)
+
+
+def test_anderson_at_rest_has_a_gradient() -> None:
+    """Flat scores, where from the second step on every move is 0, and the memory full of them."""
+    zeros, weights = jnp.zeros(4), scores_of(3, 4, 4)
+    config = SinkhornConfig(anderson_memory=2, iterations=5, domain="log")
+
+    def of(scores: jax.Array) -> jax.Array:
+        return (weights * jnp.exp(solve(scores, zeros, zeros, config=config).log_plan)).sum()
+
+    # By hand, where the plan is 1/4 everywhere: a fourth of the weights, less their means by rows
+    # and by columns.
+    mean = np.asarray(weights, np.float64)
+    mean = mean - mean.mean(axis=0) - mean.mean(axis=1, keepdims=True) + mean.mean()
+    # Rounding of sums of 16 terms of order 1.
+    np.testing.assert_allclose(jax.jit(jax.grad(of))(jnp.zeros((4, 4))), mean / 4, atol=1e-6)
+
+
+# Domains, batches, transformations
+
+
+@pytest.mark.parametrize(("apart", "scaled"), [(2, True), (55, True), (65, False), (100, False)])
+def test_scaling_is_for_scores_in_a_row_up_to_60_apart(apart: int, scaled: bool) -> None:
+    """Over epsilon, which is 2. The log domain has other roundings: some of 120 numbers differ."""
+    scores = scores_of(3, 2, 12, 4).at[1, 5].set(jnp.array([0.0, 2.0 * apart, 0.0, 0.0]))
+    scaling, logarithmic = (
+        assign_with_dustbin(
+            scores, jnp.float32(0), epsilon=2.0, config=SinkhornConfig(domain=domain)
+        ).log_plan
+        for domain in ("scaling", "log")
+    )
+    assert (scaling != logarithmic).any() == scaled
+
+
+@pytest.mark.parametrize("iterations", [4, 20])
+def test_too_far_apart_for_scaling_falls_back_to_the_log_domain(iterations: int) -> None:
+    weights = scores_of(4, 12, 5)
+
+    def both(domain: Any) -> Any:
+        def of(scores: jax.Array) -> Any:
+            config = SinkhornConfig(domain=domain, iterations=iterations)
+            log_plan = assign_with_dustbin(scores, jnp.float32(1), config=config).log_plan
+            return (weights * jnp.exp(log_plan)).sum(), log_plan
+
+        return jax.jit(jax.grad(of, has_aux=True))
+
+    scaling, logarithmic = both("scaling"), both("log")
+    for scale in (1.0, 40.0, 1e4):
+        scores = scores_of(3, 2, 12, 4, scale=scale)
+        gradient, log_plan = scaling(scores)
+        expected_gradient, expected = logarithmic(scores)
+        # In range: rounding of logarithms of order 10. Beyond it: the very same code.
+        atol = 1e-5 if scale == 1 else 0
+        np.testing.assert_allclose(log_plan, expected, rtol=1e-6, atol=atol)
+        np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-6, atol=1e-6)
+        assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(
+    "fields", [{}, {"anderson_memory": 4}, pytest.param({"step": "newton"}, marks=SLOW)], ids=str
+)
+def test_a_plan_owes_nothing_to_its_batch(fields: Any) -> None:
+    """The second problem takes many times the iterations of the first."""
+    scores = scores_of(5, 3, 20, 4) * jnp.array([0.5, 4.0, 1.0])[:, None, None]
+    together = assign_with_dustbin(scores, jnp.float32(0), config=implicit(**fields))
+    assert together.iterations[1] > together.iterations[0]
+    for index in range(3):
+        alone = assign_with_dustbin(
+            scores[index : index + 1], jnp.float32(0), config=implicit(**fields)
+        )
+        assert alone.iterations[0] == together.iterations[index]
+        # Rounding: matrix products of a batch may add up in another order.
+        np.testing.assert_allclose(plan_of(together)[index], plan_of(alone)[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        pytest.param(SinkhornConfig(), marks=SLOW),
+        implicit(),
+        pytest.param(implicit(gradient="optimistix"), marks=SLOW),
+        pytest.param(SinkhornConfig(domain="log", anderson_memory=3), marks=SLOW),
+    ],
+    ids=["3", "implicit", "optimistix", "log"],
+)
+def test_any_leading_axes_jit_and_vmap_agree(config: SinkhornConfig) -> None:
+    scores = scores_of(6, 2, 3, 12, 4, scale=2.0)
+    weights = scores_of(7, 12, 5)
+
+    def of(scores: jax.Array) -> Any:
+        result = assign_with_dustbin(scores, jnp.float32(1), config=config)
+        return (weights * jnp.exp(result.log_plan)).sum(), result
+
+    both = jax.grad(of, has_aux=True)
+    gradient, result = jax.jit(both)(scores)
+    assert result.log_plan.shape == (2, 3, 12, 5)
+    assert result.potentials.row.shape == (2, 3, 12)
+    assert result.potentials.column.shape == (2, 3, 5)
+    for field in (result.row_error, result.column_error, result.iterations, result.converged):
+        assert field.shape == (2, 3)
+    mapped = jax.jit(jax.vmap(jax.vmap(both)))(scores)
+    row = jax.jit(both)(scores[1])
+    one = jax.jit(both)(scores[1, 2])
+    for ours, theirs in (
+        (mapped, (gradient, result)),
+        (row, jax.tree.map(lambda x: x[1], (gradient, result))),
+        (one, jax.tree.map(lambda x: x[1, 2], (gradient, result))),
+    ):
+        np.testing.assert_array_equal(ours[1].iterations, theirs[1].iterations)
+        # Rounding of logarithms of order 10.
+        np.testing.assert_allclose(ours[1].log_plan, theirs[1].log_plan, atol=1e-5)
+        np.testing.assert_allclose(ours[0], theirs[0], atol=1e-5)
+
+
+def test_newton_meets_sharp_scores_in_float32() -> None:
+    """Where the first full step throws a column out of a float's reach."""
+    config = implicit(step="newton", tolerance=1e-3, iterations=400)
+    for scale in (10.0, 100.0):
+        result = assign_with_dustbin(
+            scores_of(0, 4, 30, 6, scale=scale), jnp.float32(0), config=config
+        )
+        assert result.converged.all()
+        masses = plan_of(result).sum(axis=1)
+        # The tolerance, and rounding of logarithms of 500.
+        np.testing.assert_allclose(masses, [[1] * 6 + [24]] * 4, rtol=1.1e-3)
+
+
+def test_what_misses_a_marginal_has_not_converged() -> None:
+    """Totals that differ, where they are not known: rows are met, columns cannot be."""
+    log_nu = jnp.log(jnp.array([1.0, 2.0, 3.0]))
+
+    def of(log_nu: jax.Array) -> SinkhornResult:
+        return solve(scores_of(0, 6, 3), jnp.zeros(6), log_nu, config=implicit())
+
+    assert jax.jit(of)(log_nu).converged
+    result = jax.jit(of)(log_nu + 1)
+    assert result.column_error > 0.5
+    assert not result.converged
+
+
+def test_relaxed_masses_too_large_for_a_float_still_have_gradients() -> None:
+    """Of the logarithm of the plan."""
+    fields: dict[str, Any] = {"config": implicit(iterations=1000), "row_tau": 0.9}
+    fields["column_tau"] = 0.8
+    scores = scores_of(0, 12, 4, scale=1e3)
+
+    def of(scores: jax.Array) -> jax.Array:
+        return jnp.tanh(0.01 * assign_with_dustbin(scores, 0.0, **fields).log_plan).sum()
+
+    assert jnp.isinf(jnp.exp(assign_with_dustbin(scores, 0.0, **fields).log_plan)).any()
+    gradient = jax.grad(of)(scores)
+    assert jnp.isfinite(gradient).all()
+    assert jnp.abs(gradient).max() > 1e-3
+
+
+@pytest.mark.parametrize("gradient", ["unrolled", "implicit", "optimistix", "stop"])
+def test_counts_and_flags_may_be_used_while_differentiating(gradient: Any) -> None:
+    config = SinkhornConfig() if gradient == "unrolled" else implicit(gradient=gradient)
+    scores = scores_of(6, 2, 12, 4)
+
+    def of(scores: jax.Array, use: bool) -> jax.Array:
+        result = assign_with_dustbin(scores, jnp.float32(1), config=config)
+        loss = jnp.exp(2 * result.log_plan).sum()
+        kept = jnp.where(result.finite.all(), loss, 0 * loss) * result.iterations.max()
+        return kept / result.iterations.max() if use else loss
+
+    used, plain = (jax.jit(jax.grad(of), static_argnums=1)(scores, use) for use in (True, False))
+    np.testing.assert_allclose(used, plain, rtol=1e-5)  # a product and a quotient, rounded
+
+
+@pytest.mark.parametrize("apart", [1.0, 100.0])
+def test_one_column_has_a_plan_and_a_gradient(apart: float) -> None:
+    """All mass goes there, whatever the scores."""
+    scores = apart * scores_of(0, 2, 6, 1)
+
+    def of(scores: jax.Array) -> jax.Array:
+        return solve(scores, jnp.zeros(6), jnp.log(jnp.array([6.0]))).log_plan
+
+    # Potentials of the scores' size cancel them.
+    np.testing.assert_allclose(of(scores), np.zeros((2, 6, 1)), atol=1e-6 * apart)
+    gradient = jax.grad(lambda scores: (scores_of(1, 2, 6, 1) * of(scores)).sum())(scores)
+    np.testing.assert_allclose(gradient, np.zeros((2, 6, 1)), atol=1e-6)
+
+
+def test_no_nan_on_the_way_where_scaling_does_not_do() -> None:
+    """What the unused domain computes is finite: a hunt for NaNs finds none."""
+    scores = jnp.zeros((12, 4)).at[3, 2].set(-80.0)
+    with jax.debug_nans(True):
+        gradient = jax.grad(
+            lambda s: jnp.exp(assign_with_dustbin(s, jnp.float32(1)).log_plan).max()
+        )(scores)
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(
+    "config",
+    [SinkhornConfig(), implicit(anderson_memory=3), implicit(step="newton")],
+    ids=["3", "anderson", "newton"],
+)
+def test_no_problems_at_all(config: SinkhornConfig) -> None:
+    def of(scores: jax.Array) -> jax.Array:
+        return assign_with_dustbin(scores, jnp.float32(1), config=config).log_plan.sum()
+
+    assert jax.grad(of)(jnp.zeros((0, 6, 3))).shape == (0, 6, 3)
+
+
+def test_half_precision_is_widened() -> None:
+    scores = scores_of(8, 12, 4).astype(jnp.bfloat16)
+    result = assign_with_dustbin(scores, jnp.bfloat16(1))
+    assert result.log_plan.dtype == jnp.float32
+    wide = assign_with_dustbin(scores.astype(jnp.float32), jnp.float32(1))
+    np.testing.assert_array_equal(result.log_plan, wide.log_plan)
+    gradient = jax.grad(
+        lambda s: jnp.exp(assign_with_dustbin(s, jnp.bfloat16(1)).log_plan)[:, 0].sum()
+    )(scores)
+    assert gradient.dtype == jnp.bfloat16
+    assert jnp.abs(gradient).max() > 0
+
+
+@pytest.mark.slow
+def test_nothing_is_compiled_anew_for_another_number(caplog: pytest.LogCaptureFixture) -> None:
+    scores = scores_of(9, 11, 4)
+    log_mu, log_nu = log_marginals(11, 4)
+
+    def everything(number: float) -> None:
+        assign_with_dustbin(scores + number, jnp.float32(number))
+        assign_with_dustbin(scores, jnp.float32(number), epsilon=number)
+        assign_with_dustbin(scores, jnp.float32(number), "mass")
+        full = append_dustbin(scores, jnp.float32(number))
+        solve(full, log_mu, log_nu, epsilon=number)
+        solve(full, log_mu, log_nu, epsilon=jnp.float32(number), config=implicit())
+
+    jax.clear_caches()
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        everything(0.5)
+        assert any("Compiling" in record.message for record in caplog.records)
+        caplog.clear()
+        everything(0.75)
+        assert not [r.message for r in caplog.records if "Compiling" in r.message]
+
+
+SHARDED = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from crisalad_jax.sinkhorn import SinkhornConfig, assign_with_dustbin
+
+assert len(jax.devices()) == 8
+scores = 2 * jax.random.normal(jax.random.key(0), (16, 12, 4))
+weights = jax.random.normal(jax.random.key(1), (12, 5))
+over = NamedSharding(Mesh(np.array(jax.devices()), ("batch",)), PartitionSpec("batch"))
+spread = jax.device_put(scores, over)
+for fields in ({}, {"gradient": "implicit", "tolerance": 1e-5, "iterations": 300}):
+    def of(scores):
+        result = assign_with_dustbin(scores, jnp.float32(1), config=SinkhornConfig(**fields))
+        return (weights * jnp.exp(result.log_plan)).sum(), result
+
+    mapped = jax.shard_map(
+        lambda x: of(x)[1].log_plan, mesh=over.mesh, in_specs=over.spec, out_specs=over.spec
+    )
+    np.testing.assert_allclose(jax.jit(mapped)(spread), of(scores)[1].log_plan, atol=1e-5)
+    step = jax.jit(jax.grad(of, has_aux=True))
+    for x in (1, 100):  # in range of the scaling domain, and out of it
+        gradient, result = step(x * spread)
+        expected_gradient, expected = step(x * scores)
+        assert len(result.log_plan.sharding.device_set) == 8, result.log_plan.sharding
+        np.testing.assert_array_equal(result.iterations, expected.iterations)
+        # Rounding of logarithms of order 10 x.
+        np.testing.assert_allclose(result.log_plan, expected.log_plan, atol=1e-5 * x)
+        np.testing.assert_allclose(gradient, expected_gradient, atol=1e-5)
+print("agreed")
+"""
+
+
+@pytest.mark.slow
+def test_eight_devices_give_the_same_plans() -> None:
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", SHARDED],
+        env={**os.environ, **flags},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "agreed\n", done.stderr
+
+
+# Finite for finite scores
+
+CLUSTERS = 8
+MODES: dict[str, dict[str, Any]] = {
+    "scaling": {},
+    "log": {"config": SinkhornConfig(domain="log")},
+    "scan": {"config": SinkhornConfig(iterations=10)},
+    "relaxation": {"config": SinkhornConfig(step=SinkhornStep(1.9), iterations=10)},
+    "anderson": {"config": SinkhornConfig(anderson_memory=4, iterations=10)},
+    "implicit": {"config": implicit(iterations=30)},
+    "implicit, log": {"config": implicit(iterations=30, domain="log")},
+    "implicit, relaxation": {"config": implicit(iterations=30, step=SinkhornStep(1.9))},
+    "implicit, anderson": {"config": implicit(iterations=30, anderson_memory=5)},
+    "newton": {"config": implicit(iterations=6, step="newton")},
+    "newton, unrolled": {"config": SinkhornConfig(iterations=6, step="newton")},
+    "optimistix": {"config": implicit(iterations=30, gradient="optimistix")},
+    "stop": {"config": SinkhornConfig(gradient="stop")},
+    "columns": {"config": implicit(iterations=30), "column_tau": 0.5},
+    "mass": {"dustbin": "mass"},
+    "row and column": {"dustbin": "row and column"},
+    "token": {"config": implicit(iterations=30), "dustbin": "token"},
+    "dual-softmax": {"config": SinkhornConfig(step="dual-softmax")},
+}
+QUICK = {"scaling", "scan", "relaxation", "implicit", "implicit, relaxation", "newton", "columns"}
+PATTERNS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "random": lambda scores: scores,
+    "flat": lambda scores: 0 * scores + scores[0, 0],
+    "sharp": lambda scores: jnp.where(scores == scores.max(axis=1, keepdims=True), 1.0, -1.0),
+    "one cluster": lambda scores: jnp.zeros_like(scores).at[:, 0].set(1.0).at[:, 1].set(-1.0),
+    "one patch": lambda scores: jnp.zeros_like(scores).at[0].set(-1.0).at[0, 0].set(1.0),
+    "low rank": lambda scores: scores[:, :1] * scores[:1],
+}
+
+
+@functools.lru_cache
+def finite_check(mode: str, mapped: bool) -> Callable[[jax.Array, jax.Array], Any]:
+    def loss(scores: jax.Array, dustbin: jax.Array) -> jax.Array:
+        log_plan = assign_with_dustbin(scores, dustbin, **MODES[mode]).log_plan
+        # Through the plan as in a model, and through its logarithm.
+        return jnp.sin(jnp.exp(log_plan)).sum() + 1e-3 * log_plan.sum()
+
+    both = jax.value_and_grad(loss, argnums=(0, 1))
+    return jax.jit(jax.vmap(both) if mapped else both)
+
+
+def assert_finite(
+    mode: str, pattern: str, scale: float, seed: int, rows: int, mapped: bool
+) -> None:
+    scores = jnp.clip(scale * PATTERNS[pattern](scores_of(seed, rows, CLUSTERS)), -1e4, 1e4)
+    dustbin = jnp.full(rows, 1.0) if MODES[mode].get("dustbin") == "token" else jnp.float32(1)
+    if mapped:  # beside a harmless problem
+        scores, dustbin = jnp.stack([scores, 0.1 * scores]), jnp.stack([dustbin, dustbin])
+    out = finite_check(mode, mapped)(scores, dustbin)
+    for name, x in zip(("value", "gradient", "dustbin's"), jax.tree.leaves(out), strict=True):
+        assert jnp.isfinite(x).all(), (name, x)
+
+
+SCORES = {
+    "pattern": st.sampled_from(sorted(PATTERNS)),
+    "scale": st.sampled_from([1e-3, 1.0, 10.0, 30.0, 100.0, 1e3, 1e4]),
+    "seed": st.integers(0, 1000),
+}
+
+
+@pytest.mark.parametrize(
+    "mode", [pytest.param(mode, marks=() if mode in QUICK else SLOW) for mode in MODES]
+)
+@given(**SCORES)
+@example(pattern="random", scale=1e4, seed=0)
+@example(pattern="sharp", scale=1e4, seed=0)
+@settings(max_examples=12, deadline=None)
+def test_never_nan(mode: str, pattern: str, scale: float, seed: int) -> None:
+    """With the least mass that a dustbin can have, and scores of 30 either side of the guard."""
+    assert_finite(mode, pattern, scale, seed, rows=CLUSTERS + 1, mapped=False)
+
+
+@pytest.mark.parametrize("mode", ["scaling", "optimistix"])
+@given(**SCORES)
+@example(pattern="random", scale=1e4, seed=0)
+@settings(max_examples=8, deadline=None)
+@pytest.mark.slow
+def test_never_nan_under_vmap(mode: str, pattern: str, scale: float, seed: int) -> None:
+    """Which computes both of what the guard chooses from."""
+    assert_finite(mode, pattern, scale, seed, rows=24, mapped=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("rows", [40, 2048])
+@pytest.mark.parametrize("mode", MODES)
+@given(**SCORES)
+@example(pattern="random", scale=1e4, seed=0)
+@settings(max_examples=20, deadline=None)
+def test_never_nan_for_many_patches(
+    mode: str, rows: int, mapped: bool, pattern: str, scale: float, seed: int
+) -> None:
+    assert_finite(mode, pattern, scale, seed, rows=rows, mapped=mapped)
+
+
+@pytest.mark.parametrize(
+    ("fields", "taus"),
+    [
+        ({}, {}),
+        pytest.param({"anderson_memory": 5}, {}, marks=SLOW),
+        pytest.param({"step": "newton"}, {}, marks=SLOW),
+        pytest.param({}, {"row_tau": 0.9, "column_tau": 0.8}, marks=SLOW),
+    ],
+    ids=str,
+)
+def test_implicit_gradient_in_float32(fields: Any, taus: Any) -> None:
+    """Against the same in float64, which test_sinkhorn_float64.py holds to unrolling."""
+    scores = np.asarray(scores_of(10, 4, 64, 16, scale=3.0))
+    weights = np.asarray(scores_of(11, 64, 17))
+
+    def gradient(dtype: Any, tolerance: float) -> np.ndarray:
+        def of(scores: jax.Array) -> jax.Array:
+            config = implicit(tolerance=tolerance, iterations=1000, **fields)
+            result = assign_with_dustbin(scores, jnp.zeros((), dtype), config=config, **taus)
+            return (jnp.asarray(weights, dtype) * jnp.exp(result.log_plan)).sum()
+
+        return np.asarray(jax.jit(jax.grad(of))(jnp.asarray(scores, dtype)))
+
+    ours = {tolerance: gradient(jnp.float32, tolerance) for tolerance in (1e-5, 1e-3)}
+    with jax.enable_x64(True):
+        exact = gradient(jnp.float64, 1e-12)
+    errors = {x: np.linalg.norm(found - exact) / np.linalg.norm(exact) for x, found in ours.items()}
+    # What is left where the last change was the tolerance: these four contract by 0.5 to 0.83 a
+    # step, so that the worst entry is up to five tolerances off; but in norm over all entries a
+    # fourth of one at most, in float64 as well. The rest is rounding, of 1e-6.
+    assert errors[1e-5] < 1e-5
+    assert errors[1e-3] < 1e-3
+
+
+# Dustbins
+
+
+def test_no_dustbin_shares_the_patches_alike() -> None:
+    config = SinkhornConfig(iterations=100)
+    result = assign_with_dustbin(scores_of(0, 12, 5), None, "none", config=config)
+    plan = plan_of(result)
+    assert plan.shape == (12, 5)
+    # What float32 potentials allow at convergence.
+    np.testing.assert_allclose(plan.sum(axis=0), 12 / 5, rtol=1e-5)
+    np.testing.assert_allclose(plan.sum(axis=1), 1, rtol=1e-5)
+    # As few patches as one likes.
+    few = assign_with_dustbin(scores_of(0, 3, 5), None, "none", config=config)
+    np.testing.assert_allclose(plan_of(few).sum(axis=0), 3 / 5, rtol=1e-5)
+
+
+def test_row_and_column_are_superglue() -> None:
+    """Its log_optimal_transport, written out in torch from the paper (Sarlin et al., Eq. 7-9)."""
+    scores, alpha, rows, clusters = np.asarray(scores_of(1, 9, 4)), 0.8, 9, 4
+    couplings = torch.full((rows + 1, clusters + 1), alpha, dtype=torch.float64)
+    couplings[:-1, :-1] = torch.from_numpy(scores)
+    mu = torch.tensor([1.0] * rows + [clusters], dtype=torch.float64) / (rows + clusters)
+    nu = torch.tensor([1.0] * clusters + [rows], dtype=torch.float64) / (rows + clusters)
+    u, v = torch.zeros(rows + 1), torch.zeros(clusters + 1)
+    for _ in range(100):
+        u = mu.log() - torch.logsumexp(couplings + v, dim=1)
+        v = nu.log() - torch.logsumexp(couplings + u[:, None], dim=0)
+    expected = (couplings + u[:, None] + v).exp() * (rows + clusters)
+    config = SinkhornConfig(iterations=100)
+    result = assign_with_dustbin(
+        jnp.asarray(scores), jnp.float32(alpha), "row and column", config=config
+    )
+    ours = plan_of(result)
+    # Both have converged: rounding of logarithms. The dustbin's row is left out.
+    np.testing.assert_allclose(ours, expected[:-1], rtol=1e-5)
+
+
+def test_a_score_a_patch() -> None:
+    """As a column of scores like any other."""
+    scores, dustbin = scores_of(2, 3, 12, 4), scores_of(3, 3, 12)
+    ours = assign_with_dustbin(scores, dustbin, "token")
+    full = jnp.concatenate([scores, dustbin[..., None]], axis=-1)
+    log_nu = jnp.log(jnp.array([1.0, 1, 1, 1, 8]))
+    expected = solve(full, jnp.zeros(12), log_nu)
+    np.testing.assert_allclose(ours.log_plan, expected.log_plan, atol=1e-6)  # rounding
+
+
+@pytest.mark.parametrize("logit", [-2.0, 0.0, 3.0])
+def test_learnt_mass(logit: float) -> None:
+    config = SinkhornConfig(iterations=100)
+    result = assign_with_dustbin(scores_of(4, 12, 4), jnp.float32(logit), "mass", config=config)
+    plan = plan_of(result)
+    share = 1 / (1 + np.exp(-logit))
+    # What float32 potentials allow at convergence.
+    np.testing.assert_allclose(plan.sum(axis=0)[-1], 12 * share, rtol=1e-5)
+    np.testing.assert_allclose(plan.sum(axis=0)[:-1], 12 * (1 - share) / 4, rtol=1e-5)
+    np.testing.assert_allclose(plan.sum(axis=1), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("dustbin", ["none", "column", "row and column", "token", "mass"])
+def test_epsilon_divides_the_scores_under_every_dustbin(dustbin: Any) -> None:
+    """And the dustbin's, where it has one: the logit of a mass it leaves alone."""
+    scores = scores_of(6, 12, 4)
+    score = {"none": None, "token": scores_of(3, 12)}.get(dustbin, jnp.float32(1.5))
+    divided = score if score is None or dustbin == "mass" else score / 0.25
+    ours = assign_with_dustbin(scores, score, dustbin, epsilon=0.25)
+    expected = assign_with_dustbin(scores / 0.25, divided, dustbin)
+    # Division by a power of two is exact: rounding of logarithms of order 10 at most.
+    np.testing.assert_allclose(ours.log_plan, expected.log_plan, atol=1e-5)
+
+
+def dustbin_gradient(at: jax.Array, iterations: int = 3, **problem: Any) -> jax.Array:
+    """Of the plan's clusters, squared, for sharp scores."""
+    scores = scores_of(5, 20, 4, scale=3.0)
+
+    def loss(dustbin: jax.Array) -> jax.Array:
+        config = SinkhornConfig(iterations=iterations)
+        log_plan = assign_with_dustbin(scores, dustbin, config=config, **problem).log_plan
+        return (jnp.exp(log_plan[..., :4]) ** 2).sum()
+
+    return jax.jit(jax.grad(loss))(at)
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 20])
+@pytest.mark.parametrize("z", [-10.0, 1.0, 10.0])
+def test_the_published_dustbin_is_dead(iterations: int, z: float) -> None:
+    # Sums of 20 float32 terms that cancel.
+    assert jnp.abs(dustbin_gradient(jnp.float32(z), iterations=iterations)) < 1e-5
+    plans = [
+        plan_of(
+            assign_with_dustbin(
+                scores_of(5, 20, 4), jnp.float32(x), config=SinkhornConfig(iterations=iterations)
+            )
+        )
+        for x in (0, z)
+    ]
+    np.testing.assert_allclose(*plans, atol=1e-5)  # rounding of logarithms of 10
+
+
+def test_other_dustbins_live() -> None:
+    """By margins of 100 and more over the rounding above."""
+    one, many = jnp.float32(1), jnp.ones(20)
+    assert jnp.abs(dustbin_gradient(many, dustbin="token")).max() > 0.03
+    assert jnp.abs(dustbin_gradient(one, dustbin="mass")) > 0.1
+    assert jnp.abs(dustbin_gradient(one, dustbin="row and column")) > 1e-3
+    assert jnp.abs(dustbin_gradient(one, column_tau=0.9, iterations=20)) > 0.03
+
+
+# Baselines, and what a step may be
+
+
+def test_softmax_and_dual_softmax_are_torchs() -> None:
+    scores, epsilon = scores_of(6, 2, 7, 3), 0.6
+    kernel = torch.from_numpy(np.asarray(scores)) / epsilon
+    bin_ = torch.cat([kernel, torch.full((2, 7, 1), 1.5 / epsilon)], dim=2)
+    config = SinkhornConfig(step="softmax")
+    # Rounding.
+    ours = plan_of(assign_with_dustbin(scores, jnp.float32(1.5), epsilon=epsilon, config=config))
+    np.testing.assert_allclose(ours, bin_.softmax(dim=2), rtol=1e-5)
+    dual = SinkhornConfig(step="dual-softmax")
+    result = assign_with_dustbin(scores, None, "none", epsilon=epsilon, config=dual)
+    expected = kernel.softmax(dim=2) * kernel.softmax(dim=1)
+    np.testing.assert_allclose(plan_of(result), expected, rtol=1e-5)
+    log_mu, log_nu = jnp.log(jnp.arange(1.0, 8)), jnp.log(jnp.array([4.0, 12, 12]))
+    weighted = solve(scores, log_mu, log_nu, config=SinkhornConfig(step="softmax"))
+    # Each row has the mass that it is given.
+    np.testing.assert_allclose(plan_of(weighted).sum(axis=2), [np.arange(1.0, 8)] * 2, rtol=1e-5)
+    assert (weighted.row_error < 1e-5).all()
+    # Steps like any other, which change nothing from the second on.
+    assert weighted.iterations.tolist() == result.iterations.tolist() == [3, 3]
+    assert weighted.finite.tolist() == result.finite.tolist() == [True, True]
+    assert weighted.converged.tolist() == result.converged.tolist() == [False, False]
+    resting = implicit(gradient="stop", step="softmax")
+    rested = solve(scores, log_mu, log_nu, config=resting)
+    assert rested.iterations.tolist() == [2, 2]
+    assert rested.converged.all()
+    # The potentials make the plan, the masses in them.
+    row, column = weighted.potentials
+    made = scores + row[..., None] + column[:, None]
+    np.testing.assert_allclose(weighted.log_plan, made, atol=1e-6)  # rounding
+
+
+@register_step("test-sinkhorn-capacity")
+def _capacity(problem: Problem, potentials: Potentials) -> Potentials:
+    """Columns take no more than their marginals, and may take less."""
+    column = jnp.minimum(problem.log_nu - problem.over_rows(potentials.row), 0)
+    return Potentials(problem.log_mu - problem.over_columns(column), column)
+
+
+def test_a_step_with_marginals_of_its_own() -> None:
+    """Optimal: no column above its capacity, and only full ones have a price."""
+    scores = scores_of(7, 20, 4, scale=2.0)
+    log_mu, log_nu = jnp.zeros(20), jnp.log(jnp.array([3.0, 4, 30, 30]))
+    for gradient in ("stop", "optimistix"):
+        config = implicit(gradient=gradient, step="test-sinkhorn-capacity")
+        # A tau below 1 says that totals may differ.
+        result = solve(scores, log_mu, log_nu, column_tau=0.5, config=config)
+        assert result.converged
+        masses, price = plan_of(result).sum(axis=0), result.potentials.column
+        np.testing.assert_allclose(masses[:2], [3, 4], rtol=1e-4)  # ten times the tolerance
+        assert (masses[2:] < 29).all()
+        assert (price[:2] < -0.1).all()
+        np.testing.assert_array_equal(price[2:], 0)
+        np.testing.assert_allclose(plan_of(result).sum(axis=1), 1, rtol=1e-5)
+
+
+def test_optimal_as_epsilon_falls() -> None:
+    """At small epsilon the plan is the assignment found by trying all permutations."""
+    scores = np.asarray(scores_of(3, 4, 4), np.float64)
+    best = max(
+        itertools.permutations(range(4)), key=lambda p: sum(scores[i, j] for i, j in enumerate(p))
+    )
+    zeros = jnp.zeros(4)
+    config = SinkhornConfig(iterations=2000)
+    plan = solve(jnp.asarray(scores, jnp.float32), zeros, zeros, epsilon=0.02, config=config)
+    np.testing.assert_array_equal(np.asarray(plan.log_plan).argmax(axis=1), best)

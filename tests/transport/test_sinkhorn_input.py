@@ -1,0 +1,446 @@
+"""What `solve`, `assign_with_dustbin`, a registration and the settings refuse, and say."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.sinkhorn import (
+    Dustbin,
+    Marginals,
+    Potentials,
+    Problem,
+    SinkhornConfig,
+    SinkhornStep,
+    Step,
+    append_dustbin,
+    assign_with_dustbin,
+    log_marginals,
+    register_dustbin,
+    register_step,
+    solve,
+)
+from crisalad_jax.utils.errors import InputError
+
+
+def implicit(**fields: Any) -> SinkhornConfig:
+    return SinkhornConfig(gradient="implicit", tolerance=1e-5, **fields)
+
+
+@register_step("test-input-tuple")
+def _plain_tuple(problem: Problem, at: Potentials) -> Any:
+    return tuple(at)
+
+
+@register_step("test-input-short")
+def _short(problem: Problem, at: Potentials) -> Potentials:
+    return at._replace(row=at.row[:2])
+
+
+@register_step("test-input-half")
+def _half(problem: Problem, at: Potentials) -> Potentials:
+    return at._replace(row=at.row.astype(jnp.float16))
+
+
+@register_step("test-input-state")
+@dataclasses.dataclass(frozen=True)
+class _Unsteady(Step):
+    """Its state is a whole number, then one that is not."""
+
+    def init(self, problem: Problem, params: Any) -> Any:
+        return jnp.zeros((), jnp.int32)
+
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Any) -> Any:
+        return potentials, state + 0.5
+
+
+@register_step("test-input-alone")
+@dataclasses.dataclass(frozen=True)
+class _Alone(Step):
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Any) -> Any:
+        return potentials
+
+
+MU, NU = jnp.zeros(6), jnp.log(jnp.array([1.0, 2.0, 3.0]))
+BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
+    "one axis": (lambda: solve(jnp.zeros(3), MU, NU), r"scores of shape \(3,\) and log_mu"),
+    "rows": (lambda: solve(jnp.zeros((5, 3)), MU, NU), r"\(5, 3\) and log_mu of \(6,\)"),
+    "columns": (lambda: solve(jnp.zeros((6, 4)), MU, NU), r"\(6, 4\) and log_nu of \(3,\)"),
+    "no axis": (lambda: solve(jnp.zeros((6, 3)), MU, MU[0]), r"log_nu of \(\)"),
+    "batches": (
+        lambda: solve(jnp.zeros((2, 6, 3)), jnp.zeros((3, 6)), NU),
+        r"\(2, 6, 3\) and log_mu of \(3, 6\)",
+    ),
+    "more axes": (
+        lambda: solve(jnp.zeros((6, 3)), MU, jnp.zeros((2, 3))),
+        r"\(6, 3\) and log_nu of \(2, 3\)",
+    ),
+    "epsilons": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, epsilon=jnp.ones(3)),
+        r"epsilon found of shape \(3,\), expected a single number",
+    ),
+    "newton, relaxed rows": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, row_tau=0.5, config=SinkhornConfig("newton")),
+        "step newton: found row_tau 0.5 and column_tau 1.0, expected 1",
+    ),
+    "row_tau": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, row_tau=0.0),
+        "row_tau found 0.0, expected more than 0 and at most 1",
+    ),
+    "column_tau": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 3)), 1.0, column_tau=1.1),
+        "column_tau found 1.1, expected more than 0 and at most 1",
+    ),
+    "dustbin": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 3)), 1.0, "row"),
+        "^dustbin: found 'row', expected one of column, mass, none, row and column,",
+    ),
+    "solver": (
+        lambda: solve(
+            jnp.zeros((6, 3)), MU, NU, solver=optimistix.FixedPointIteration(rtol=0, atol=1)
+        ),
+        "a solver beside gradient 'unrolled', expected 'optimistix'",
+    ),
+    "no clusters": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 0)), 1.0),
+        r"assign_with_dustbin: found scores of shape \(6, 0",
+    ),
+    "no columns": (
+        lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
+        r"of shape \(6, 0\) and log_mu",
+    ),
+    "complex": (
+        lambda: solve(jnp.zeros((6, 3), complex), MU, NU),
+        "scores found of complex64, expected real numbers",
+    ),
+    "a step's tuple": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
+        r"^step test-input-tuple: found to return \(Shape.*, expected Potentials\(row",
+    ),
+    "a step's shapes": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-short")),
+        r"^step test-input-short: found to return Potentials\(row=.*shape=\(2,\)",
+    ),
+    "a step's type": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-half")),
+        "^step test-input-half: found to return .*float16.*, expected .*float32",
+    ),
+    "a step's state": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-state")),
+        "^step test-input-state: found to return a state of .*float32.*, expected .*int32",
+    ),
+    "a step without a state": (
+        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-alone")),
+        "^step test-input-alone: found to return Potentials.*expected \\(Potentials, state\\)",
+    ),
+    "appended": (
+        lambda: append_dustbin(jnp.zeros((6, 3)), jnp.ones(5)),
+        r"dustbin: found shape \(5,\), expected \(\) or \(6,\)",
+    ),
+    "assign": (
+        lambda: assign_with_dustbin(jnp.zeros(6), jnp.float32(1)),
+        r"assign_with_dustbin: found scores of shape \(6,",
+    ),
+    "no mass": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 6)), jnp.float32(1)),
+        "6 patches for 6 clusters",
+    ),
+    "less mass": (
+        lambda: assign_with_dustbin(jnp.zeros((4, 6)), jnp.float32(1)),
+        "4 patches for 6 clusters",
+    ),
+    "token, one": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "token"),
+        r"dustbin: found shape \(\), expected \(6,\) for 'token'",
+    ),
+    "column, many": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.ones(6)),
+        r"dustbin: found shape \(6,\), expected \(\) for 'column'",
+    ),
+    "mass, none": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 3)), None, "mass"),
+        r"dustbin: found shape None, expected \(\) for 'mass'",
+    ),
+    "none, one": (
+        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "none"),
+        r"dustbin: found shape \(\), expected None for 'none'",
+    ),
+}
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("traced", [False, True], ids=["eager", "traced"])
+@pytest.mark.parametrize("name", BAD_CALLS)
+def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
+    call, message = BAD_CALLS[name]
+    with pytest.raises(InputError, match=message) as raised:
+        jax.eval_shape(call) if traced else call()
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize(
+    ("scores", "log_mu", "log_nu", "epsilon", "message"),
+    [
+        (jnp.nan, MU, NU, 1.0, "scores found with NaN or infinity"),
+        (jnp.inf, MU, NU, 1.0, "scores found with NaN or infinity"),
+        (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "log_mu found with NaN or infinity"),
+        (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN or infinity"),
+        (0.0, MU, NU, 0.0, "epsilon found 0.0, expected more than 0"),
+        (0.0, MU, NU, -1.0, "epsilon found -1.0, expected more than 0"),
+        (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected more than 0"),
+        (1.0, MU, NU, 1e-40, r"up to 1\.0e\+40, expected numbers that float32 can hold"),
+        (0.0, MU, NU + 1e-3, 1.0, "found to sum to 6 and 6.006, expected the same"),
+        (0.0, MU, NU + 3e-4, 1.0, "found to sum to 6 and 6.0018, expected the same"),
+        (0.0, jnp.stack([MU, MU - 1]), NU, 1.0, "found to sum to 2.20728 and 6, expected the same"),
+    ],
+)
+def test_bad_numbers_raise(
+    scores: float, log_mu: Any, log_nu: Any, epsilon: Any, message: str
+) -> None:
+    full = jnp.zeros((2, 6, 3)).at[1, 2, 1].set(scores)
+    with pytest.raises(InputError, match=f"sinkhorn: .*{message}") as raised:
+        solve(full, log_mu, log_nu, epsilon=epsilon)
+    assert "\n" not in str(raised.value)
+    known = jnp.isfinite(scores)
+    if known and epsilon == 1:  # and where they are known while the scores are traced
+        with pytest.raises(InputError, match=message):
+            jax.jit(lambda scores: solve(scores, log_mu, log_nu))(full)
+
+
+def test_totals_of_a_step_of_another_problem_need_not_agree() -> None:
+    """Rows of a softmax send all their mass, whatever the columns' marginals."""
+    plan = jnp.exp(
+        solve(jnp.zeros((6, 3)), MU, NU - 1, config=SinkhornConfig(step="softmax")).log_plan
+    )
+    np.testing.assert_allclose(plan, 1 / 3, rtol=1e-6)  # a quotient of exponentials in float32
+
+
+def test_totals_need_not_agree_to_the_last_digits() -> None:
+    """Sums of logarithms in float32 do not."""
+    assert solve(jnp.zeros((6, 3)), MU, NU + 1e-5).finite
+
+
+def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
+    assert solve(jnp.zeros((6, 3)), MU, NU + 1, column_tau=0.5).finite
+
+
+def test_settings_of_the_problem_are_no_settings_of_the_solver() -> None:
+    """Where they once stood: nothing runs at an epsilon of 1 that was given another."""
+    for name, value in (("epsilon", 0.1), ("row_tau", 0.5), ("column_tau", 0.5)):
+        with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
+            solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig(**{name: value}))
+    with pytest.raises(TypeError, match="unexpected keyword argument 'dustbin'"):
+        assign_with_dustbin(jnp.zeros((6, 3)), 1.0, config=SinkhornConfig(dustbin="mass"))
+    for name, value in (("must_converge", True), ("anderson", 3), ("method", "newton")):
+        with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
+            SinkhornConfig(**{name: value})
+    with pytest.raises(TypeError, match="unexpected keyword argument 'step'"):
+        solve(jnp.zeros((6, 3)), MU, NU, step=SinkhornStep())
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize(
+    ("kind", "fields", "message"),
+    [
+        (
+            SinkhornConfig,
+            {"step": "simplex"},
+            "^SinkhornConfig.step: step: found 'simplex', expected one of dual-softmax, newton, "
+            "sinkhorn, softmax.*is a plug-in missing",
+        ),
+        (SinkhornConfig, {"step": 3}, "SinkhornConfig.step: found 3, expected a step or its name"),
+        (SinkhornConfig, {"domain": "kernel"}, "SinkhornConfig.domain: found 'kernel'"),
+        (
+            SinkhornConfig,
+            {"gradient": "exact"},
+            "SinkhornConfig.gradient: gradient: found 'exact', expected one of implicit, optim",
+        ),
+        (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
+        (
+            SinkhornConfig,
+            {"iterations": 2.5},
+            "SinkhornConfig.iterations: found 2.5, expected a whole number",
+        ),
+        (
+            SinkhornConfig,
+            {"tolerance": 0.0, "gradient": "stop"},
+            "SinkhornConfig.tolerance: found 0.0",
+        ),
+        (SinkhornConfig, {"anderson_memory": 1}, "SinkhornConfig.anderson_memory: found 1"),
+        (SinkhornConfig, {"anderson_memory": 2.5}, "SinkhornConfig.anderson_memory: found 2.5"),
+        (SinkhornConfig, {"anderson_memory": -2}, "SinkhornConfig.anderson_memory: found -2"),
+        (
+            SinkhornConfig,
+            {"gradient": "implicit"},
+            "found 'implicit' with a fixed number of iterations",
+        ),
+        (
+            SinkhornConfig,
+            {"gradient": "optimistix"},
+            "found 'optimistix' with a fixed number of iterations",
+        ),
+        (SinkhornConfig, {"tolerance": 1e-3}, "found 'unrolled' with a tolerance"),
+        (SinkhornConfig, {"throw": True}, "throw: found no tolerance"),
+        (
+            SinkhornConfig,
+            {"gradient": "optimistix", "tolerance": 1e-3, "anderson_memory": 3},
+            "anderson_memory: found with gradient 'optimistix'",
+        ),
+        (
+            SinkhornConfig,
+            {"step": "softmax", "gradient": "implicit", "tolerance": 1e-3},
+            "gradient: found 'implicit' with step 'softmax', which does not say that it solves",
+        ),
+        (
+            SinkhornConfig,
+            {"step": "test-input-tuple", "gradient": "implicit", "tolerance": 1e-3},
+            "found 'implicit' with step 'test-input-tuple', which does not say that it solves",
+        ),
+        (SinkhornStep, {"relaxation": 2.0}, "SinkhornStep.relaxation: found 2.0"),
+        (SinkhornStep, {"relaxation": 0.9}, "SinkhornStep.relaxation: found 0.9"),
+        (SinkhornStep, {"relaxation": float("nan")}, "SinkhornStep.relaxation: found nan"),
+        (
+            SaladConfig,
+            {"dustbin": "row"},
+            "SaladConfig.dustbin: dustbin: found 'row', expected one of column, mass, none",
+        ),
+        (SaladConfig, {"epsilon": 0.0}, "SaladConfig.epsilon: found 0.0"),
+        (SaladConfig, {"epsilon": float("nan")}, "SaladConfig.epsilon: found nan"),
+        (SaladConfig, {"epsilon": float("inf")}, "SaladConfig.epsilon: found inf"),
+        (SaladConfig, {"row_tau": 0.0}, "SaladConfig.row_tau: found 0.0"),
+        (SaladConfig, {"column_tau": 1.1}, "SaladConfig.column_tau: found 1.1"),
+    ],
+)
+def test_bad_settings_raise(kind: type, fields: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        kind(**fields)
+    assert "\n" not in str(raised.value)
+
+
+# Registrations
+
+
+class _Bare(Step):
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Any) -> Any:
+        return potentials, state
+
+
+@dataclasses.dataclass
+class _Thawed:
+    size: int = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class _Stranger:
+    size: int = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class _Empty(Step):
+    size: int = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class _Named(_Bare):
+    name: str = "mine"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sound(_Bare):
+    size: int = 3
+
+
+def _a_function(problem: Problem, potentials: Potentials) -> Potentials:
+    return potentials
+
+
+@pytest.mark.parametrize(
+    ("register", "name", "part", "message"),
+    [
+        (
+            register_step,
+            "newton",
+            _Sound,
+            "^register_step: found the name 'newton' taken by crisalad_jax.transport.steps."
+            "NewtonStep, expected another name for _Sound$",
+        ),
+        (register_step, "sinkhorn", _a_function, "found the name 'sinkhorn' taken by .*SinkhornS"),
+        (register_step, "", _Bare, "^register_step '': found _Bare, which is no frozen dataclass"),
+        (register_step, "test-bad", _Thawed, "'test-bad': found _Thawed, which is no frozen data"),
+        (register_step, "test-bad", _Stranger, "found _Stranger, expected a subclass of Step$"),
+        (register_step, "test-bad", _Empty, "'test-bad': found no method step, expected it$"),
+        (register_step, "test-bad", _Named, "found a field 'name', which files keep the part's"),
+        (register_step, "test-bad", 3, "found int, expected a frozen dataclass that inherits from"),
+        (register_dustbin, "test-bad", _Sound, "found _Sound, expected a subclass of Dustbin$"),
+        (register_dustbin, "test-bad", _a_function, "register_dustbin 'test-bad': found function,"),
+    ],
+)
+def test_bad_registrations_raise(register: Any, name: str, part: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        register(name)(part)
+    assert "\n" not in str(raised.value)
+    with pytest.raises(InputError):
+        SinkhornConfig(step="test-bad")
+
+
+def test_what_is_registered_twice_is_the_later() -> None:
+    """As where a notebook's cell is run again: one class of one module, with other code."""
+
+    def make(step: float) -> Any:
+        @register_step("test-input-again")
+        def again(problem: Problem, at: Potentials) -> Potentials:
+            return at._replace(row=at.row + step)
+
+        return again
+
+    zeros = jnp.zeros(3)
+    for step in (1.0, 2.0):
+        make(step)
+        config = SinkhornConfig(step="test-input-again", iterations=2)
+        result = solve(jnp.zeros((3, 3)), zeros, zeros, config=config)
+        assert result.potentials.row.tolist() == [2 * step] * 3
+
+
+def test_a_part_and_its_name_are_one_configuration() -> None:
+    assert SinkhornConfig(step="sinkhorn") == SinkhornConfig(step=SinkhornStep())
+    assert hash(SinkhornConfig(step="sinkhorn")) == hash(SinkhornConfig())
+    assert SinkhornConfig(step=SinkhornStep(1.5)) != SinkhornConfig()
+    assert SinkhornConfig().step.part_name == "sinkhorn"
+    # A part whose fields are alike is another part.
+    assert SinkhornConfig("softmax") != SinkhornConfig("dual-softmax")
+
+
+@register_dustbin("test-input-last-patch")
+@dataclasses.dataclass(frozen=True)
+class _LastPatch(Dustbin):
+    """The last number of each patch's features is its score for the dustbin, with a factor."""
+
+    takes_difference = True
+    factor: float = 2.0
+
+    def init(self, key: Any, dim: int) -> Any:
+        return {"shift": jnp.full((), 0.5)}
+
+    def marginals(self, params: Any, scores: Any, patches: Any) -> Any:
+        column = self.factor * patches[..., -1] + params["shift"]
+        log_mu, log_nu = log_marginals(*scores.shape[-2:])
+        return Marginals(append_dustbin(scores, column), log_mu, log_nu)
+
+
+def test_a_dustbin_of_ones_own() -> None:
+    scores, patches = (jax.random.normal(jax.random.key(x), (2, 9, 4)) for x in (0, 1))
+    dustbin = _LastPatch(factor=3.0)
+    params = dustbin.init(jax.random.key(2), 4)
+    found = assign_with_dustbin(scores, params, dustbin, patches=patches)
+    expected = assign_with_dustbin(scores, 3 * patches[..., -1] + 0.5, "token")
+    assert (found.log_plan == expected.log_plan).all()
+    named = assign_with_dustbin(scores, params, "test-input-last-patch", patches=patches)
+    expected = assign_with_dustbin(scores, 2 * patches[..., -1] + 0.5, "token")
+    assert (named.log_plan == expected.log_plan).all()

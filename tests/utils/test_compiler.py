@@ -1,0 +1,228 @@
+"""Compiler options, virtual devices, the compile cache: what is asked of JAX, and what it does."""
+
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.utils import compiler
+
+
+def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment: str) -> str:
+    """What a fresh Python prints: devices are counted once, when JAX starts."""
+    inherited = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("JAX_", "XLA_", "XDG_"))
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", source, *arguments],
+        env={**inherited, "HOME": str(home), "JAX_PLATFORMS": "cpu", **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def _options_anew() -> Any:
+    options = compiler.compiler_options  # a test may put another in its place
+    options.cache_clear()
+    yield
+    options.cache_clear()
+
+
+@pytest.mark.usefixtures("_options_anew")
+def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        compiler,
+        "_LIBRARIES",
+        {"some": {"xla_of_another_version": True, "xla_cpu_enable_fast_math": True}},
+    )
+    assert compiler.compiler_options("some") == {"xla_cpu_enable_fast_math": True}
+
+
+@pytest.mark.usefixtures("_options_anew")
+def test_an_accelerator_has_no_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    for library in ("Eigen", "oneDNN", "YNN"):
+        assert compiler.compiler_options(library, least_memory=True) == {}
+
+
+def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that it does not know stops it."""
+    monkeypatch.setattr(compiler, "compiler_options", lambda *_, **__: {"xla_no_such_option": True})
+    function = compiler.jit(lambda x: x + 1)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
+        function(jnp.ones(3))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
+        function.lower(jnp.ones(3)).compile()  # pyright: ignore[reportFunctionMemberAccess]
+
+
+@dataclasses.dataclass(frozen=True)
+class Configured:
+    """As much of a configuration as is looked at."""
+
+    compute_dtype: str
+
+
+@pytest.mark.parametrize("caches", [False, True], ids=("no cache", "a cache"))
+@pytest.mark.parametrize(
+    ("runs_long", "size", "dtype", "asked"),
+    [
+        (False, compiler._SMALL, "float32", "Eigen"),
+        (True, compiler._SMALL, "float32", "oneDNN"),
+        (True, compiler._SMALL - 1, "float32", "Eigen"),
+        (True, compiler._SMALL, "bfloat16", "YNN"),
+        (False, compiler._SMALL - 1, "bfloat16", "YNN"),
+    ],
+)
+def test_whose_products_a_program_has(
+    monkeypatch: pytest.MonkeyPatch,
+    runs_long: bool,
+    size: int,
+    dtype: str,
+    asked: str,
+    caches: bool,
+) -> None:
+    """A folder of compiled programs has no say: a notebook gives the command line's bits."""
+    seen = []
+
+    def options(library: str, *, least_memory: bool) -> dict[str, bool]:
+        seen.append((library, least_memory))
+        return {}
+
+    monkeypatch.setattr(compiler, "compiler_options", options)
+    function = compiler.jit(
+        lambda x, y, config: x + y, runs_long=runs_long, static_argnames="config"
+    )
+    before = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    try:
+        jax.config.update("jax_compilation_cache_dir", "/dev/null/nowhere" if caches else None)
+        x = jax.ShapeDtypeStruct((size,), jnp.float32)
+        images = jax.ShapeDtypeStruct((size,), jnp.uint8)
+        function.lower(x, images, Configured(dtype))  # pyright: ignore[reportFunctionMemberAccess]
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+    assert seen == [(asked, not runs_long)]
+
+
+WAYS: dict[str, Callable[[Any], Any]] = {
+    "by itself": lambda f: f(jnp.arange(3.0), "by", power=3),
+    "in jit": lambda f: jax.jit(lambda x: f(x, "by", power=3))(jnp.arange(3.0)),
+    "in jit, of constants": lambda f: jax.jit(lambda: f(jnp.arange(3.0), "by", power=3))(),
+    "in vmap": lambda f: jax.vmap(lambda x: f(x, "by", power=3))(jnp.arange(3.0)),
+    "in a gradient": lambda f: jax.grad(lambda x: f(x, "by", power=4).sum() / 4)(jnp.arange(3.0)),
+    "in grad, of constants": lambda f: (
+        jax.grad(lambda x: x * f(jnp.arange(3.0), "by", power=3)[2])(1.0) * jnp.array([0, 1 / 8, 1])
+    ),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_compiled_function_may_be_used_anywhere(way: str) -> None:
+    function = compiler.jit(lambda x, how, power: x**power, static_argnames=("how", "power"))
+    # Whole numbers below 10: nothing to round but the logarithm of XLA's power.
+    np.testing.assert_allclose(WAYS[way](function), [0, 1, 8], rtol=1e-6)
+
+
+def test_arguments_can_be_donated() -> None:
+    function = compiler.jit(lambda x: x + 1, donate_argnums=0)
+    given = jnp.ones(1000)
+    np.testing.assert_array_equal(function(given), np.full(1000, 2.0))
+    assert given.is_deleted()
+
+
+SPREAD = """
+import sys, jax, jax.numpy as jnp, numpy as np
+from crisalad_jax.utils import compiler
+compiler.set_up()
+from crisalad_jax.utils.devices import devices_for
+from tests.conftest import MODEL, random_params
+from crisalad_jax.nn.model import extract_tokens
+count = len(jax.local_devices())
+params = random_params(MODEL)
+images = np.random.default_rng(0).integers(0, 256, (6, *MODEL.image_size, 3), dtype=np.uint8)
+expected = extract_tokens(params, jnp.asarray(images), MODEL)
+devices = devices_for(6)
+spread, everywhere = devices.shard_batch(images), devices.replicate(params)
+found = extract_tokens(everywhere, spread, MODEL)
+# Unit vectors of 8 numbers, rounded at 1e-7 some hundred times on the way.
+for ours, theirs in zip(found[:2], expected[:2]):
+    np.testing.assert_allclose(np.asarray(ours), theirs, atol=1e-5)
+leaf = everywhere.backbone.blocks.attn.qkv.weight
+places = {shard.data.unsafe_buffer_pointer() for shard in leaf.addressable_shards}
+print(count, len(spread.sharding.device_set), len(found.local.sharding.device_set), len(places))
+"""
+
+
+@pytest.mark.parametrize(
+    ("devices", "used"),
+    [(4, 3), *(pytest.param(n, n, marks=pytest.mark.slow) for n in (1, 3))],
+)
+def test_images_are_spread_and_parameters_shared(
+    devices: int, used: int, tmp_path: pathlib.Path
+) -> None:
+    """Six images, on as many devices as have the same number of them; one copy of a parameter."""
+    path = os.getcwd()
+    told = {"JAX_NUM_CPU_DEVICES": str(devices), "PYTHONPATH": path}
+    assert in_a_program(SPREAD, tmp_path, **told) == f"{devices} {used} {used} 1\n"
+
+
+SET_UP = """
+import os, jax
+if os.environ.get("FEWER"):
+    os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+from crisalad_jax.utils import compiler
+compiler.set_up()
+print(len(jax.devices()), len(os.sched_getaffinity(0)), jax.config.jax_compilation_cache_dir)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+def squared(x):
+    return x @ x
+compiler.jit(squared)(jax.numpy.ones((64, 64))).block_until_ready()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")
+@pytest.mark.parametrize("fewer", ["", "yes"], ids=("all cores", "one core"))
+def test_a_device_a_core_and_programs_are_kept(tmp_path: pathlib.Path, fewer: str) -> None:
+    cache = tmp_path / ".cache" / "crisalad-jax"
+    devices, cores, place = in_a_program(SET_UP, tmp_path, FEWER=fewer).split()
+    assert devices == cores
+    assert not fewer or cores == "1"
+    assert place == str(cache)
+    assert list(cache.glob("jit_squared-*"))
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")
+def test_without_a_place_for_them_programs_are_not_kept(tmp_path: pathlib.Path) -> None:
+    nowhere = tmp_path / "file"
+    nowhere.write_text("")
+    assert in_a_program(SET_UP, tmp_path, XDG_CACHE_HOME=str(nowhere)).split()[2] == "None"
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"JAX_NUM_CPU_DEVICES": "3"},
+        {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"},
+    ],
+    ids=lambda told: next(iter(told)),
+)
+def test_the_environment_is_heeded(told: dict[str, str], tmp_path: pathlib.Path) -> None:
+    kept, elsewhere = str(tmp_path / "kept"), tmp_path / "elsewhere"
+    environment = {**told, "JAX_COMPILATION_CACHE_DIR": kept, "XDG_CACHE_HOME": str(elsewhere)}
+    devices, _, place = in_a_program(SET_UP, tmp_path, **environment).split()
+    assert (devices, place) == ("3", kept)
+    assert not elsewhere.exists()
