@@ -288,7 +288,7 @@ HALVES = (Half("bfloat16", 8, 7), Half("float16", 5, 10))
 class RoundedStep(Step):
     """The log-domain step with every intermediate result rounded to half precision."""
 
-    half: Half
+    half: Half = HALVES[0]
 
     def step(
         self, problem: Problem, potentials: Potentials, state: Any, iteration: jax.Array
