@@ -151,10 +151,10 @@ class OtherProblem(WidePlan):
         return problem.kernel
 """
 BAD_STEPS = {
-    "short": "found to return Potentials(row=ShapeDtypeStruct(shape=({}2",
-    "nothing": "found to return None, expected Potentials(row=ShapeDtypeStruct(shape=(",
-    "wide-plan": "found a log_plan of ShapeDtypeStruct(shape=(7, 7), dtype=float32), expected one",
-    "other-problem": "found to prepare ShapeDtypeStruct(shape=(",
+    "short": "found to return Potentials(row=float32[{}2], column=float32[",
+    "nothing": "found to return None, expected Potentials(row=float32[",
+    "wide-plan": "found a log_plan of float32[7,7], expected one",
+    "other-problem": "found to prepare float32[",
 }
 
 
@@ -182,7 +182,7 @@ def test_a_step_that_returns_something_else(
     assert "\n" not in str(error.value)
     save_with_step(weights, name)
     data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", BATCH)
-    words = f"crisalad: {words.format(f'{BATCH}, ')}"
+    words = f"crisalad: {words.format(f'{BATCH},')}"
     fails(capfd, *data, "--plugin", plugin, "--quiet", words=(words,))
 
 
@@ -298,6 +298,101 @@ def test_a_loss_that_is_no_number(
     run = ("train", "--data", shared / "city", "--out", out, "--config", shared / "recipe.json")
     more = ("--weights", shared / "weights.safetensors", "--plugin", plugin, "--quiet")
     fails(capfd, *run, *more, "--loss.kind", name, words=(f"crisalad: {words}",))
+
+
+RAISES = """
+import crisalad_jax as cj
+
+@cj.register_step("raises")
+def raises(problem, potentials):
+    rows = problem.over_rows(potentials.row)
+    return helper(rows)
+
+def helper(rows):
+    raise ValueError("found no rows,\\nexpected some")
+"""
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_a_plug_in_that_raises_while_it_runs_is_named_in_one_line(
+    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, monkeypatch
+) -> None:
+    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
+    plugin.write_text(RAISES)
+    load_plugin(str(plugin))
+    save_with_step(weights, "raises")
+    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", BATCH)
+    words = (
+        f"crisalad: plugin {plugin}: line 10, in helper: ValueError: found no rows, expected some "
+        "(from Python you see the traceback)\n"
+    )
+    fails(capfd, *data, "--plugin", plugin, "--quiet", words=(words,))
+
+    def broken(*_: Any, **__: Any) -> None:
+        raise ValueError("not a plug-in's")
+
+    # An error of this package is no plug-in's, and is not hidden.
+    monkeypatch.setattr("crisalad_jax.cli.info.run", broken)
+    with pytest.raises(ValueError, match="not a plug-in's"):
+        succeeds(capfd, "info", "--plugin", plugin)
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [
+        (lambda scores: scores, "found to return .*, expected Marginals$"),
+        (
+            lambda scores: cj.sinkhorn.Marginals(scores[..., :2], jnp.zeros(6), jnp.zeros(2)),
+            r"found to return scores of shape \(6, 2\), expected at least the 6 patches and the 3 "
+            r"clusters of \(6, 3\)$",
+        ),
+    ],
+)
+def test_a_dustbin_that_returns_something_else_is_named(returned: Any, words: str) -> None:
+    @cj.sinkhorn.register_dustbin("wrong")
+    @dataclasses.dataclass(frozen=True)
+    class Wrong(cj.sinkhorn.Dustbin):
+        def marginals(self, params: Any, scores: Any, patches: Any) -> Any:
+            return returned(scores)
+
+    with pytest.raises(InputError, match=f"^dustbin wrong: {words}"):
+        cj.sinkhorn.assign_with_dustbin(jnp.zeros((6, 3)), None, "wrong")
+
+
+@pytest.mark.parametrize("returned", [None, "potentials", "short"])
+def test_a_gradient_that_returns_something_else_is_named(returned: str | None) -> None:
+    @cj.sinkhorn.register_gradient("wrong")
+    @dataclasses.dataclass(frozen=True)
+    class Wrong(cj.sinkhorn.Gradient):
+        def solve(self, problem: Any, config: Any, params: Any, init: Any) -> Any:
+            short = init._replace(row=init.row[1:])
+            one = jnp.zeros((), jnp.int32)
+            solution = cj.sinkhorn.Solution(short, one, one > 0)
+            return {None: None, "potentials": init, "short": solution}[returned]
+
+    found = {
+        None: "None",
+        "potentials": r"Potentials\(row=float32\[6\], column=float32\[3\]\)",
+        "short": r"Solution\(potentials=Potentials\(row=float32\[5\], .*\)",
+    }[returned]
+    log_nu = jnp.log(jnp.full(3, 2.0))
+    with pytest.raises(InputError, match=f"^gradient wrong: found to return {found}, expected a S"):
+        solve(jnp.zeros((6, 3)), jnp.zeros(6), log_nu, config=SinkhornConfig(gradient="wrong"))
+
+
+def test_a_token_shape_that_is_a_plain_tuple_is_named() -> None:
+    @cj.register_aggregator("tuple")
+    @dataclasses.dataclass(frozen=True)
+    class Plain(cj.Aggregator):
+        def token_shape(self, dim: int) -> Any:
+            return dim, 0, dim
+
+        def apply(self, params: Any, features: Any, grid: Any, *, key: Any) -> Any:
+            raise NotImplementedError
+
+    words = r"^aggregator tuple: token_shape found to return \(768, 0, 768\), expected TokenShape\("
+    with pytest.raises(InputError, match=words):
+        cj.ModelConfig(aggregator="tuple")
 
 
 def test_a_plug_in_that_ends_the_program_is_refused(tmp_path: pathlib.Path) -> None:

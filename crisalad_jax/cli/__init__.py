@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.plugins import load_entry_points, load_plugin
+from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_failure
 from crisalad_jax.utils.errors import InputError, Stopped
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.notes import Note
@@ -156,4 +156,10 @@ def _exit_code(given: list[str]) -> int:
     except KeyboardInterrupt:
         print("crisalad: interrupted", file=sys.stderr)
         return 130
+    except Exception as error:
+        told = plugin_failure(error)
+        if told is None:
+            raise
+        print(f"crisalad: {told} (from Python you see the traceback)", file=sys.stderr)
+        return 2
     return 0

@@ -17,6 +17,8 @@ ENTRY_POINTS = "crisalad_jax.plugins"
 _FILES: dict[str, pathlib.Path] = {}
 """File of each loaded plug-in, by its module's name."""
 _ENTERED: set[str] = set()
+_LOADED: set[str] = set()
+"""Source files of all loaded plug-ins."""
 
 
 def load_plugin(plugin: str) -> None:
@@ -89,10 +91,11 @@ def _load_file(file: str) -> None:
         raise
 
 
-def _run(load: Callable[[], ModuleType], file: str | None) -> None:
+def _run(load: Callable[[], ModuleType], file: str) -> None:
     """Run a plug-in's import, and report in one line what it raises, and where."""
     try:
         load()
+        _LOADED.add(file)
     except InputError:
         raise
     except (Exception, SystemExit) as error:
@@ -104,6 +107,20 @@ def _run(load: Callable[[], ModuleType], file: str | None) -> None:
         raise InputError(
             f"cannot be loaded: it raises {type(error).__name__}{where}: {what}"
         ) from error
+
+
+def plugin_failure(error: BaseException) -> str | None:
+    """Describe in one line an exception that came from a plug-in's code; None for any other."""
+    places = [
+        (place.filename, place.lineno, place.name)
+        for place in traceback.extract_tb(error.__traceback__)
+        if place.filename in _LOADED
+    ]
+    if not places:
+        return None
+    file, line, function = places[-1]
+    what = " ".join(str(error).split())
+    return f"plugin {file}: line {line}, in {function}: {type(error).__name__}: {what}"
 
 
 def plugin_of(module: str) -> str | None:

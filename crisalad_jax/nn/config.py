@@ -58,11 +58,12 @@ class ModelConfig:
             f"CrossImageConfig.layers: found {self.cross_image.layers} for aggregator {name}, with "
             "which nothing trains, expected 0",
         )
+        shape = self.token_shape
         if self.cross_image.layers:
-            self._check_cross_image()
+            self._check_cross_image(shape)
 
-    def _check_cross_image(self) -> None:
-        shape, heads = self.token_shape, self.cross_image.heads
+    def _check_cross_image(self, shape: TokenShape) -> None:
+        heads = self.cross_image.heads
         width, name = shape.token_dim, f"aggregator {self.aggregator.part_name}"
         field, kind = self.aggregator.width_field, type(self.aggregator).__name__
         require(
@@ -86,7 +87,13 @@ class ModelConfig:
     @property
     def token_shape(self) -> TokenShape:
         """Shape of an image's tokens."""
-        return self.aggregator.token_shape(self.backbone.dim)
+        shape = self.aggregator.token_shape(self.backbone.dim)
+        require(
+            isinstance(shape, TokenShape),
+            f"aggregator {self.aggregator.part_name}: token_shape found to return {shape!r}, "
+            "expected TokenShape(global_dim, tokens, token_dim)",
+        )
+        return shape
 
     @property
     def descriptor_dim(self) -> int:

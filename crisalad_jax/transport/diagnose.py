@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from crisalad_jax.transport.config import SinkhornConfig
+from crisalad_jax.transport.config import SinkhornConfig, Solution
 from crisalad_jax.transport.problem import Potentials, Problem
 from crisalad_jax.utils.errors import InputError
 
@@ -174,6 +174,32 @@ def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
         )
 
 
+def check_solution(solution: Any, config: SinkhornConfig, problem: Problem) -> None:
+    """Check that a gradient returns a solution of the problem's shapes.
+
+    Raises:
+        InputError: it does not; the message names the gradient.
+    """
+    zeros = problem.zeros()
+    batch = zeros.row.shape[:-1]
+    fits = (
+        isinstance(solution, Solution)
+        and isinstance(solution.potentials, Potentials)
+        and _kinds(solution.potentials) == _kinds(zeros)
+        and jnp.shape(solution.iterations) == jnp.shape(solution.met) == batch
+    )
+    if not fits:
+        raise InputError(
+            f"gradient {config.gradient.part_name}: found to return {_named(solution)}, expected a "
+            f"Solution of {_words(zeros)}, and of iterations and met of shape {batch}"
+        )
+
+
+def _named(value: Any) -> str:
+    arrays = all(hasattr(leaf, "shape") for leaf in jax.tree.leaves(value))
+    return _words(value) if arrays else type(value).__name__
+
+
 def _kinds(tree: Any) -> tuple[Any, ...]:
     """Return a tree's structure, and its leaves' shapes and types."""
     leaves = [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
@@ -181,7 +207,12 @@ def _kinds(tree: Any) -> tuple[Any, ...]:
 
 
 def _words(tree: Any) -> str:
-    return " ".join(str(tree).split())
+    """Describe a tree by the types and shapes of its leaves, such as float32[2,3]."""
+
+    def word(leaf: Any) -> str:
+        return f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]"
+
+    return str(jax.tree.map(word, tree)).replace("'", "")
 
 
 def _spreads(shape: tuple[int, ...], target: tuple[int, ...]) -> bool:

@@ -68,6 +68,25 @@ def _check_shape(params: Any, expected: tuple[int, ...] | None, name: str) -> No
         raise InputError(f"dustbin: found shape {shape}, expected {expected} for {name!r}")
 
 
+def check_marginals(marginals: Any, dustbin: Dustbin, scores: Array) -> Marginals:
+    """Return what a dustbin returned, if it is `Marginals` that begin with patches and clusters.
+
+    Raises:
+        InputError: it is not; the message names the dustbin.
+    """
+    where = f"dustbin {dustbin.part_name}: found to return"
+    if not isinstance(marginals, Marginals):
+        raise InputError(f"{where} {type(marginals).__name__}, expected Marginals")
+    shape, (rows, clusters) = jnp.shape(marginals.scores), scores.shape[-2:]
+    clusters -= dustbin.scores
+    if len(shape) != scores.ndim or shape[-2] < rows or shape[-1] < clusters:
+        raise InputError(
+            f"{where} scores of shape {shape}, expected at least the {rows} patches and the "
+            f"{clusters} clusters of {scores.shape}"
+        )
+    return marginals
+
+
 @DUSTBINS.register("none")
 @dataclasses.dataclass(frozen=True)
 class NoDustbin(Dustbin):

@@ -10,9 +10,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.transport.config import SinkhornConfig
-from crisalad_jax.transport.diagnose import check_inputs, check_step, marginal_error, wide_dtype
+from crisalad_jax.transport.diagnose import (
+    check_inputs,
+    check_solution,
+    check_step,
+    marginal_error,
+    wide_dtype,
+)
 from crisalad_jax.transport.differentiate import Optimistix, centred
-from crisalad_jax.transport.dustbin import DUSTBINS, Dustbin, widened
+from crisalad_jax.transport.dustbin import DUSTBINS, Dustbin, check_marginals, widened
 from crisalad_jax.transport.problem import Potentials, Problem, zero_potentials
 from crisalad_jax.utils.errors import InputError
 
@@ -134,6 +140,7 @@ def _solve(
         start = Potentials(*(a.astype(wide) + b for a, b in zip(init, zeros, strict=True)))
     options = {} if solver is None else {"solver": solver}
     solution = config.gradient.solve(problem, config, step_params, start, **options)
+    check_solution(solution, config, problem)
     potentials, step = solution.potentials, config.step
     log_plan = step.log_plan(problem, potentials)
     errors = marginal_error(log_plan, problem.log_mu, problem.log_nu)
@@ -211,7 +218,9 @@ def assign_with_dustbin(
     scores = widened(jnp.asarray(scores))
     if isinstance(dustbin, str):
         dustbin = DUSTBINS.make(dustbin)
-    full, log_mu, log_nu = dustbin.marginals(params, scores, patches)
+    full, log_mu, log_nu = check_marginals(
+        dustbin.marginals(params, scores, patches), dustbin, scores
+    )
     result = solve(
         full,
         log_mu,
