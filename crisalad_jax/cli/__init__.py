@@ -1,12 +1,14 @@
 """The command line: parse, make a configuration, call the library; a module for each command.
 
 Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 143 ended by
-SIGTERM with its work saved, 1 anything else.
+SIGTERM with its work saved, 141 the reader of the output is gone, 1 anything else.
 """
 
 import contextlib
 import importlib
 import io
+import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -145,6 +147,10 @@ def _exit_code(given: list[str]) -> int:
     except ModuleNotFoundError as error:
         print(f"crisalad: {missing_extra(error, f'crisalad {given[0]}')}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # as of `crisalad train --help | head`
+        # Else Python would complain when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except (InputError, OSError) as error:  # OSError: a full disk, or a fault that no check foresaw
         print("crisalad:", *str(error).splitlines(), file=sys.stderr)
         return 2

@@ -113,7 +113,8 @@ def read_places(
 def _find_tables(root: pathlib.Path, cities: Sequence[str] | None) -> list[pathlib.Path]:
     folder = root / "Dataframes"
     if not folder.is_dir():
-        raise InputError(f"{root}: found no folder Dataframes, expected the layout of GSV-Cities")
+        missing = "folder Dataframes" if root.is_dir() else "such folder"
+        raise InputError(f"{root}: found no {missing}, expected the layout of GSV-Cities")
     tables = {path.stem: path for path in folder.glob("*.csv")}
     if not tables:
         raise InputError(f"{folder}: found no CSV file, expected one for each city")

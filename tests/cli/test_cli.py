@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import importlib
 import json
+import os
 import pathlib
 import re
 import subprocess
@@ -233,6 +234,16 @@ def test_the_console_script_and_the_module_are_the_same_thing(tmp_path):
     assert done.stderr.startswith("crisalad: a.jpg: found an image cut short")
     assert done.stderr.count("\n") == 1
     assert files_in(tmp_path) == {"a.jpg", "w.safetensors"}
+
+
+def test_a_reader_that_goes_away_ends_the_command_quietly():
+    """As `crisalad info --help | head -1`; 141 is what a shell says of a program ended by it."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "crisalad_jax", "info", "--help"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 # train

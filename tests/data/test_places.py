@@ -119,6 +119,10 @@ def test_byte_order_mark_and_blank_lines(two_cities):
 
 
 def test_no_dataframes(tmp_path):
+    with pytest.raises(
+        InputError, match=r"^.*none: found no such folder, expected the layout of G"
+    ):
+        read_places(tmp_path / "none")
     with pytest.raises(InputError, match="no folder Dataframes"):
         read_places(tmp_path)
     (tmp_path / "Dataframes").mkdir()

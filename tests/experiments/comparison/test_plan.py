@@ -71,7 +71,7 @@ REFUSED = [
     (("--weights", "crisalad=none"), ("none: found no such file",)),
     (("--image-size", 50, 50), ("found 50 x 50, expected sides that are multiples of 14",)),
     (("--preset", "huge"), ("preset: found 'huge', expected one of b14",)),
-    (("--train", "none"), ("none: found no folder Dataframes",)),
+    (("--train", "none"), ("none: found no such folder",)),
     (("--test", "none"), ("none: found",)),
     (("--backbone", "none"), ("none: found no such file",)),
 ]
