@@ -94,12 +94,13 @@ def run(page: str, text: str) -> int:
 
 
 def main() -> None:
-    """Run every page in a folder of its own, beside the pictures of the documentation."""
+    """Run every page in a folder of its own, beside the documentation and the examples."""
     root = pathlib.Path(__file__).resolve().parents[1]
     for page in sys.argv[1:]:
         text = pathlib.Path(page).read_text(encoding="utf-8")
         with tempfile.TemporaryDirectory() as folder, own_parts():
-            os.symlink(root / "docs", pathlib.Path(folder) / "docs")
+            for beside in ("docs", "examples"):
+                os.symlink(root / beside, pathlib.Path(folder) / beside)
             os.chdir(folder)
             start = time.process_time()
             count = run(page, text)

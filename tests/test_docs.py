@@ -15,7 +15,10 @@ from crisalad_jax.config.parts import REGISTRIES
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
-TEXTS = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
+TEXTS = [
+    *(README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "examples" / "README.md"),
+    *PAGES,
+]
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 PATH = re.compile(r"`((?:examples|scripts|tests|docs|\.ci)/[\w./-]*[\w/])`")
 
@@ -95,11 +98,13 @@ def test_readme_is_short():
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
 
 
-@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md"]
+)
 def test_links_outside_of_the_site_lead_somewhere(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     relative = [link.partition("#")[0] for link in LINK.findall(text) if ":" not in link]
-    assert not [link for link in relative if link and not (ROOT / link).exists()]
+    assert not [link for link in relative if link and not (page.parent / link).exists()]
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.relative_to(ROOT).as_posix())
