@@ -1,10 +1,9 @@
 """Leakage of a grouping: the share of images in sight of an image that show its own place."""
 
-import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float64, Int64
 
 from crisalad_jax.retrieval.grouping import Batches
@@ -38,49 +37,21 @@ def by_truth(
     """
     right = np.concatenate(positives) if positives else np.empty(0, np.int64)
     asking = np.repeat(np.arange(len(positives)), [len(each) for each in positives])
-    queries = _Sharing(asking, right, len(positives), database)
-    return queries, _Sharing(right, asking, database, len(positives))
+    entries = np.ones(len(right), np.int8), (asking, right)
+    truth = scipy.sparse.csr_array(entries, shape=(len(positives), database), dtype=bool)
+    return _sharing(truth), _sharing(truth.T.tocsr())
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Sharing:
-    """Tests whether two owners have a thing in common; memory is linear in entries and pairs."""
+def _sharing(owned: scipy.sparse.csr_array) -> SamePlace:
+    """Make the test that two rows have an entry in common; memory is linear in pairs."""
+    step = max(1, _CHUNK // int(np.diff(owned.indptr).max(initial=1)))
 
-    owners: Int64[np.ndarray, " entry"]
-    things: Int64[np.ndarray, " entry"]
-    owner_count: int
-    thing_count: int
+    def same(a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]) -> np.ndarray:
+        pieces = (slice(i, i + step) for i in range(0, len(a), step))
+        counts = [owned[a[piece]].multiply(owned[b[piece]]).sum(axis=1) for piece in pieces]
+        return np.concatenate([np.zeros(0), *counts]) > 0
 
-    @functools.cached_property
-    def _codes(self) -> Int64[np.ndarray, " code"]:
-        """Each entry as one number, in ascending order: an owner's entries stand together."""
-        return np.unique(self.owners * self.thing_count + self.things)
-
-    @functools.cached_property
-    def _bounds(self) -> Int64[np.ndarray, " bound"]:
-        """Index where each owner's codes begin, and the number of all codes."""
-        return np.searchsorted(self._codes, np.arange(self.owner_count + 1) * self.thing_count)
-
-    def __call__(
-        self, a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]
-    ) -> Bool[np.ndarray, " pair"]:
-        most = int(np.diff(self._bounds).max(initial=1))
-        step = max(1, _CHUNK // most)
-        parts = [self._part(a[i : i + step], b[i : i + step]) for i in range(0, len(a), step)]
-        return np.concatenate([np.zeros(0, bool), *parts])
-
-    def _part(
-        self, a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]
-    ) -> Bool[np.ndarray, " pair"]:
-        """Look up every thing of the first owners among those of the second."""
-        counts = np.diff(self._bounds)[a]
-        pair = np.repeat(np.arange(len(a)), counts)
-        place = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
-        things = self._codes[self._bounds[a][pair] + place] % max(self.thing_count, 1)
-        wanted = b[pair] * self.thing_count + things
-        first = np.searchsorted(self._codes, wanted, side="left")
-        hit = np.searchsorted(self._codes, wanted, side="right") > first
-        return np.bincount(pair[hit], minlength=len(a)) > 0
+    return same
 
 
 def same_place_share(batches: Batches, same: SamePlace) -> float | None:

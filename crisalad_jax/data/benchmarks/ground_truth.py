@@ -25,22 +25,11 @@ def check_radius(radius: float) -> None:
 def within(
     database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"], radius: float
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
-    """Find the database images at most `radius` away from each query, as ascending indices.
+    """Find the database images at most `radius` away from each query, as ascending indices."""
+    import scipy.spatial  # takes a fifth of a second, which reading images does not need
 
-    Memory stays linear in the database.
-    """
-    # Sort along the longer side of the map: a band of twice the radius holds few candidates.
-    axis = int(np.argmax(np.ptp(database, axis=0)))
-    order = np.argsort(database[:, axis], kind="stable")
-    ordered = database[order]
-    # Rounding is monotonic, so the rounded band loses no image at most `radius` away.
-    first = np.searchsorted(ordered[:, axis], queries[:, axis] - radius, side="left")
-    last = np.searchsorted(ordered[:, axis], queries[:, axis] + radius, side="right")
-    positives = []
-    for query, start, stop in zip(queries, first, last, strict=True):
-        squared = np.square(ordered[start:stop] - query).sum(axis=1)
-        positives.append(np.sort(order[start:stop][squared <= radius * radius]))
-    return tuple(positives)
+    near = scipy.spatial.KDTree(database).query_ball_point(queries, radius, return_sorted=True)
+    return tuple(np.array(references, np.int64) for references in near)
 
 
 def indices(value: Any) -> Int64[np.ndarray, " _"]:
