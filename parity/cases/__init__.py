@@ -297,7 +297,7 @@ RUNS: tuple[Run, ...] = (
     Run("training CriSALAD's adapters and head", CRISALAD, "adapters+head"),
     Run("training CriSALAD's last block and head", CRISALAD, "last-1-blocks+head"),
     Run("training all of CriSALAD", CRISALAD, "all"),
-    Run("training CricaVPR's adapters and head", CRICAVPR, "adapters+head"),
+    Run("training CricaVPR's adapters and head", CRICAVPR, "adapters+head", kinks=True),
 )
 
 
