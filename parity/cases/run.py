@@ -40,7 +40,7 @@ class Run:
     trainable: str
     size: tuple[int, int] = (42, 56)
     kinks: bool = False
-    """Whether a ReLU is measured to switch on one side only, by rounding; later steps then differ."""
+    """Whether a ReLU is measured to switch on one side only, after which the sides drift apart."""
 
 
 class Batch(NamedTuple):
