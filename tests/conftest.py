@@ -220,6 +220,7 @@ def own_parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         for name in ("_parts", "_presets"):
             monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
     monkeypatch.setattr(plugins, "_FILES", {})
+    monkeypatch.setattr(plugins, "_LOADED", set())
     before = set(sys.modules)
     yield
     for name in set(sys.modules) - before:

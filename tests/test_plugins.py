@@ -8,13 +8,14 @@ import subprocess
 import sys
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
-from crisalad_jax.config import source
+from crisalad_jax.config import plugins, source
 from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.losses import LossConfig, metric_loss
@@ -331,10 +332,13 @@ def test_a_plug_in_that_raises_while_it_runs_is_named_in_one_line(
     def broken(*_: Any, **__: Any) -> None:
         raise ValueError("not a plug-in's")
 
-    # An error of this package is no plug-in's, and is not hidden.
+    # What a plug-in returned may break other code; without plug-ins it is an error of this package.
     monkeypatch.setattr("crisalad_jax.cli.info.run", broken)
+    words = f"crisalad: plugin {plugin}: ValueError: not a plug-in's (from Python"
+    fails(capfd, "info", "--plugin", plugin, words=(words,))
+    monkeypatch.setattr(plugins, "_LOADED", set())
     with pytest.raises(ValueError, match="not a plug-in's"):
-        succeeds(capfd, "info", "--plugin", plugin)
+        succeeds(capfd, "info")
 
 
 @pytest.mark.parametrize(
@@ -570,3 +574,122 @@ def test_plug_ins_all_the_way_in_processes_of_their_own(tmp_path: pathlib.Path, 
     files[0].write_text(files[0].read_text().replace("jnp.exp(", "jnp.exp(0.5 * "))
     note = crisalad("evaluate", *data, *plug).stderr
     assert "found another source of aggregator.sinkhorn.step learnt-epsilon than these" in note
+
+
+def test_a_plug_in_that_ends_the_program_while_it_runs_fails(
+    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
+) -> None:
+    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
+    plugin.write_text(
+        RAISES.replace('ValueError("found no rows,\\nexpected some")', "SystemExit(0)")
+    )
+    load_plugin(str(plugin))
+    save_with_step(weights, "raises")
+    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", BATCH)
+    words = f"crisalad: plugin {plugin}: line 10, in helper: SystemExit: 0 (from Python"
+    fails(capfd, *data, "--plugin", plugin, "--quiet", words=(words,))
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "int32"])
+def test_tokens_parameters_and_losses_of_another_type_are_named(dtype: str) -> None:
+    @cj.register_aggregator("half")
+    @dataclasses.dataclass(frozen=True)
+    class Half(cj.Aggregator):
+        draws: bool = False
+
+        def token_shape(self, dim: int) -> cj.TokenShape:
+            return cj.TokenShape(dim, 0, dim)
+
+        def init(self, key: Any, backbone: Any, grid: Any) -> Any:
+            return {"scale": jnp.ones(3, dtype)} if self.draws else None
+
+        def apply(self, params: Any, features: Any, grid: Any, *, key: Any) -> cj.Tokens:
+            return cj.Tokens.of_global(features.patches.mean(axis=-2).astype(dtype))
+
+    config = dataclasses.replace(WITHOUT_ENCODER, aggregator=Half())
+    pictures = np.zeros((2, *config.image_size, 3), np.uint8)
+    words = f"^aggregator half: found to return tokens of type {dtype}, expected float32"
+    with pytest.raises(InputError, match=words):
+        describe(random_params(config), pictures, config)
+    config = dataclasses.replace(config, aggregator=Half(draws=True))
+    words = f"^aggregator half: found parameter scale of type {dtype}, expected float32"
+    with pytest.raises(InputError, match=words):
+        cj.init_crisalad(jax.random.key(0), config)
+
+    @cj.register_loss("half")
+    def half(batch: Any) -> Any:
+        return batch.similarities.sum().astype(dtype)
+
+    with pytest.raises(
+        InputError, match=f"^loss half: found to return a number of type {dtype}, expected float32"
+    ):
+        metric_loss(jnp.eye(6), jnp.arange(6) // 2, LossConfig(kind="half"))
+
+
+@pytest.mark.parametrize(
+    ("register", "words"),
+    [
+        (
+            lambda: cj.register_step(lambda a, b: b),
+            "found <function .*, expected a name: @r",
+        ),
+        (lambda: cj.register_step(3), "found 3, expected a name"),
+        (lambda: cj.register_step(""), "found the name '', expected one without"),
+        (lambda: cj.register_step("my:step"), "found the name 'my:step', expected one without"),
+    ],
+)
+def test_a_registration_without_a_name_is_refused(register: Any, words: str) -> None:
+    with pytest.raises(InputError, match=f"^register_step: {words}"):
+        register()
+
+
+@pytest.mark.parametrize(
+    ("kind", "default", "words"),
+    [
+        (int, "three", "found 'three', expected int"),
+        (tuple, (1, 2), r"found \[1, 2\], expected tuple"),
+        (Any, 1, "found 1, expected .*Any"),
+        (Any, print, "configuration: found <built-in function print>"),
+    ],
+)
+def test_settings_that_no_file_can_keep_are_refused(kind: Any, default: Any, words: str) -> None:
+    made = dataclasses.make_dataclass(
+        "Odd", [("field", kind, default)], bases=(type(cj.LossConfig().kind),), frozen=True
+    )
+    with pytest.raises(InputError, match=words):
+        cj.register_loss("odd")(made)
+    assert "odd" not in REGISTRIES["loss"].names()
+
+
+def test_a_field_or_a_preset_of_another_name_is_refused() -> None:
+    base = type(cj.LossConfig().kind)
+    made = dataclasses.make_dataclass("Odd", [("apply", int, 1)], bases=(base,), frozen=True)
+    with pytest.raises(InputError, match=r"found a field 'apply', which is the name of a method$"):
+        cj.register_loss("odd")(made)
+    made = dataclasses.make_dataclass("Odd", [("scale", int, 1)], bases=(base,), frozen=True)
+    with pytest.raises(InputError, match=r"found scal in a preset, expected alpha, beta, base, sc"):
+        cj.register_loss("odd", tiny={"scal": 2})(made)
+
+
+def test_a_run_goes_on_with_the_source_that_it_began_with_alone(
+    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, monkeypatch
+) -> None:
+    plugin, out = tmp_path / "mine.py", tmp_path / "out"
+    text = """
+import crisalad_jax as cj
+
+@cj.register_loss("close")
+def close(batch):
+    return 1 - batch.similarities.mean()
+"""
+    plugin.write_text(text)
+    run = ("train", "--data", shared / "city", "--out", out, "--config", shared / "recipe.json")
+    more = ("--weights", shared / "weights.safetensors", "--plugin", plugin, "--quiet")
+    given = (*run, *more, "--loss.kind", "close", "--loss.miner", "none")
+    succeeds(capfd, *given)
+    succeeds(capfd, *given)  # the same command finds all done
+    plugin.write_text(text.replace("1 -", "2 -"))
+    monkeypatch.setattr(source, "_file_digest", source._file_digest.__wrapped__)
+    words = f"{out}: found another source of loss.kind close than the run began with; expected"
+    fails(capfd, *given, words=(words,))

@@ -7,6 +7,7 @@ SIGTERM with its work saved, 141 the reader of the output is gone, 1 anything el
 import contextlib
 import importlib
 import io
+import itertools
 import os
 import signal
 import sys
@@ -14,11 +15,12 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import choose, require
 from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_failure
 from crisalad_jax.utils.errors import InputError, Stopped
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.version import VERSION
 
 _COMMANDS = {
     "demo": "Render a small city, train a tiny model on it, and show Recall@K before and after.",
@@ -84,7 +86,7 @@ def _unboxed(box: str) -> str:
 
 
 def _usage() -> str:
-    lines = ["usage: crisalad COMMAND [--help] ...", "", "commands:"]
+    lines = ["usage: crisalad COMMAND [--help] ... | --version", "", "commands:"]
     lines += [f"  {name:<12}{summary}" for name, summary in _COMMANDS.items()]
     return "\n".join(lines)
 
@@ -93,10 +95,14 @@ def _load_plugins(given: Sequence[str]) -> None:
     """Register the parts of installed packages and of the plug-ins after --plugin."""
     load_entry_points()
     named = False
-    for argument in given:
+    for argument, following in itertools.pairwise([*given, "--"]):
         flag, equals, value = argument.partition("=")
         if flag == "--plugin":
             named = not equals
+            require(
+                not named or not following.startswith("--"),
+                "--plugin: found no value, expected FILE.py or MODULE",
+            )
             if equals:
                 load_plugin(value)
         elif argument.startswith("--"):
@@ -134,6 +140,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not given or given[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if given else sys.stderr)
         return 0 if given else 2
+    if given == ["--version"]:
+        print(f"crisalad-jax {VERSION}")
+        return 0
     with warnings.catch_warnings():
         warnings.showwarning = _show_note
         warnings.simplefilter("always", Note)
@@ -154,8 +163,8 @@ def _exit_code(given: list[str]) -> int:
     except (InputError, OSError) as error:  # OSError: a full disk, or a fault that no check foresaw
         print("crisalad:", *str(error).splitlines(), file=sys.stderr)
         return 2
-    except SystemExit:  # from tyro, after --help
-        return 0
+    except SystemExit as stop:  # from tyro, after --help
+        return _tell_of_plugin(stop) if plugin_failure(stop) else 0
     except Stopped as stopped:
         print(f"crisalad: {stopped}", file=sys.stderr)
         return 128 + stopped.number
@@ -163,9 +172,13 @@ def _exit_code(given: list[str]) -> int:
         print("crisalad: interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        told = plugin_failure(error)
-        if told is None:
+        if plugin_failure(error) is None:
             raise
-        print(f"crisalad: {told} (from Python you see the traceback)", file=sys.stderr)
-        return 2
+        return _tell_of_plugin(error)
     return 0
+
+
+def _tell_of_plugin(error: BaseException) -> int:
+    """Print what a plug-in raised in one line, and return the exit code."""
+    print(f"crisalad: {plugin_failure(error)} (from Python you see the traceback)", file=sys.stderr)
+    return 2

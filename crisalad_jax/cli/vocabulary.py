@@ -13,6 +13,7 @@ from crisalad_jax.training.vocabulary import (
     build_vocabulary,
     needs_vocabulary,
     start_vocabulary,
+    vocabulary_aggregators,
     vocabulary_words,
 )
 from crisalad_jax.utils.errors import InputError
@@ -99,8 +100,8 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
     params, config = load_weights(arguments.weights)
     if not needs_vocabulary(config):
         raise InputError(
-            f"{arguments.weights}: found aggregator {config.aggregator.part_name}, expected "
-            "netvlad or anyloc, or another with a vocabulary; --backbone takes the backbone of any "
-            "model"
+            f"{arguments.weights}: found aggregator {config.aggregator.part_name}, expected one "
+            f"with a vocabulary ({', '.join(vocabulary_aggregators())}); --backbone takes the "
+            "backbone of any model"
         )
     return params, config.resized(arguments.image_size)

@@ -8,6 +8,8 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+
 from crisalad_jax.config.aliases import upgrade
 from crisalad_jax.config.parts import Part
 from crisalad_jax.utils.errors import InputError
@@ -28,6 +30,9 @@ def _plain(value: Any) -> Any:
         return {NAME: value.part_name, **fields} if isinstance(value, Part) else fields
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    if value is not None and not isinstance(value, bool | int | float | str):
+        raise InputError(f"configuration: found {value!r}, expected numbers, text or lists of them")
     return value
 
 

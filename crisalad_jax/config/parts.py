@@ -8,7 +8,15 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    TypeVar,
+    cast,
+)
 
 from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_of
 from crisalad_jax.utils.errors import InputError
@@ -92,10 +100,34 @@ class Registry(Generic[P]):
         """
 
         def decorate(part: _C) -> _C:
-            self._add(name, self._class_of(name, part), presets)
+            made = self._class_of(name, part)
+            self._add(name, made, presets)
+            try:
+                self._check_settings(name, made, presets)
+            except InputError:
+                del self._parts[name], self._presets[name]
+                raise
             return part
 
+        where = f"register_{self.kind}"
+        if not isinstance(name, str):
+            raise InputError(f"{where}: found {name!r}, expected a name: @{where}('...')")
+        if not name or set(name) & set(":,") or name != name.strip():
+            raise InputError(f"{where}: found the name {name!r}, expected one without ':' and ','")
         return decorate
+
+    def _check_settings(self, name: str, part: type[P], presets: Mapping[str, Any]) -> None:
+        """Check that files can keep the settings, and that the presets' fields are there."""
+        from crisalad_jax.config.io import from_plain, to_plain
+
+        where = f"register_{self.kind} {name!r}"
+        fields = [field.name for field in dataclasses.fields(part)]
+        unknown = [each for preset in presets.values() for each in preset if each not in fields]
+        if unknown:
+            raise InputError(
+                f"{where}: found {', '.join(unknown)} in a preset, expected {', '.join(fields)}"
+            )
+        from_plain(self.base, to_plain(part()), source=where)
 
     def _class_of(self, name: str, part: Callable[..., Any]) -> type[P]:
         where = f"register_{self.kind} {name!r}"
@@ -116,8 +148,12 @@ class Registry(Generic[P]):
             raise InputError(
                 f"{where}: found {part.__qualname__}, expected a subclass of {self.base.__name__}"
             )
-        if "name" in {field.name for field in dataclasses.fields(part)}:
+        fields = [field.name for field in dataclasses.fields(part)]
+        if "name" in fields:
             raise InputError(f"{where}: found a field 'name', which files keep the part's own in")
+        hidden = [name for name in fields if callable(getattr(self.base, name, None))]
+        if hidden:
+            raise InputError(f"{where}: found a field {hidden[0]!r}, which is the name of a method")
         missing = sorted(getattr(part, "__abstractmethods__", ()))
         if missing:
             raise InputError(f"{where}: found no method {', '.join(missing)}, expected it")
@@ -224,6 +260,40 @@ def resolve_names(config: Any) -> None:
             object.__setattr__(config, field.name, value)
         elif not isinstance(value, registry.base):
             raise InputError(f"{where}: found {value!r}, expected a {registry.kind} or its name")
+        elif "part_name" not in vars(type(value)):
+            raise InputError(
+                f"{where}: found {type(value).__qualname__}, which is not registered, expected "
+                f"@register_{registry.kind}(NAME) above it: files keep parts by name"
+            )
+
+
+def count_arguments(function: Callable[..., Any], *offered: str) -> int:
+    """Return how many of the offered arguments, in their order, a plain function takes.
+
+    It takes those that it requires, and those that have the name of the one that is offered. A
+    setting with a default, such as `temperature=0.1`, keeps it.
+
+    Raises:
+        InputError: it requires more arguments.
+    """
+    parameters = list(inspect.signature(function).parameters.values())
+    if any(each.kind is each.VAR_POSITIONAL for each in parameters):
+        return len(offered)
+    by_place = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    taken = [
+        number
+        for number, each in enumerate(by_place, 1)
+        if each.default is each.empty or each.name in offered[number - 1 : number]
+    ]
+    count = max(taken, default=0)
+    more = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
+    more += [each.name for each in by_place[len(offered) : count]]
+    if more:
+        raise InputError(
+            f"{getattr(function, '__name__', function)}: found the arguments {', '.join(more)}, "
+            f"expected at most {', '.join(offered)}"
+        )
+    return count
 
 
 def _home(part: type[Part]) -> tuple[str, str]:

@@ -110,17 +110,23 @@ def _run(load: Callable[[], ModuleType], file: str) -> None:
 
 
 def plugin_failure(error: BaseException) -> str | None:
-    """Describe in one line an exception that came from a plug-in's code; None for any other."""
+    """Describe in one line an exception that plug-ins may have caused; None without plug-ins.
+
+    If it came from a plug-in's code, the line says where. Else a plug-in may have returned what
+    nothing here can work with, so the line names all plug-ins. `SystemExit` must be a plug-in's.
+    """
     places = [
         (place.filename, place.lineno, place.name)
         for place in traceback.extract_tb(error.__traceback__)
         if place.filename in _LOADED
     ]
-    if not places:
+    if not _LOADED or (not places and isinstance(error, SystemExit)):
         return None
-    file, line, function = places[-1]
-    what = " ".join(str(error).split())
-    return f"plugin {file}: line {line}, in {function}: {type(error).__name__}: {what}"
+    where = ", ".join(sorted(_LOADED))
+    if places:
+        file, line, function = places[-1]
+        where = f"{file}: line {line}, in {function}"
+    return f"plugin {where}: {type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def plugin_of(module: str) -> str | None:

@@ -212,7 +212,14 @@ class _TrainingImages:
         place = (*self.seed, step, slot // self.images_per_place)
         of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
         generator = np.random.default_rng((*self.seed, step, slot))
-        return self.augmentation.apply(image, generator, of_place=of_place)
+        augmented = self.augmentation.apply(image, generator, of_place=of_place)
+        shape, dtype = np.shape(augmented), getattr(augmented, "dtype", type(augmented).__name__)
+        if shape != image.shape or dtype != np.uint8:
+            raise InputError(
+                f"augmentation {self.augmentation.part_name}: found to return {dtype} of shape "
+                f"{shape}, expected uint8 of {image.shape}"
+            )
+        return augmented
 
 
 def image_batches(

@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 import functools
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -14,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.parts import Part, Registry, count_arguments
 
 Similarities = Float[Array, "anchor image"]
 
@@ -106,6 +105,14 @@ class Loss(Part, abc.ABC):
         """Learning rate of the loss's own parameters, which have their own Adam optimizer."""
         return 1e-2
 
+    def from_scratch(self) -> "Loss":
+        """Return the loss with constants that learn from random weights; by default as it is."""
+        return self
+
+    def with_grouping(self, grouping: ClassesConfig) -> "Loss":
+        """Return the loss with other classes of images; by default as it is."""
+        return self
+
     @abc.abstractmethod
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Return the loss of a batch; `params` are of `init`."""
@@ -116,7 +123,8 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
 
     A function of (descriptors, labels) or (descriptors, labels, valid) is taken as well.
     """
-    whole = len(inspect.signature(function).parameters) == 1
+    # Of a whole batch, or of its arrays.
+    whole = count_arguments(function, "descriptors", "labels", "valid") == 1
 
     def apply(self: Loss, params: Any, batch: LossBatch) -> LossValue:
         if whole:
@@ -130,7 +138,7 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
 
 def call_loss(function: Callable[..., Any], descriptors: Any, labels: Any, valid: Any) -> Any:
     """Call a function of (descriptors, labels), or of (descriptors, labels, valid)."""
-    takes = len(inspect.signature(function).parameters)
+    takes = count_arguments(function, "descriptors", "labels", "valid")
     return function(*(descriptors, labels, valid)[:takes])
 
 
@@ -157,6 +165,11 @@ def check_value(value: Any, name: str) -> None:
             is_array and not jnp.shape(number),
             f"loss {name}: found to return {what}{shape}, expected a single number",
         )
+    dtype = getattr(value.loss, "dtype", type(value.loss).__name__)
+    require(
+        dtype in (jnp.float32, jnp.float64),
+        f"loss {name}: found to return a number of type {dtype}, expected float32",
+    )
 
 
 LOSSES = Registry("loss", Loss, of_function=_of_function)

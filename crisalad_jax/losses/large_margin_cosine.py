@@ -39,6 +39,10 @@ class LargeMarginCosineConfig(Loss):
         """Grouping of images into classes, by position, heading or place."""
         return self.classes
 
+    def with_grouping(self, grouping: ClassesConfig) -> Loss:
+        """Return the loss over other classes."""
+        return dataclasses.replace(self, classes=grouping)
+
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Float[Array, "class dim"]:
         """Draw vectors for the classes (Glorot and Bengio 2010, uniform, as CosPlace's)."""
         bound = jnp.sqrt(6 / (jnp.asarray(classes, jnp.float32) + dim))

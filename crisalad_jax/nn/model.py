@@ -19,7 +19,7 @@ from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import pytree_dataclass
+from crisalad_jax.utils.pytree import check_drawn, pytree_dataclass
 
 Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
 
@@ -47,7 +47,7 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         The parameters. To use DINOv2's weights, replace `backbone` by them.
 
     Raises:
-        InputError: a part of a plug-in that returns no pytree of arrays.
+        InputError: a part of a plug-in that returns anything but a pytree of float32 arrays.
 
     Example:
         >>> import jax
@@ -56,11 +56,15 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         >>> params.backbone.cls_token.shape
         (128,)
     """
-    backbone, aggregator, cross_image = jax.random.split(key, 3)
+    keys = jax.random.split(key, 3)
+    backbone = config.backbone.init(keys[0])
+    check_drawn(backbone, f"backbone {config.backbone.part_name}")
+    aggregator = config.aggregator.init(keys[1], config.backbone, config.grid)
+    check_drawn(aggregator, f"aggregator {config.aggregator.part_name}")
     return Crisalad(
-        backbone=config.backbone.init(backbone),
-        aggregator=config.aggregator.init(aggregator, config.backbone, config.grid),
-        cross_image=init_cross_image(cross_image, config.token_shape.token_dim, config.cross_image)
+        backbone=backbone,
+        aggregator=aggregator,
+        cross_image=init_cross_image(keys[2], config.token_shape.token_dim, config.cross_image)
         if config.cross_image.layers
         else None,
     )
@@ -84,8 +88,8 @@ def describe(
     """Describe a batch of RGB images by unit vectors.
 
     With a cross-image encoder a descriptor depends on the images that `mask` lets it attend to:
-    `mask[i, j]` allows image i to attend to image j, and None allows all. See `self_mask` and
-    `valid_mask`.
+    `mask[i, j]` allows image i to attend to image j, and None allows all. An image that may attend
+    to none attends to itself. See `self_mask` and `valid_mask`.
 
     It works under `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`), once and
     twice. Forward mode (`jax.jvp`, `jax.hessian`) does not work: the gradient of attention is
@@ -104,8 +108,9 @@ def describe(
         Descriptors of length 1, in float32 at least.
 
     Raises:
-        InputError: while tracing, for images of the wrong rank, channels or sides, or with too few
-            patches for the clusters; or a batch is no multiple of `micro_batch`.
+        InputError: while tracing, for images of the wrong type, rank, channels or sides, or with
+            too few patches for the clusters; a mask of another shape; or a batch is no multiple of
+            `micro_batch`.
 
     Example:
         >>> import jax, numpy as np
@@ -211,6 +216,10 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
     config.check_image_size((images.shape[1], images.shape[2]))
+    if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):
+        raise InputError(
+            f"images: found {images.dtype}, expected uint8 pixels, or floats that are normalised"
+        )
     if images.dtype == jnp.uint8:
         images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
     request = config.aggregator.features(config.backbone.depth)
@@ -257,7 +266,7 @@ def attend_across_images(
         Descriptors of length 1, in float32 at least.
 
     Raises:
-        InputError: never by itself; shapes that do not fit are JAX's own errors.
+        InputError: while tracing, for a mask of another shape.
 
     Example:
         >>> import jax, numpy as np
@@ -272,6 +281,14 @@ def attend_across_images(
         options = config.cross_image
         enter = functools.partial(as_sequence, global_token=options.global_token)
         leave = functools.partial(from_sequence, global_token=options.global_token)
+        if mask is not None:
+            count = tokens.local.shape[0]
+            if mask.shape != (count, count):
+                raise InputError(
+                    f"mask: found shape {mask.shape}, expected {(count, count)}, a row and a "
+                    "column for each image"
+                )
+            mask = mask | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
         with jax.named_scope("cross_image"):
             sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
             sequence = cross_image_encoder(

@@ -8,6 +8,7 @@ import optax
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from crisalad_jax.losses import Loss
+from crisalad_jax.utils.pytree import check_drawn
 
 
 class Classifiers(NamedTuple):
@@ -32,6 +33,7 @@ def init_classifiers(
     """
     keys = jax.random.split(key, len(classes))
     groups = [loss.init(each, count, dim) for each, count in zip(keys, classes, strict=True)]
+    check_drawn(groups, f"loss {loss.part_name}")
     if not jax.tree.leaves(groups):
         return None
     largest = max(classes)

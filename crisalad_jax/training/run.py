@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
 from crisalad_jax.data.places import Places
@@ -131,6 +132,7 @@ class Run:
             weights_checksum=checksum(jax.tree.leaves(params)),
             places_checksum=checksums["places"],
             validation_checksum=checksums["validation"],
+            sources={name: list(source) for name, source in sources_of(config).items()},
         )
         distributed.check_same("weights", self.record.weights_checksum)
         self._files: RunFiles | None = None
@@ -173,6 +175,13 @@ class Run:
                     f"{self.out}: the run started from other {what} than are given now; "
                     "expected the same, or another folder"
                 )
+
+        changed = changed_sources(self.config, saved.get("sources", {}), same_version=False)
+        if changed:
+            raise InputError(
+                f"{self.out}: found another source of {', '.join(changed)} than the run began "
+                "with; expected the same, or another folder"
+            )
 
     def is_done(self) -> bool:
         """Return whether no step and no validation is left."""

@@ -39,6 +39,8 @@ class RunRecord:
     """Recall@5 and step of the best validations, best first."""
     without_gain: int = 0
     """Number of validations since the best one."""
+    sources: dict[str, list[Any]] = dataclasses.field(default_factory=dict)
+    """Name and source's digest of every part of the configuration."""
     stopped_early: bool = False
     skipped_images: int = 0
 

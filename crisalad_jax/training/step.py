@@ -14,7 +14,8 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from crisalad_jax.losses import LossConfig, LossResult, LossValue, metric_loss
+from crisalad_jax.config.checks import require
+from crisalad_jax.losses import Loss, LossConfig, LossResult, LossValue, metric_loss
 from crisalad_jax.losses.base import call_loss, check_value
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import split_key
@@ -119,10 +120,10 @@ def init_train_state(
         key: draws the parameters of a loss that has some.
 
     Returns:
-        (state, frozen).
+        (state, frozen). The state is a copy, so `params` stay of use.
 
     Raises:
-        InputError: what `split_params` raises.
+        InputError: what `split_params` raises; or the loss needs a key, or classes.
 
     Example:
         >>> import jax
@@ -134,13 +135,41 @@ def init_train_state(
         >>> int(state.step)
         0
     """
+    require(
+        isinstance(config, StepConfig),
+        f"config: found {type(config).__name__}, expected the StepConfig of `step_config`",
+    )
     chosen, frozen = split_params(params, config.model, trainable)
+    # Copied, because a step uses up the buffers of its state, and `params` are the caller's.
+    chosen = jax.tree.map(jnp.copy, chosen)
     optimiser = config.make_optimiser().init(chosen)
     classifiers = None
-    if isinstance(config.loss, LossConfig) and key is not None:
-        classes, dim = config.classes or (0,), config.model.descriptor_dim
-        classifiers = init_classifiers(key, config.loss.kind, classes, dim)
+    if isinstance(config.loss, LossConfig):
+        classifiers = _init_loss(key, config.loss.kind, config)
     return TrainState(jnp.zeros((), jnp.int32), chosen, optimiser, classifiers), frozen
+
+
+def _init_loss(key: PRNGKeyArray | None, loss: Loss, config: StepConfig) -> Classifiers | None:
+    """Draw the parameters of a loss, if it has any."""
+    name = loss.part_name
+    require(
+        loss.grouping is None or bool(config.classes),
+        f"classes: found none for loss {name}, which classifies, expected the number of classes of "
+        "each group (step_config(..., classes=))",
+    )
+    make = functools.partial(
+        init_classifiers,
+        loss=loss,
+        classes=config.classes or (0,),
+        dim=config.model.descriptor_dim,
+    )
+    if key is not None:
+        return make(key)
+    require(
+        jax.eval_shape(make, jax.random.key(0)) is None,
+        f"key: found None for loss {name}, which has parameters, expected a jax.random.key",
+    )
+    return None
 
 
 def cast_frozen(frozen: PyTree, config: ModelConfig) -> PyTree:
@@ -164,6 +193,7 @@ def step_config(
     steps_per_epoch: int = 1,
     optimiser: optax.GradientTransformation | None = None,
     loss: LossFunction | None = None,
+    classes: tuple[int, ...] = (),
 ) -> StepConfig:
     """Make the part of a run's configuration that its compiled step depends on.
 
@@ -174,15 +204,24 @@ def step_config(
         optimiser: any optimiser of optax, in place of the configuration's.
         loss: any function of (descriptors, labels) or (descriptors, labels, valid) that returns a
             number, in place of the configuration's.
+        classes: number of classes of each group, for a loss that classifies.
 
     Returns:
         A static argument of `train_step`.
+
+    Raises:
+        InputError: the loss is no function.
 
     Example:
         >>> from crisalad_jax import recipe
         >>> step_config(recipe("tiny"), steps=100).steps
         100
     """
+    require(
+        loss is None or callable(loss),
+        f"loss: found {loss!r}, expected a function of (descriptors, labels); a registered loss is "
+        "named in the configuration's",
+    )
     return StepConfig(
         model=config.model,
         loss=config.loss if loss is None else loss,
@@ -190,6 +229,7 @@ def step_config(
         steps=steps,
         steps_per_epoch=steps_per_epoch,
         micro_batch=config.micro_batch,
+        classes=classes,
     )
 
 
@@ -200,6 +240,7 @@ def make_train_step(
     steps_per_epoch: int = 1,
     optimiser: optax.GradientTransformation | None = None,
     loss: LossFunction | None = None,
+    classes: tuple[int, ...] = (),
 ) -> Callable[..., tuple[TrainState, Metrics]]:
     """Make a compiled step of training.
 
@@ -209,6 +250,7 @@ def make_train_step(
         steps_per_epoch: see `step_config`.
         optimiser: see `step_config`.
         loss: see `step_config`.
+        classes: see `step_config`.
 
     Returns:
         `step(state, frozen, images, labels, key, valid=None) -> (state, metrics)`; see
@@ -228,7 +270,12 @@ def make_train_step(
         (1, ())
     """
     static = step_config(
-        config, steps=steps, steps_per_epoch=steps_per_epoch, optimiser=optimiser, loss=loss
+        config,
+        steps=steps,
+        steps_per_epoch=steps_per_epoch,
+        optimiser=optimiser,
+        loss=loss,
+        classes=classes,
     )
 
     def step(

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.training.config import has_adapters
@@ -96,12 +95,10 @@ def model_words(config: ModelConfig) -> str:
         'backbone of width 768, 12 blocks, 0 registers, adapter depthwise'
     """
     backbone = config.backbone
-    words = f"backbone of width {backbone.dim}, {backbone.depth} blocks"
-    if isinstance(backbone, ViTConfig):
-        words += f", {backbone.registers} registers, adapter {backbone.adapter.kind}"
     return (
-        f"{words}; aggregator {config.aggregator.part_name}; {config.cross_image.layers} "
-        f"cross-image layers; descriptor of {config.descriptor_dim} numbers"
+        f"backbone of width {backbone.dim}, {backbone.depth} blocks{backbone.extras}; "
+        f"aggregator {config.aggregator.part_name}; {config.cross_image.layers} cross-image "
+        f"layers; descriptor of {config.descriptor_dim} numbers"
     )
 
 

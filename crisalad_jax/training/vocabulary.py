@@ -45,6 +45,11 @@ def needs_vocabulary(config: ModelConfig) -> bool:
     return config.aggregator.starts_from_centroids
 
 
+def vocabulary_aggregators() -> list[str]:
+    """List the names of the registered aggregators that start from centroids."""
+    return [name for name in AGGREGATORS if AGGREGATORS.make(name).starts_from_centroids]
+
+
 def with_vocabulary(
     params: Crisalad,
     config: ModelConfig,

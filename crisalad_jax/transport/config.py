@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Bool, Int
 
@@ -27,6 +27,9 @@ Solve = Callable[[Problem], Solution]
 @dataclasses.dataclass(frozen=True)
 class Gradient(Part):
     """A gradient of the potentials, through which JAX differentiates the plan."""
+
+    takes_solver: ClassVar[bool] = False
+    """Whether `solve` takes the solver that is given to `sinkhorn.solve`."""
 
     def check(self, config: "SinkhornConfig") -> None:
         """Raise InputError where this gradient does not go with a configuration."""

@@ -85,6 +85,26 @@ def check_inputs(
         _check_totals(log_mu, log_nu)
 
 
+def check_init(init: Any, scores: Array) -> Potentials:
+    """Return the potentials to start from, if they fit the scores.
+
+    Raises:
+        InputError: they do not, or where they are known (outside of `jit`) are not finite.
+    """
+    expected = scores.shape[:-1], (*scores.shape[:-2], scores.shape[-1])
+    is_pair = isinstance(init, tuple) and len(init) == 2
+    shapes = tuple(map(jnp.shape, init)) if is_pair else ()
+    if not is_pair or not all(map(_spreads, shapes, expected)):
+        raise InputError(
+            f"sinkhorn: init found of {shapes or type(init).__name__}, expected Potentials of shapes {expected[0]} and "
+            f"{expected[1]}"
+        )
+    start = Potentials(*map(jnp.asarray, init))
+    if not all(isinstance(x, Tracer) or _is_finite(x) for x in start):
+        raise InputError("sinkhorn: init found with NaN or infinity, expected finite potentials")
+    return start
+
+
 def _is_finite(value: Array) -> bool:
     # Concrete values stay concrete under tracing. Only a flag is copied to the host.
     with jax.ensure_compile_time_eval():
@@ -106,6 +126,9 @@ def _check_epsilon(scores: Array, epsilon: float) -> None:
             f"sinkhorn: epsilon found {epsilon}, with which scores over it are up to "
             f"{largest:.1e}, expected numbers that {wide_dtype(scores)} can hold"
         )
+    least = float(jnp.finfo(wide_dtype(scores)).tiny)
+    if epsilon < least:  # a processor may take it for 0
+        raise InputError(f"sinkhorn: epsilon found {epsilon}, expected at least {least:.1e}")
 
 
 def _check_totals(log_mu: Array, log_nu: Array) -> None:
@@ -209,10 +232,17 @@ def _kinds(tree: Any) -> tuple[Any, ...]:
 def _words(tree: Any) -> str:
     """Describe a tree by the types and shapes of its leaves, such as float32[2,3]."""
 
-    def word(leaf: Any) -> str:
-        return f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]"
+    def word(leaf: Any) -> _Word:
+        return _Word(f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]")
 
-    return str(jax.tree.map(word, tree)).replace("'", "")
+    return str(jax.tree.map(word, tree))
+
+
+class _Word(str):
+    """Text that stands without quotes in the text of a tree."""
+
+    __slots__ = ()
+    __repr__ = str.__str__
 
 
 def _spreads(shape: tuple[int, ...], target: tuple[int, ...]) -> bool:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -166,6 +166,8 @@ class Optimistix(Gradient):
     Every step gets the state of `Step.init` and the iteration number 0. `Step.finish` is not
     called.
     """
+
+    takes_solver: ClassVar[bool] = True
 
     def check(self, config: SinkhornConfig) -> None:
         """Require a tolerance, and refuse acceleration."""

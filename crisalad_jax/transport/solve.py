@@ -11,13 +11,14 @@ from jaxtyping import Array, Bool, Float, Int
 from crisalad_jax.config.checks import require
 from crisalad_jax.transport.config import SinkhornConfig
 from crisalad_jax.transport.diagnose import (
+    check_init,
     check_inputs,
     check_solution,
     check_step,
     marginal_error,
     wide_dtype,
 )
-from crisalad_jax.transport.differentiate import Optimistix, centred
+from crisalad_jax.transport.differentiate import centred
 from crisalad_jax.transport.dustbin import DUSTBINS, Dustbin, check_marginals, widened
 from crisalad_jax.transport.problem import Potentials, Problem, zero_potentials
 from crisalad_jax.utils.errors import InputError
@@ -104,10 +105,12 @@ def solve(
     # Totals may differ for a step of another problem, such as one with column capacities.
     equal = row_tau == column_tau == 1 and config.step.entropic
     check_inputs(scores, log_mu, log_nu, epsilon, equal_totals=equal)
-    if solver is not None and not isinstance(config.gradient, Optimistix):
+    if init is not None:
+        init = check_init(init, scores)
+    if solver is not None and not config.gradient.takes_solver:
         raise InputError(
-            f"sinkhorn: found a solver beside gradient {config.gradient.part_name!r}, expected "
-            "'optimistix'"
+            f"sinkhorn: found a solver beside gradient {config.gradient.part_name!r}, expected one "
+            "that takes it, such as 'optimistix'"
         )
     arguments = scores, log_mu, log_nu, epsilon, init, step_params, row_tau, column_tau, config
     # A solver need not be hashable, so it cannot be a static argument.

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.parts import Part, Registry, count_arguments
 from crisalad_jax.transport.problem import Potentials, Problem, product
 
 
@@ -86,7 +85,7 @@ class Step(Part, abc.ABC):
 
 def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
     """Return the methods of a step that is a function of (problem, potentials[, iteration])."""
-    count = len(inspect.signature(function).parameters)
+    count = count_arguments(function, "problem", "potentials", "iteration")
 
     def step(
         self: Step, problem: Problem, potentials: Potentials, state: Any, iteration: Array

@@ -4,6 +4,9 @@ import dataclasses
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
+
+from crisalad_jax.utils.errors import InputError
 
 _T = TypeVar("_T")
 
@@ -55,6 +58,19 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
+
+
+def check_drawn(tree: Any, where: str) -> None:
+    """Check that new parameters are arrays of numbers that can train, in float32 at least.
+
+    Raises:
+        InputError: naming `where` and the first leaf that is not.
+    """
+    for name, leaf in named_leaves(tree).items():
+        dtype = getattr(leaf, "dtype", type(leaf).__name__)
+        if dtype not in (jnp.float32, jnp.float64):
+            path = f" {name}" if name else ""
+            raise InputError(f"{where}: found parameter{path} of type {dtype}, expected float32")
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:

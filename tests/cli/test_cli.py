@@ -866,3 +866,13 @@ def test_info_of_a_file_and_of_other_choices(capfd, tmp_path, shared, params):
     assert (summary["trainable_parameters"], summary["frozen_parameters"]) == (count, 0)
     assert summary["image_size"] == [56, 70]
     assert summary["descriptor"] == 48
+
+
+def test_a_plug_in_without_a_name_is_refused(capfd):
+    for more in ((), ("--quiet",)):
+        fails(capfd, "info", "--plugin", *more, words=("--plugin: found no value, expected FIL",))
+
+
+def test_the_version_is_that_of_the_package(capfd):
+    assert main(["--version"]) == 0
+    assert capfd.readouterr().out == f"crisalad-jax {crisalad_jax.__version__}\n"

@@ -5,6 +5,7 @@ import json
 import pathlib
 from typing import Any
 
+import numpy as np
 import pytest
 
 from crisalad_jax.config.aliases import upgrade
@@ -222,3 +223,13 @@ def test_differences_name_the_fields_in_full():
         "model.aggregator.clusters: found 32, expected 64",
         "seed: found 3, expected 0",
     ]
+
+
+def test_a_number_of_numpy_is_a_number_and_other_objects_are_refused() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Some:
+        value: Any
+
+    assert to_plain(Some(np.float32(0.5))) == {"value": 0.5}
+    with pytest.raises(InputError, match=r"^configuration: found <object .*>, expected numbers"):
+        to_plain(Some(object()))

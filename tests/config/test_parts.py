@@ -2,11 +2,19 @@
 
 import abc
 import dataclasses
+import functools
 from typing import Any
 
 import pytest
 
-from crisalad_jax.config.parts import REGISTRIES, Part, Registry, part_field, resolve_names
+from crisalad_jax.config.parts import (
+    REGISTRIES,
+    Part,
+    Registry,
+    count_arguments,
+    part_field,
+    resolve_names,
+)
 from crisalad_jax.utils.errors import InputError
 
 
@@ -192,3 +200,49 @@ def test_a_field_takes_a_part_or_its_name(birds: Registry[Bird]):
     for other in (3, None, Stone(), Duck):
         with pytest.raises(InputError, match=r"^Pond.bird: found .*, expected a bird or its name$"):
             Pond(bird=other)
+
+
+def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds: Registry[Bird]):
+    """A file would keep it under its parent's name, and load the parent."""
+    birds.register("duck")(Duck)
+
+    @dataclasses.dataclass(frozen=True)
+    class Pond:
+        bird: Bird = part_field(birds, "duck")
+
+        def __post_init__(self) -> None:
+            resolve_names(self)
+
+    @dataclasses.dataclass(frozen=True)
+    class Loud(Duck):
+        pass
+
+    with pytest.raises(InputError, match=r"^Pond.bird: found .*Loud, which is not registered, exp"):
+        Pond(Loud())
+
+
+@pytest.mark.parametrize(
+    ("function", "count"),
+    [
+        (lambda a, b: 0, 2),
+        (lambda a, b, valid: 0, 3),
+        (lambda a, b, valid=None: 0, 3),
+        (lambda a, b, temperature=0.1: 0, 2),
+        (lambda a, b, c, temperature=0.1: 0, 3),
+        (lambda a, *, temperature=0.1: 0, 1),
+        (lambda *arguments: 0, 3),
+        (lambda a, **settings: 0, 1),
+        (functools.partial(lambda a, b, c, scale: 0, scale=2), 3),
+    ],
+)
+def test_a_function_is_given_what_it_requires_and_keeps_its_defaults(function: Any, count: int):
+    assert count_arguments(function, "descriptors", "labels", "valid") == count
+
+
+@pytest.mark.parametrize(
+    "function", [lambda a, b, c, scale: 0, lambda a, *, scale: 0], ids=["fourth", "by name"]
+)
+def test_a_function_that_requires_more_is_refused(function: Any):
+    words = r"found the arguments scale, expected at most descriptors, labels, valid$"
+    with pytest.raises(InputError, match=words):
+        count_arguments(function, "descriptors", "labels", "valid")

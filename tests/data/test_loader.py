@@ -1,11 +1,13 @@
 """Batches of images: what is in them, that nothing but the seed decides it, and bad files."""
 
 import csv
+import dataclasses
 import gc
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -454,3 +456,25 @@ def test_bad_arguments_raise_at_the_call(places, changes, message):
 def test_bad_batch_size_raises_at_the_call(places):
     with pytest.raises(InputError, match="batch_size: found 0"):
         image_batches([places.path(0)], image_size=SIZE, batch_size=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spoilt(NoAugmentation):
+    part_name = "spoilt"
+    change: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def apply(self, image, generator, *, of_place):
+        return self.change(image)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda image: image / np.float32(255), "float32 of shape "),
+        (lambda image: image[1:], "uint8 of shape "),
+        (lambda image: None, "NoneType of shape "),
+    ],
+)
+def test_an_augmentation_that_returns_something_else_is_named(places, change, words):
+    with pytest.raises(InputError, match=f"^augmentation spoilt: found to return {words}.*, expec"):
+        train(places, augmentation=Spoilt(change))

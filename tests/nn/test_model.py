@@ -1,6 +1,7 @@
 """The whole model: shapes, unit norm, what a descriptor depends on, precision, errors."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL as CONFIG
-from tests.conftest import random_params
+from tests.conftest import assert_equal, random_params
 
 # Descriptors have entries of order 0.1; float32 sums compiled for another batch size differ by
 # some units in the last place after a few layers.
@@ -296,3 +297,26 @@ def test_a_model_without_salad_transports_nothing(params):
         InputError, match=r"^aggregator: found class-token, expected one that transp"
     ):
         transport_masses(bare, pictures(2), config)
+
+
+def test_an_image_that_may_attend_to_none_attends_to_itself_and_spoils_no_other(params):
+    mask = np.eye(3, dtype=bool)
+    mask[2, 2] = False
+    descriptors = describe(params, pictures(3), CONFIG, mask=mask)
+    assert_equal(descriptors, describe(params, pictures(3), CONFIG, mask=self_mask(3)))
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("shape", [(3,), (2, 2), (3, 1)])
+def test_a_mask_of_another_shape_is_refused(params, shape):
+    words = re.escape(f"mask: found shape {shape}, expected (3, 3), a row and a column for each")
+    with pytest.raises(InputError, match=words):
+        describe(params, pictures(3), CONFIG, mask=np.ones(shape, bool))
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("dtype", ["int32", "int8", "uint16", "bool"])
+def test_whole_numbers_other_than_bytes_are_refused(params, dtype):
+    words = f"^images: found {dtype}, expected uint8 pixels, or floats that are normalised"
+    with pytest.raises(InputError, match=words):
+        describe(params, pictures(2).astype(dtype), CONFIG)

@@ -2,14 +2,13 @@
 
 import abc
 import dataclasses
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.parts import Part, Registry, count_arguments
 
 Image = UInt8[np.ndarray, "h w 3"]
 
@@ -44,7 +43,7 @@ class Augmentation(Part, abc.ABC):
 
 def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
     """Return the methods of an augmentation that is a plain function."""
-    count = len(inspect.signature(function).parameters)
+    count = count_arguments(function, "image", "generator")
 
     def apply(
         self: Augmentation,

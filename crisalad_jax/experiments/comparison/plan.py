@@ -23,7 +23,6 @@ from crisalad_jax.experiments.comparison.ablation import (
 )
 from crisalad_jax.experiments.comparison.methods import method_of, method_training
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
@@ -305,10 +304,10 @@ def _of_views(training: TrainConfig, images: int, views: int) -> TrainConfig:
 
 def _own_places(loss: LossConfig) -> LossConfig:
     """Make a classification loss take a small set's places as classes, all in one group."""
-    if not isinstance(loss.kind, LargeMarginCosineConfig):
+    if loss.kind.grouping is None:
         return loss
-    classes = dataclasses.replace(loss.kind.classes, kind="places", groups=1, steps=None)
-    return dataclasses.replace(loss, kind=dataclasses.replace(loss.kind, classes=classes))
+    classes = dataclasses.replace(loss.kind.grouping, kind="places", groups=1, steps=None)
+    return dataclasses.replace(loss, kind=loss.kind.with_grouping(classes))
 
 
 def _check(variant: Variant, config: ComparisonConfig, benchmarks: list[Benchmark]) -> None:

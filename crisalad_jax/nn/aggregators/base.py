@@ -168,6 +168,11 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
         isinstance(tokens, Tokens),
         f"aggregator {name}: found to return {_kind(tokens)}, expected Tokens",
     )
+    for array in tokens.global_token, tokens.local:
+        require(
+            array.dtype in (jnp.float32, jnp.float64),
+            f"aggregator {name}: found to return tokens of type {array.dtype}, expected float32",
+        )
     shape = aggregator.token_shape(dim)
     shapes = tokens.global_token.shape, tokens.local.shape
     expected = (*batch, shape.global_dim), (*batch, shape.tokens, shape.token_dim)

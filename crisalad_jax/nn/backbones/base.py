@@ -74,6 +74,11 @@ class Backbone(Part, abc.ABC):
             InputError: while tracing, for a request that this backbone cannot meet.
         """
 
+    @property
+    def extras(self) -> str:
+        """Settings that one line about a model names, each after a comma; by default none."""
+        return ""
+
     def split_blocks(self, params: Any, first: int) -> Any:
         """Return parameters whose `params.blocks` is cut in two, after the first `first` blocks.
 

@@ -140,6 +140,11 @@ class ViTConfig(Backbone):
         """Width of the adapter's bottleneck."""
         return self.adapter.width(self.dim)
 
+    @property
+    def extras(self) -> str:
+        """Registers and the kind of adapter."""
+        return f", {self.registers} registers, adapter {self.adapter.kind}"
+
     def init(self, key: PRNGKeyArray) -> ViT:
         """Draw parameters as DINOv2 does before training."""
         return init_vit(key, self)

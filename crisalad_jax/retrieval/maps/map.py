@@ -80,6 +80,8 @@ class Map:
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self._store = store
+        self._checked: Crisalad | None = None
+        """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
         for path in sorted((folder / SEGMENTS).glob("[0-9]*.json")):
             self._read_record(path)
@@ -336,7 +338,19 @@ class Map:
             )
         params, config = load_weights(file)
         check_model(self.description, self.folder, model_hash(params, config), file)
+        self._checked = params
         return params
+
+    def check_params(self, params: Crisalad) -> None:
+        """Check that parameters are of the model that made the map; the same ones only once.
+
+        Raises:
+            InputError: they are not.
+        """
+        if params is not self._checked:
+            digest = model_hash(params, self.description.config)
+            check_model(self.description, self.folder, digest, "the given parameters")
+            self._checked = params
 
     def close(self) -> None:
         """Close the store."""

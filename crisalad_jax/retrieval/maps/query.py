@@ -87,8 +87,8 @@ def query(
         The answers, of use after the map is closed too.
 
     Raises:
-        InputError: no image, or one that cannot be read; a number out of range; or what
-            `Map.search` raises.
+        InputError: parameters of another model; no image, or one that cannot be read; a number
+            out of range; or what `Map.search` raises.
 
     Example:
         >>> import jax
@@ -107,6 +107,7 @@ def query(
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
     paths = _listed(images)
+    places.check_params(params)
     config = places.description.config
     parts: list[Neighbours] = []
     waiting: list[np.ndarray] = []

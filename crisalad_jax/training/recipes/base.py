@@ -8,7 +8,6 @@ from crisalad_jax.config.checks import choose
 from crisalad_jax.config.parts import REGISTRIES, Part
 from crisalad_jax.config.plugins import load_entry_points
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.utils.errors import InputError
@@ -205,10 +204,7 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         >>> from_scratch(recipe("tiny", "gem")).trainable
         'all'
     """
-    loss = config.loss
-    if isinstance(loss.kind, MultiSimilarityConfig):
-        # base 0.5, because from random weights base 0 drives all similarities to 0 together.
-        loss = dataclasses.replace(loss, kind=MultiSimilarityConfig(base=0.5))
+    loss = dataclasses.replace(config.loss, kind=config.loss.kind.from_scratch())
     built_in = type(config.augmentation).__module__.startswith("crisalad_jax.")
     return dataclasses.replace(
         config,

@@ -3,6 +3,7 @@
 import json
 import pathlib
 
+import jax
 import numpy as np
 import pytest
 from rich.console import Console
@@ -141,3 +142,10 @@ def test_a_summary(folder, shared):
     assert json.loads(json.dumps(summary)) == summary | {"axes": ["east", "north"]}
     assert (summary["images"], summary["positions"], summary["verified"]) == (7, 7, True)
     assert summary["weights"] == str((shared / "weights.safetensors").resolve())
+
+
+def test_parameters_of_another_model_are_refused(folder, params, sides):
+    """Also where they have the same shapes, and answers would come."""
+    other = jax.tree.map(lambda x: x + 1, params)
+    with pytest.raises(InputError, match=r"found a map made by model \w+ .*, but the given param"):
+        ask(folder, other, sides[1])
