@@ -96,8 +96,8 @@ def check_init(init: Any, scores: Array) -> Potentials:
     shapes = tuple(map(jnp.shape, init)) if is_pair else ()
     if not is_pair or not all(map(_spreads, shapes, expected)):
         raise InputError(
-            f"sinkhorn: init found of {shapes or type(init).__name__}, expected Potentials of shapes {expected[0]} and "
-            f"{expected[1]}"
+            f"sinkhorn: init found of {shapes or type(init).__name__}, expected Potentials of "
+            f"shapes {expected[0]} and {expected[1]}"
         )
     start = Potentials(*map(jnp.asarray, init))
     if not all(isinstance(x, Tracer) or _is_finite(x) for x in start):
