@@ -1,6 +1,7 @@
 """Compute the loss that a configuration names, over the pairs that its miner chooses."""
 
 import dataclasses
+import functools
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -134,7 +135,7 @@ def metric_loss(
         The loss and what is logged beside it.
 
     Raises:
-        InputError: a loss returns something else than a number, or what one of a plug-in raises.
+        InputError: a loss returns something else than a number, or lacks its parameters.
 
     Example:
         >>> import jax.numpy as jnp
@@ -149,6 +150,12 @@ def metric_loss(
     similarities = jax.lax.stop_gradient(batch.similarities)
     mined = mine(similarities, every, margin=config.miner_margin)
     pairs = every if config.miner == "none" else mined
+    if params is None:
+        draw = functools.partial(config.kind.init, classes=1, dim=wide.shape[1])
+        require(
+            jax.eval_shape(draw, jax.random.key(0)) is None,
+            f"loss {config.kind.part_name}: found no params, expected those of its init",
+        )
     value = config.kind.apply(params, dataclasses.replace(batch, pairs=pairs))
     check_value(value, config.kind.part_name)
     loss = value.loss

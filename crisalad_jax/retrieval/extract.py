@@ -10,6 +10,7 @@ from crisalad_jax.data.images import check_lines, list_images, names_in
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
@@ -122,6 +123,7 @@ def extract(
     descriptors = group(
         params, config, folder, grouping, batch_size=batch_size, seed=seed, quiet=quiet
     )[folder.readable]
+    check_rows(descriptors, f"{_source(images)}: descriptors", range(len(descriptors)), unit=True)
     if components is not None:
         descriptors = components.apply(descriptors)
     readable = [name for name, ok in zip(names, folder.readable, strict=True) if ok]

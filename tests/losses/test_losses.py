@@ -32,6 +32,7 @@ from crisalad_jax.losses.large_margin_cosine import large_margin_cosine_loss
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.losses.supcon import SupConConfig
 from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.utils.errors import InputError
 
 PAPER = LossConfig()
 
@@ -419,3 +420,9 @@ def test_a_descriptor_of_zeros_has_a_finite_gradient_and_a_nan_is_told() -> None
     assert all(np.isfinite(gradient).all() for gradient in gradients)
     x[0] = np.nan
     assert np.isnan(cosine_loss(x, labels, weights)[0])
+
+
+def test_a_loss_without_its_parameters_is_told() -> None:
+    config = LossConfig(kind="large-margin-cosine", miner="none")
+    with pytest.raises(InputError, match=r"^loss large-margin-cosine: found no params, expected"):
+        metric_loss(jnp.eye(4), jnp.array([0, 0, 1, 1]), config)

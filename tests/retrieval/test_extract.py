@@ -1,8 +1,10 @@
 """`extract`: folders and lists, into files and into memory; what is refused before any work."""
 
+import dataclasses
 import json
 import pathlib
 
+import jax
 import numpy as np
 import pytest
 
@@ -116,3 +118,12 @@ def test_what_is_known_before_there_is_a_model(options, words, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=words):
         check_extraction(**{"out": "d.npy"} | options)
+
+
+def test_a_descriptor_that_is_not_finite_is_not_written(params, town, tmp_path):
+    encoder = jax.tree.map(lambda leaf: leaf * np.nan, params.cross_image)
+    broken = dataclasses.replace(params, cross_image=encoder)
+    out = tmp_path / "d.npy"
+    with pytest.raises(InputError, match=r"descriptors: row 0 is not finite, expected finite unit"):
+        run(broken, town, out)
+    assert not out.exists()
