@@ -288,7 +288,8 @@ HALVES = (Half("bfloat16", 8, 7), Half("float16", 5, 10))
 class RoundedStep(Step):
     """The log-domain step with every intermediate result rounded to half precision."""
 
-    half: Half = HALVES[0]
+    exponent: int = HALVES[0].exponent
+    mantissa: int = HALVES[0].mantissa
 
     def step(
         self, problem: Problem, potentials: Potentials, state: Any, iteration: jax.Array
@@ -301,7 +302,7 @@ class RoundedStep(Step):
 
     def rounded(self, x: jax.Array) -> jax.Array:
         # A cast there and back is taken out by the compiler; this is not.
-        return jax.lax.reduce_precision(x, self.half.exponent, self.half.mantissa)
+        return jax.lax.reduce_precision(x, self.exponent, self.mantissa)
 
     def log_sum(self, x: jax.Array, axis: int) -> jax.Array:
         top = x.max(axis=axis, keepdims=True)
@@ -326,7 +327,7 @@ def precision(size: Size) -> Study:
             jax.lax.reduce_precision(scores, half.exponent, half.mantissa)
         )
         ways[f"{half.name} inside"] = lambda scores, half=half: plan_of(
-            scores, SinkhornConfig(step=RoundedStep(half), domain="log")
+            scores, SinkhornConfig(step=RoundedStep(half.exponent, half.mantissa), domain="log")
         )
     values, rows = [], []
     for kind, scale, scores in cases(size):

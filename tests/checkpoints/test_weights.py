@@ -11,7 +11,7 @@ import typing
 import warnings
 import zlib
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -465,6 +465,7 @@ class LaterSinkhorn(SinkhornConfig):
 class LaterSalad(SaladConfig):
     """Of a later version."""
 
+    part_name: ClassVar[str] = "salad"
     sinkhorn: SinkhornConfig = LaterSinkhorn()
     flavour: str = "plain"
 

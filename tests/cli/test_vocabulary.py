@@ -67,7 +67,7 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path) -> None:
     start = ("vocabulary", "--images", shared / "town", "--out")
     for more, words in (
         ((tmp_path / "w.npy",), "w.npy: found the suffix '.npy', expected .safetensors"),
-        ((out, "--weights", weights), f"{weights}: found aggregator salad, expected netvlad or"),
+        ((out, "--weights", weights), f"{weights}: found aggregator salad, expected one w"),
         ((out, "--weights", weights, "--backbone", weights), "--backbone: found beside --weights"),
         ((out, "--weights", weights, "--layer", 1), "--layer: found beside --weights"),
         ((out, "--preset", "tiny", "--layer", 4), "layer: found 4, expected -4 to 3"),

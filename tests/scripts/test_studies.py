@@ -188,7 +188,7 @@ def test_rounded_scores_are_as_far_off_as_numpy_says(study: ModuleType) -> None:
 
 def test_a_rounded_step_that_rounds_nothing_is_the_step(study: ModuleType) -> None:
     scores = jnp.asarray(scores_of(study, "iid", 3.0), jnp.float32)
-    whole = study.RoundedStep(study.Half("float32", 8, 23))
+    whole = study.RoundedStep(exponent=8, mantissa=23)
     found = study.solve_published(scores, SinkhornConfig(step=whole, domain="log")).log_plan
     expected = study.solve_published(scores, SinkhornConfig(domain="log")).log_plan
     np.testing.assert_allclose(found, expected, atol=1e-5)  # float32 at numbers of order 20
