@@ -146,7 +146,8 @@ def _read_torch(path: pathlib.Path) -> Any:
             "could run code)"
         ) from error
     except Exception as error:  # a damaged pickle may raise any exception
-        reason = str(error).split("\n")[0][:200] or type(error).__name__
+        reason = str(error).split("\n")[0][:200]
+        reason = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
         raise InputError(f"{path}: not a whole torch checkpoint: {reason}") from error
 
     def arrays(value: Any, name: object) -> Any:

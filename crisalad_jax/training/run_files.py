@@ -143,7 +143,7 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> None:
     """Check that `out` is the folder of a run with this configuration, or can become one.
 
     Raises:
-        InputError: it holds a run of another configuration, or files but no run.
+        InputError: it is a file, or holds a run of another configuration, or files but no run.
     """
     path = out / "config.json"
     if path.exists():
@@ -153,7 +153,9 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> None:
                 f"{out}: holds a run of another configuration: {'; '.join(wrong)}; give the same "
                 "to go on with it, or another folder"
             )
-    elif out.exists() and (not out.is_dir() or holds_other_files(out)):
+    elif out.exists() and not out.is_dir():
+        raise InputError(f"{out}: found a file, expected the folder of a run, or a new one")
+    elif out.exists() and holds_other_files(out):
         raise InputError(f"{out}: found files but no run, expected a run or a new or empty folder")
 
 
