@@ -256,6 +256,9 @@ def make_train_step(
         `step(state, frozen, images, labels, key, valid=None) -> (state, metrics)`; see
         `train_step`. The state that goes in is used up.
 
+    Raises:
+        InputError: what `step_config` raises; and from `step`, labels of 2^31 or more.
+
     Example:
         >>> import jax, numpy as np, optax
         >>> from crisalad_jax import init_crisalad, init_train_state, recipe, step_config
@@ -286,6 +289,11 @@ def make_train_step(
         key: PRNGKeyArray,
         valid: Bool[Array | np.ndarray, " image"] | None = None,
     ) -> tuple[TrainState, Metrics]:
+        # JAX would keep the lower half of each, and join places that differ in the upper one.
+        require(
+            isinstance(labels, jax.Array) or not np.size(labels) or np.max(labels) < 2**31,
+            f"labels: found up to {np.max(labels, initial=0)}, expected numbers below 2^31",
+        )
         mask = jnp.ones(len(labels), bool) if valid is None else jnp.asarray(valid)
         return train_step(
             state, frozen, jnp.asarray(images), jnp.asarray(labels), mask, key, static

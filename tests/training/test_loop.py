@@ -545,7 +545,9 @@ def test_a_folder_of_other_files_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("words")
     with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
         claim_run(tmp_path, RECIPE)
-    with pytest.raises(InputError, match=r"thesis\.tex: found a file, expected the folder of a run"):
+    with pytest.raises(
+        InputError, match=r"thesis\.tex: found a file, expected the folder of a run"
+    ):
         claim_run(tmp_path / "thesis.tex", RECIPE)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 

@@ -611,3 +611,11 @@ def test_a_setting_of_a_loss_keeps_its_default(params) -> None:
     state, frozen = init_train_state(params, "head", static)
     train_step(state, frozen, pictures(6), LABELS, VALID, jax.random.key(0), static)
     assert set(seen) == {0.25}
+
+
+def test_labels_that_32_bits_cannot_tell_apart_are_refused(params) -> None:
+    config = TrainConfig(model=MODEL)
+    state, frozen = init_train_state(params, "head", step_config(config, steps=1))
+    labels = np.array([0, 2**32, 1, 2**32 + 1, 2, 2])
+    with pytest.raises(InputError, match=r"^labels: found up to 4294967297, expected numbers bel"):
+        make_train_step(config, steps=1)(state, frozen, pictures(6), labels, jax.random.key(0))
