@@ -164,7 +164,7 @@ def _exit_code(given: list[str]) -> int:
         print("crisalad:", *str(error).splitlines(), file=sys.stderr)
         return 2
     except SystemExit as stop:  # from tyro, after --help
-        return _tell_of_plugin(stop) if plugin_failure(stop) else 0
+        return _tell_of_plugin(stop) or 0
     except Stopped as stopped:
         print(f"crisalad: {stopped}", file=sys.stderr)
         return 128 + stopped.number
@@ -172,13 +172,17 @@ def _exit_code(given: list[str]) -> int:
         print("crisalad: interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        if plugin_failure(error) is None:
+        code = _tell_of_plugin(error)
+        if code is None:
             raise
-        return _tell_of_plugin(error)
+        return code
     return 0
 
 
-def _tell_of_plugin(error: BaseException) -> int:
-    """Print what a plug-in raised in one line, and return the exit code."""
-    print(f"crisalad: {plugin_failure(error)} (from Python you see the traceback)", file=sys.stderr)
+def _tell_of_plugin(error: BaseException) -> int | None:
+    """Print what a plug-in raised in one line, and return the exit code; None for other errors."""
+    failure = plugin_failure(error)
+    if failure is None:
+        return None
+    print(f"crisalad: {failure} (from Python you see the traceback)", file=sys.stderr)
     return 2

@@ -23,7 +23,7 @@ class MultiSimilarityConfig(Loss):
 
     def from_scratch(self) -> Loss:
         """Return base 0.5: from random weights base 0 drives all similarities to 0 together."""
-        return dataclasses.replace(self, alpha=1.0, beta=50.0, base=0.5)
+        return MultiSimilarityConfig(base=0.5)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Average the loss over all anchors; those without a mined pair count as 0."""

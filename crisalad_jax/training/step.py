@@ -26,6 +26,7 @@ from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils import compiler, devices
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
@@ -290,10 +291,9 @@ def make_train_step(
         valid: Bool[Array | np.ndarray, " image"] | None = None,
     ) -> tuple[TrainState, Metrics]:
         # JAX would keep the lower half of each, and join places that differ in the upper one.
-        require(
-            isinstance(labels, jax.Array) or not np.size(labels) or np.max(labels) < 2**31,
-            f"labels: found up to {np.max(labels, initial=0)}, expected numbers below 2^31",
-        )
+        # Its own arrays have no such labels, and may be traced or still be computed.
+        if not isinstance(labels, jax.Array) and np.max(labels, initial=0) >= 2**31:
+            raise InputError(f"labels: found up to {np.max(labels)}, expected numbers below 2^31")
         mask = jnp.ones(len(labels), bool) if valid is None else jnp.asarray(valid)
         return train_step(
             state, frozen, jnp.asarray(images), jnp.asarray(labels), mask, key, static
