@@ -1,12 +1,26 @@
 """Checks of a configuration's fields."""
 
+import dataclasses
+import functools
 import math
+import types
 from collections.abc import Mapping
-from typing import TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 from crisalad_jax.utils.errors import InputError
 
 _T = TypeVar("_T")
+REGISTRY = "registry"
+"""Key of a part's registry in the metadata of its field."""
+_PLAIN: Mapping[type, tuple[str, tuple[type, ...]]] = {
+    bool: ("True or False", (bool, np.bool_)),
+    int: ("a whole number", (int, np.integer)),
+    float: ("a number", (int, float, np.integer, np.floating)),
+    str: ("text", (str,)),
+}
+"""Words for a plain type, and the types whose values stand for it."""
 
 
 def choose(what: str, name: str, choices: Mapping[str, _T]) -> _T:
@@ -26,15 +40,84 @@ def require(condition: bool, message: str) -> None:
         raise InputError(message)
 
 
+def check_types(config: Any) -> None:
+    """Check that every field of a configuration holds a value of its annotated type.
+
+    NumPy's numbers stand for Python's, and whole numbers for floats. Fields for parts are left to
+    `resolve_names`, and types that configurations do not use are not checked.
+
+    Args:
+        config: the configuration, a dataclass that is being made.
+
+    Raises:
+        InputError: naming the class and the first field that does not.
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig
+        >>> CrossImageConfig(layers=1.5)
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: CrossImageConfig.layers: found 1.5, expected a ...
+    """
+    for name, hint in _checked_hints(type(config)).items():
+        _check_type(config, name, hint)
+
+
+def _check_type(config: Any, name: str, hint: Any) -> None:
+    value = getattr(config, name)
+    require(
+        _fits(hint, value),
+        f"{type(config).__name__}.{name}: found {value!r}, expected {_words(hint)}",
+    )
+
+
+@functools.cache
+def _checked_hints(kind: type) -> Mapping[str, Any]:
+    """Return the types of the fields that are for no part."""
+    hints = get_type_hints(kind)
+    fields: Any = dataclasses.fields(kind)
+    return {f.name: hints[f.name] for f in fields if REGISTRY not in f.metadata}
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    """Return whether a value is of a type."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(_fits(each, value) for each in arguments)
+    if origin is Literal:
+        return type(value) in map(type, arguments) and value in arguments
+    if origin is tuple and isinstance(value, tuple):
+        endless = arguments[-1:] == (...,)
+        kinds = arguments[:1] * len(value) if endless else arguments
+        return len(kinds) == len(value) and all(map(_fits, kinds, value))
+    if hint in _PLAIN:
+        # A bool is an int to Python, and no number of anything.
+        return isinstance(value, _PLAIN[hint][1]) and (hint is bool or type(value) is not bool)
+    kind = origin or hint
+    return not isinstance(kind, type) or isinstance(value, kind)
+
+
+def _words(hint: Any) -> str:
+    """Describe a type for a message."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return ", or ".join(map(_words, arguments))
+    if origin is Literal:
+        return f"one of {', '.join(sorted(map(str, arguments)))}"
+    if origin is tuple:
+        length = "" if arguments[-1:] == (...,) else f" of {len(arguments)}"
+        return f"a tuple{length}, each {_words(arguments[0])}"  # no tuple here mixes types
+    if hint in _PLAIN:
+        return _PLAIN[hint][0]
+    return "None" if hint is type(None) else getattr(hint, "__name__", str(hint))
+
+
 def require_positive(config: object, *names: str) -> None:
-    """Check that fields are positive and finite, and whole numbers where annotated `int`."""
-    hints = get_type_hints(type(config))
+    """Check that fields are of their types, positive and finite."""
+    hints = _checked_hints(type(config))
     for name in names:
+        _check_type(config, name, hints[name])
         value = getattr(config, name)
-        require(
-            hints[name] is not int or isinstance(value, int),
-            f"{type(config).__name__}.{name}: found {value}, expected a whole number",
-        )
         require(
             0 < value < math.inf,
             f"{type(config).__name__}.{name}: found {value}, expected more than 0, and finite",

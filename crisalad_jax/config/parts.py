@@ -10,6 +10,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
 
+from crisalad_jax.config.checks import REGISTRY, check_types
 from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_of
 from crisalad_jax.utils.errors import InputError
 
@@ -20,6 +21,24 @@ class Part:
 
     registry: ClassVar["Registry[Any]"]
     part_name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        """Check that the fields hold values of their types."""
+        check_types(self)
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Check a subclass's fields before its own `__post_init__` reads them."""
+        super().__init_subclass__(**options)
+        own = vars(cls).get("__post_init__")
+        if own is None:
+            return
+
+        @functools.wraps(own)
+        def check_first(self: Part) -> None:
+            check_types(self)
+            own(self)
+
+        cls.__post_init__ = check_first
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by name, so that another process finds a part of a plug-in file."""
@@ -229,17 +248,19 @@ class Registry(Generic[P]):
 def part_field(registry: Registry[P], default: str | type[P]) -> P:
     """Return a dataclass field for a part, by default the one with this name, or of this class."""
     make: Any = functools.partial(registry.make, default) if isinstance(default, str) else default
-    return dataclasses.field(default_factory=make, metadata={"registry": registry})
+    return dataclasses.field(default_factory=make, metadata={REGISTRY: registry})
 
 
 def resolve_names(config: Any) -> None:
-    """Replace names by parts in a configuration that is being constructed.
+    """Check a new configuration's types, and replace names by parts.
 
     Raises:
-        InputError: a name that is not registered, or a value that is no part of the kind.
+        InputError: a name that is not registered, a value that is no part of the kind, or what
+            `check_types` raises.
     """
+    check_types(config)
     for field in dataclasses.fields(config):
-        registry = field.metadata.get("registry")
+        registry = field.metadata.get(REGISTRY)
         if registry is None:
             continue
         value = getattr(config, field.name)
@@ -248,7 +269,9 @@ def resolve_names(config: Any) -> None:
             try:
                 value = registry.make(value)
             except InputError as error:
-                raise InputError(f"{where}: {error}") from error
+                # The field's name says what kind of part it is for.
+                words = str(error).removeprefix(f"{registry.kind}: ")
+                raise InputError(f"{where}: {words}") from error
             object.__setattr__(config, field.name, value)
         elif not isinstance(value, registry.base):
             raise InputError(f"{where}: found {value!r}, expected a {registry.kind} or its name")

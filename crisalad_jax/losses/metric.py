@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from crisalad_jax.config.checks import require, require_choice
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, Pairs, Similarities, check_value
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
@@ -36,7 +36,6 @@ class LossConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         resolve_names(self)
-        require_choice(self, "miner")
         require(
             self.miner_margin >= 0,
             f"LossConfig.miner_margin: found {self.miner_margin}, expected at least 0",

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_choice, require_positive
+from crisalad_jax.config.checks import check_types, require, require_positive
 from crisalad_jax.nn.layers import (
     BatchNorm,
     Conv,
@@ -54,7 +54,7 @@ class AdapterConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_choice(self, "kind")
+        check_types(self)
         require_positive(self, "bottleneck", "kernel_size")
         require(
             self.kernel_size % 2 == 1,

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from crisalad_jax.config.checks import require, require_choice
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator, TokenShape
@@ -49,7 +49,6 @@ class ModelConfig:
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""
         resolve_names(self)
-        require_choice(self, "normalisation", "compute_dtype", "remat")
         self.check_image_size(self.image_size)
         self.aggregator.features(self.backbone.depth)
         name = self.aggregator.part_name

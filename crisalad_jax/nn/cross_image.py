@@ -8,7 +8,7 @@ import dataclasses
 import jax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_fraction, require_positive
+from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.nn.attention import Attention, attention, init_torch_attention
 from crisalad_jax.nn.layers import (
@@ -46,6 +46,7 @@ class CrossImageConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        check_types(self)
         require_positive(self, "heads", "feedforward")
         require(
             self.layers >= 0, f"CrossImageConfig.layers: found {self.layers}, expected at least 0"

@@ -4,7 +4,7 @@ import dataclasses
 import re
 from typing import Literal
 
-from crisalad_jax.config.checks import require, require_choice, require_fraction, require_positive
+from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.losses import LossConfig
@@ -43,7 +43,7 @@ class OptimiserConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
-        require_choice(self, "kind", "schedule")
+        check_types(self)
         require_positive(self, "learning_rate", "step_epochs", "step_gamma")
         if self.decay_steps is not None:
             require(
@@ -101,7 +101,6 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
         resolve_names(self)
-        require_choice(self, "batch_order")
         require_positive(
             self, "places_per_batch", "images_per_place", "epochs", "validate_every", "keep_best"
         )

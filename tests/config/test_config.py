@@ -3,6 +3,7 @@
 import dataclasses
 import re
 
+import numpy as np
 import pytest
 
 from crisalad_jax.config.checks import choose
@@ -248,7 +249,7 @@ def test_one_patch_more_than_clusters_is_enough():
             },
             "bottleneck: found 0.25, which is a width of 24 for dim 96; expected a multiple of 16",
         ),
-        (ModelConfig, {"aggregator": "vlad"}, "^ModelConfig.aggregator: aggregator: found 'vlad'"),
+        (ModelConfig, {"aggregator": "vlad"}, "^ModelConfig.aggregator: found 'vlad'"),
         (
             ModelConfig,
             {"aggregator": "gem-pyramid", "image_size": (28, 56)},
@@ -317,7 +318,7 @@ def test_one_patch_more_than_clusters_is_enough():
         (
             LossConfig,
             {"kind": "softmax"},
-            "^LossConfig.kind: loss: found 'softmax', expected one of circle",
+            "^LossConfig.kind: found 'softmax', expected one of circle",
         ),
         (LossConfig, {"miner": "hard"}, "LossConfig.miner: found 'hard'"),
         (LossConfig, {"kind": "fast-ap"}, "expected 'none': it ranks all images"),
@@ -355,7 +356,7 @@ def test_one_patch_more_than_clusters_is_enough():
         (
             TrainConfig,
             {"augmentation": "heavy"},
-            "^TrainConfig.augmentation: augmentation: found 'heavy'",
+            "^TrainConfig.augmentation: found 'heavy'",
         ),
         (TrainConfig, {"batch_order": "any"}, "TrainConfig.batch_order: found 'any'"),
         (TrainConfig, {"epochs": 0}, "TrainConfig.epochs: found 0"),
@@ -372,6 +373,66 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
     with pytest.raises(InputError, match=words) as caught:
         kind(**fields)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "found", "expected"),
+    [
+        (CrossImageConfig, {"layers": 1.5}, "1.5", "a whole number"),
+        (CrossImageConfig, {"layers": True}, "True", "a whole number"),
+        (CrossImageConfig, {"heads": "4"}, "'4'", "a whole number"),
+        (CrossImageConfig, {"dropout": None}, "None", "a number"),
+        (CrossImageConfig, {"global_token": 1}, "1", "True or False"),
+        (AdapterConfig, {"kind": None}, "None", "one of depthwise, mlp, multi-resolution, none"),
+        (AdapterConfig, {"alpha": "0.2"}, "'0.2'", "a number"),
+        (ViTConfig, {"dim": "384"}, "'384'", "a whole number"),
+        (ViTConfig, {"adapter": "mlp"}, "'mlp'", "AdapterConfig"),
+        (SaladConfig, {"clusters": 8.0}, "8.0", "a whole number"),
+        (SaladConfig, {"sinkhorn": 3}, "3", "SinkhornConfig"),
+        (AnyLocConfig, {"layer": 31.0}, "31.0", "a whole number"),
+        (SinkhornConfig, {"throw": 1}, "1", "True or False"),
+        (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a number, or None"),
+        (ModelConfig, {"image_size": 224}, "224", "a tuple of 2, each a whole number"),
+        (ModelConfig, {"image_size": [224, 224]}, "[224, 224]", "a tuple of 2, each a whole num"),
+        (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),
+        (ModelConfig, {"cross_image": 2}, "2", "CrossImageConfig"),
+        (ModelConfig, {"remat": ["dots"]}, "['dots']", "one of dots, full, none"),
+        (LossConfig, {"miner_margin": "0.1"}, "'0.1'", "a number"),
+        (TripletConfig, {"margin": "0.1"}, "'0.1'", "a number"),
+        (ClassesConfig, {"groups": 2.5}, "2.5", "a whole number"),
+        (OptimiserConfig, {"learning_rate": "1e-3"}, "'1e-3'", "a number"),
+        (OptimiserConfig, {"decay_steps": 10.5}, "10.5", "a whole number, or None"),
+        (OptimiserConfig, {"warmup_steps": 0.1}, "0.1", "a whole number"),
+        (TrainConfig, {"model": "tiny"}, "'tiny'", "ModelConfig"),
+        (TrainConfig, {"loss": "triplet"}, "'triplet'", "LossConfig"),
+        (TrainConfig, {"trainable": None}, "None", "text"),
+        (TrainConfig, {"seed": None}, "None", "a whole number"),
+        (TrainConfig, {"cities": "Bath"}, "'Bath'", "a tuple, each text, or None"),
+        (TrainConfig, {"cities": ("Bath", 3)}, "('Bath', 3)", "a tuple, each text, or None"),
+        (LightAugmentConfig, {"blur": "1"}, "'1'", "a number"),
+    ],
+)
+@pytest.mark.usefixtures("_unchecked")
+def test_a_field_of_another_type_is_refused_by_its_name(kind, fields, found, expected):
+    (field,) = fields
+    words = rf"^{kind.__name__}\.{field}: found {re.escape(found)}, expected {re.escape(expected)}"
+    with pytest.raises(InputError, match=words) as caught:
+        kind(**fields)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_a_replaced_field_is_checked_too():
+    with pytest.raises(InputError, match=r"^TrainConfig\.model: found 'tiny', expected Mod"):
+        dataclasses.replace(recipe("tiny"), model="tiny")  # pyright: ignore
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_numpys_numbers_and_whole_numbers_for_floats_are_taken():
+    assert CrossImageConfig(layers=np.int64(1)) == CrossImageConfig(layers=1)
+    assert OptimiserConfig(learning_rate=1) == OptimiserConfig(learning_rate=1.0)
+    assert LossConfig(miner_margin=np.float32(0.5)) == LossConfig(miner_margin=0.5)
+    assert ModelConfig(image_size=(np.int32(224), 224)) == ModelConfig()
 
 
 def test_anylocs_layer_is_its_papers_of_vit_g():

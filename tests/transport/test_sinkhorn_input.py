@@ -252,7 +252,7 @@ def test_settings_of_the_problem_are_no_settings_of_the_solver() -> None:
         (
             SinkhornConfig,
             {"step": "simplex"},
-            "^SinkhornConfig.step: step: found 'simplex', expected one of dual-softmax, newton, "
+            "^SinkhornConfig.step: found 'simplex', expected one of dual-softmax, newton, "
             "sinkhorn, softmax.*is a plug-in missing",
         ),
         (SinkhornConfig, {"step": 3}, "SinkhornConfig.step: found 3, expected a step or its name"),
@@ -260,7 +260,7 @@ def test_settings_of_the_problem_are_no_settings_of_the_solver() -> None:
         (
             SinkhornConfig,
             {"gradient": "exact"},
-            "SinkhornConfig.gradient: gradient: found 'exact', expected one of implicit, optim",
+            "SinkhornConfig.gradient: found 'exact', expected one of implicit, optim",
         ),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (
@@ -309,7 +309,7 @@ def test_settings_of_the_problem_are_no_settings_of_the_solver() -> None:
         (
             SaladConfig,
             {"dustbin": "row"},
-            "SaladConfig.dustbin: dustbin: found 'row', expected one of column, mass, none",
+            "SaladConfig.dustbin: found 'row', expected one of column, mass, none",
         ),
         (SaladConfig, {"epsilon": 0.0}, "SaladConfig.epsilon: found 0.0"),
         (SaladConfig, {"epsilon": float("nan")}, "SaladConfig.epsilon: found nan"),

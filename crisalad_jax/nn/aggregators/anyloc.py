@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_choice, require_positive
+from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.netvlad import residual_sums
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
@@ -46,7 +46,6 @@ class AnyLocConfig(Aggregator):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "clusters")
-        require_choice(self, "facet")
 
     def block(self, depth: int) -> int:
         """Return the number of the facet's block among `depth` blocks, from 0.

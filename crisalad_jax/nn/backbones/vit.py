@@ -17,7 +17,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
-from crisalad_jax.config.checks import choose, require, require_choice, require_positive
+from crisalad_jax.config.checks import choose, require, require_positive
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.nn.adapter import Adapter, AdapterConfig, adapter, init_adapter
 from crisalad_jax.nn.attention import Attention, attention
@@ -110,7 +110,6 @@ class ViTConfig(Backbone):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "dim", "depth", "heads", "mlp_ratio", "position_grid")
-        require_choice(self, "ffn", "position_init")
         require(
             self.registers >= 0,
             f"ViTConfig.registers: found {self.registers}, expected at least 0",
