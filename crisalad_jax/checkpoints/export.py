@@ -20,8 +20,9 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, describe, self_mask
 from crisalad_jax.utils import compiler
+from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_folder, check_new_folder, sha256_of, write_json
+from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
 from crisalad_jax.utils.pytree import named_leaves
 
 FORMAT = "crisalad-jax export 1"

@@ -17,6 +17,7 @@ import safetensors
 import safetensors.numpy
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS, State, check_holds, infer, to_params, to_state
+from crisalad_jax.checkpoints.safetensors_io import write_safetensors
 from crisalad_jax.checkpoints.weights import (
     count_layers,
     is_ours,
@@ -32,7 +33,7 @@ from crisalad_jax.nn.backbones.vit import ViT, ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_source, check_target, write_safetensors
+from crisalad_jax.utils.files import atomic_path, check_source, check_target
 
 TORCH_SUFFIXES = (".pth", ".pt", ".ckpt")
 
@@ -54,7 +55,7 @@ class Model(NamedTuple):
     config: ModelConfig
 
 
-def load(path: str | os.PathLike[str]) -> Model:
+def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
     """Load a model from a file of this package or a public checkpoint.
 
     Args:
@@ -76,11 +77,11 @@ def load(path: str | os.PathLike[str]) -> Model:
         >>> load(folder / "weights.safetensors").config == config
         True
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, verify=verify)
     return Model(checkpoint.params, checkpoint.config)
 
 
-def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
+def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
     """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
 
     Torch files are read by `torch.load(weights_only=True)`, which runs no code of the file.
@@ -93,7 +94,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
     path = pathlib.Path(path)
     check_source(path, "a checkpoint")
     if is_ours(path):
-        params, config = load_weights(path)
+        params, config = load_weights(path, verify=verify)
         return Checkpoint(params, config, load_extras(path), None)
     try:
         with path.open("rb") as file:
@@ -268,7 +269,11 @@ def write_checkpoint(
         content["config"] = json.dumps(to_plain(config))
     # Pass an open file, because torch writes the name of a path into the archive.
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        torch.save(content, file)
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:  # torch's, after the disk's own
+            reason = error.__context__ if isinstance(error.__context__, OSError) else error
+            raise InputError(f"{path}: cannot be written: {str(reason).splitlines()[0]}") from error
 
 
 class Conversion(NamedTuple):

@@ -5,7 +5,6 @@ detected none, and 39 changed the loaded numbers. The SHA-256 of every file is t
 """
 
 import contextlib
-import json
 import os
 import pathlib
 import shutil
@@ -18,8 +17,9 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
+from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import sha256_of, write_json
+from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.pytree import named_leaves
 
 _DROPPED = "dropped"
@@ -144,10 +144,15 @@ class StateStore:
 
     def _check_seal(self, step: int) -> None:
         folder = self._folder / str(step)
-        hashes = _hashes(folder)
-        for name, sha256 in json.loads((folder / _SEAL).read_text()).items():
-            if hashes.get(name) != sha256:
-                what = "other bytes than were saved" if name in hashes else "no file"
+        found, saved = _hashes(folder), read_json(folder / _SEAL, "the digests of a state's files")
+        if not isinstance(saved, dict) or not saved:
+            raise ValueError(f"{_SEAL}: found no digests, expected those of {len(found)} files")
+        for name in found.keys() | saved.keys():
+            if found.get(name) != saved.get(name):
+                both = name in found and name in saved
+                what = "other bytes than were saved" if both else "no file"
+                if name not in saved:
+                    what = "a file that was not saved"
                 raise ValueError(f"{name}: found {what}")
 
     def wait(self) -> None:

@@ -14,25 +14,29 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors
 
+from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source, write_safetensors
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
 
-FORMAT = "crisalad-jax 2"
-"""Only key of a weight file's metadata, because several have no fixed order. Its value is JSON: the
-configuration, the version of this package, and the name and source's digest of every part."""
+FORMAT = "crisalad-jax 3"
+"""Only key of a weight file's metadata. Its value is JSON: the file's checksum, the configuration,
+the version of this package, and the name and source's digest of every part."""
+FORMAT_2 = "crisalad-jax 2"
+"""Metadata key of files without a checksum."""
 FORMAT_1 = "crisalad-jax 1"
 """Metadata key of version 0.1, whose value was the configuration alone."""
 _MARK = "aggregator.backbone"
 """Array in files of version 0.1: a checksum of the backbone of AnyLoc's vocabulary; 0 before one is
 built."""
+_FORMATS = {FORMAT, FORMAT_2, FORMAT_1}
 EXTRA = "extra."
 """Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
 
@@ -75,14 +79,14 @@ def save_weights(
         "parts": sources_of(config),
         "aggregator": config.aggregator.metadata(params.aggregator),
     }
-    write_safetensors(path, arrays, {FORMAT: json.dumps(metadata)})
+    write_sealed(path, arrays, FORMAT, metadata)
 
 
 def is_ours(path: str | os.PathLike[str]) -> bool:
     """Return whether this is a whole safetensors file that `save_weights` wrote."""
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            return not {FORMAT, FORMAT_1}.isdisjoint(file.metadata() or {})
+            return not _FORMATS.isdisjoint(file.metadata() or {})
     except (safetensors.SafetensorError, OSError):
         return False
 
@@ -95,24 +99,25 @@ def load_extras(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 
 def load_weights(
-    path: str | os.PathLike[str], expected: ModelConfig | None = None
+    path: str | os.PathLike[str], expected: ModelConfig | None = None, *, verify: bool = True
 ) -> tuple[Crisalad, ModelConfig]:
     """Read the parameters and configuration that `save_weights` wrote.
 
-    Files of version 0.1 load too. A note tells if a part's source has changed since the weights
-    were written.
+    Files of version 0.1 load too. A note tells of a file without a checksum, and if a part's source
+    has changed since the weights were written.
 
     Args:
         path: the file.
         expected: if given, the configuration that the file must have, except for what parameters
             do not depend on: image size (but MixVPR's do), dropout, compute type, remat.
+        verify: whether to check that the file's bytes are those that were written.
 
     Returns:
         (params, config).
 
     Raises:
-        InputError: the file is missing, cut short or no such file; it needs a part that is not
-            registered; its parameters do not fit its configuration or are not finite (all that are
+        InputError: the file is missing, changed, cut short or no such file; it needs a part that is
+            not registered; its parameters do not fit its configuration or are not finite (all that are
             missing, unknown or wrong are listed); its configuration is not `expected` (all fields
             that differ are listed); or AnyLoc's vocabulary is of another backbone.
 
@@ -123,6 +128,22 @@ def load_weights(
         crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
     """
     path = pathlib.Path(path)
+    with checked_safetensors(path, verify=verify):
+        params, config, metadata = _load(path, expected)
+    same_version = metadata.get("version") == VERSION
+    changed = changed_sources(config, metadata.get("parts", {}), same_version)
+    if changed:
+        tell(
+            f"{path}: found another source of {', '.join(changed)} than these weights were written "
+            "with; descriptors may differ"
+        )
+    return params, config
+
+
+def _load(
+    path: pathlib.Path, expected: ModelConfig | None
+) -> tuple[Crisalad, ModelConfig, dict[str, Any]]:
+    """Read parameters, configuration and the rest of the metadata; see `load_weights`."""
     arrays, metadata = _read(path)
     config = from_plain(ModelConfig, metadata["config"], source=f"{path} (metadata)")
     if expected is not None:
@@ -137,38 +158,16 @@ def load_weights(
         own = config.aggregator.bind(own, params.backbone)
     params = dataclasses.replace(params, aggregator=own)
     config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
-    same_version = metadata.get("version") == VERSION
-    changed = changed_sources(config, metadata.get("parts", {}), same_version)
-    if changed:
-        tell(
-            f"{path}: found another source of {', '.join(changed)} than these weights were written "
-            "with; descriptors may differ"
-        )
-    return params, config
+    return params, config, metadata
 
 
 def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read the arrays by name, and the metadata in today's format."""
-    check_source(path, "a .safetensors file of weights")
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            key = next((key for key in (FORMAT, FORMAT_1) if key in metadata), None)
-            if key is None:
-                raise InputError(
-                    f"{path}: found metadata {sorted(metadata)}, expected {FORMAT!r}, as this "
-                    "package writes it; `crisalad convert` reads public checkpoints"
-                )
-            names = [name for name in file.keys() if not name.startswith(EXTRA)]  # noqa: SIM118
-            arrays = {name: file.get_tensor(name) for name in names}
-    except (safetensors.SafetensorError, OSError) as error:
-        raise InputError(
-            f"{path}: not a whole safetensors file: {error}; `crisalad convert` reads torch files"
-        ) from error
-    try:
-        plain = json.loads(metadata[key])
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: found no configuration in its metadata: {error}") from error
+    expected = (
+        f"a .safetensors file of weights ({FORMAT!r}), as this package writes it; `crisalad "
+        "convert` reads public checkpoints"
+    )
+    key, plain, arrays = read_sealed(path, (FORMAT, FORMAT_2, FORMAT_1), expected, but=EXTRA)
     if key == FORMAT_1:
         mark = arrays.pop(_MARK, np.zeros(()))
         return dict(_renamed(arrays)), {"config": plain, _MARK: float(mark.max(initial=0))}

@@ -13,6 +13,7 @@ import numpy as np
 from crisalad_jax.config.aliases import upgrade
 from crisalad_jax.config.parts import Part
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json
 
 _T = TypeVar("_T")
 NAME = "name"
@@ -151,12 +152,10 @@ def read_config(kind: type[_T], path: pathlib.Path) -> _T:
     """Read a configuration that a run wrote.
 
     Raises:
-        InputError: the file is missing, is not JSON, or holds another configuration.
+        InputError: the file is missing, is not JSON, was changed since it was written, or holds
+            another configuration.
     """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot read this configuration: {error}") from error
+    value = read_json(path, "a configuration as JSON")
     return from_plain(kind, value, source=str(path))
 
 

@@ -160,6 +160,18 @@ def pieces(
         yield rows
 
 
+def check_all_rows(array: Float[np.ndarray, "n d"], name: str, *, unit: bool) -> None:
+    """Check all rows of an array in memory or on disk, as `check_rows`, before they are used.
+
+    Raises:
+        InputError: a row is not finite, or no unit vector where that is asked for.
+    """
+    for start in range(0, len(array), _CHECKED):
+        rows = array[start : start + _CHECKED]
+        check_rows(rows, name, range(start, len(array)), unit=unit)
+        _let_go(rows)
+
+
 def check_rows(
     rows: Float[np.ndarray, "rows d"], name: str, places: Sequence[int] | np.ndarray, *, unit: bool
 ) -> None:

@@ -22,6 +22,9 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.progress import progress_bar
 
+_SMALL = 16
+"""Largest batch that is padded, so that few images need no other program than many."""
+
 
 class FolderTokens(NamedTuple):
     """Tokens of many images on the host (see `Tokens`), and which images could be read."""
@@ -29,6 +32,11 @@ class FolderTokens(NamedTuple):
     global_tokens: Float[np.ndarray, "image global_dim"]
     local: Float[np.ndarray, "image token dim"]
     readable: Bool[np.ndarray, " image"]
+
+
+def useful_batch_size(batch_size: int, images: int) -> int:
+    """Return the batch size, or less where it would be padding for the most part."""
+    return min(batch_size, max(images, _SMALL))
 
 
 def read_tokens(

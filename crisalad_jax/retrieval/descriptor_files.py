@@ -1,111 +1,259 @@
-"""Files of descriptors: .npy with a list of names, or HDF5 as hloc reads it."""
+"""Files of descriptors: .npy with a list of names, or HDF5 as hloc reads it.
 
+d.npy          a row for each image
+d.names.txt    a line for each image
+d.npy.json     how they were made, and the digests of the files that belong together
+d.h5           a group for each image; d.h5.json beside it
+"""
+
+import io
 import os
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import IO, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from crisalad_jax.config.checks import choose
+from crisalad_jax.data.images import check_lines
 from crisalad_jax.retrieval.chunks import as_rows
+from crisalad_jax.utils.checksums import sha256_of, tell_unchecked
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_source, write_npy
+from crisalad_jax.utils.files import (
+    atomic_path,
+    check_source,
+    read_json,
+    read_text,
+    write_json,
+    write_npy,
+)
 
 Descriptors = Float[np.ndarray, "image descriptor"]
+_DIGESTS = "files"
+"""Key of the digests in the record, by the files' roles."""
+_SUFFIXES = (".npy", ".h5")
+_INFLATION = 1100
+"""Largest ratio of numbers to bytes that deflate, HDF5's compression, reaches."""
 
 
-def writer_for(
-    path: str | os.PathLike[str],
-) -> Callable[[pathlib.Path, Descriptors, Sequence[str]], None]:
-    """Return the function that writes files of this suffix; call it before any work is done.
+def check_suffix(path: str | os.PathLike[str]) -> None:
+    """Check that descriptors can be written to a file of this suffix, before any work is done.
 
     Raises:
         InputError: the suffix is neither .npy nor .h5.
     """
-    path = pathlib.Path(path)
-    writers: Mapping[str, Callable[[pathlib.Path, Descriptors, Sequence[str]], None]] = {
-        ".npy": _write_npy,
-        ".h5": _write_h5,
-    }
-    return choose(f"{path}: suffix of the descriptors' file", path.suffix, writers)
+    suffix = pathlib.Path(path).suffix
+    choose(f"{path}: suffix of the descriptors' file", suffix, dict.fromkeys(_SUFFIXES))
 
 
-def config_of(path: pathlib.Path) -> pathlib.Path:
+def record_of(path: pathlib.Path) -> pathlib.Path:
     """Return the path of the JSON file that tells how the descriptors in `path` were made."""
-    return path.with_suffix(".config.json")
+    return path.with_name(f"{path.name}.json")
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:
     """List all files that a set of descriptors in `path` consists of."""
     names = [_names_of(path)] if path.suffix == ".npy" else []
-    return [path, *names, config_of(path)]
+    return [path, *names, record_of(path)]
 
 
 def _names_of(path: pathlib.Path) -> pathlib.Path:
     return path.with_suffix(".names.txt")
 
 
-def open_npy(path: str | os.PathLike[str]) -> Descriptors:
-    """Memory-map the array in a .npy file: float32, float16, float64 or bfloat16.
+def write_descriptors(
+    path: str | os.PathLike[str],
+    descriptors: Descriptors,
+    names: Sequence[str],
+    record: Mapping[str, Any] | None = None,
+) -> None:
+    """Write descriptors, their images' names and a record of both.
+
+    All files are written whole under temporary names. Then the record gets its name, and the others
+    theirs. A process that is killed in between leaves a set whose digests differ from its record,
+    and `read_descriptors` refuses that.
+
+    Args:
+        path: a file .npy or .h5.
+        descriptors: a row for each image.
+        names: of the images.
+        record: how they were made, as JSON values.
 
     Raises:
-        InputError: there is no such file, or it holds no matrix of such numbers.
+        InputError: another suffix, a name twice in a .h5, or a file that cannot be written.
     """
+    check_suffix(path)
     path = pathlib.Path(path)
-    check_source(path, "a .npy file of descriptors")
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path}: not a whole .npy file: {error}") from error
-    if not isinstance(array, np.ndarray) or (
-        array.dtype.kind != "f" and array.dtype != np.dtype("V2")
+    write = {".npy": _write_npy, ".h5": _write_h5}[path.suffix]
+    write(path, descriptors, names, dict(record or {}))
+
+
+def _write_npy(
+    path: pathlib.Path, descriptors: Descriptors, names: Sequence[str], record: dict[str, Any]
+) -> None:
+    # The files that are entered last are renamed first.
+    with (
+        atomic_path(path) as array,
+        atomic_path(_names_of(path)) as listed,
+        atomic_path(record_of(path)) as written,
     ):
-        dtype = array.dtype if isinstance(array, np.ndarray) else "an archive"
-        raise InputError(f"{path}: found {dtype}, expected an array of floating-point numbers")
-    return as_rows(array, str(path))
+        write_npy(array, descriptors)
+        listed.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+        digests = {"descriptors": sha256_of(array), "names": sha256_of(listed)}
+        write_json(written, {_DIGESTS: digests} | record)
 
 
-def _write_npy(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:
-    """Write a .npy file; line i of the file with the suffix .names.txt names row i."""
-    with atomic_path(_names_of(path)) as temporary:
-        temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
-    with atomic_path(path) as temporary:
-        write_npy(temporary, descriptors)
-
-
-def _write_h5(path: pathlib.Path, descriptors: Descriptors, names: Sequence[str]) -> None:
+def _write_h5(
+    path: pathlib.Path, descriptors: Descriptors, names: Sequence[str], record: dict[str, Any]
+) -> None:
     """Write a group for each image, with a dataset `global_descriptor`, as hloc does."""
     import h5py
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        for name, descriptor in zip(names, descriptors, strict=True):
-            if f"{name}/global_descriptor" in file:
-                raise InputError(f"{path}: found the image name {name!r} twice, expected it once")
-            file.create_dataset(f"{name}/global_descriptor", data=descriptor)
+    with atomic_path(path) as array, atomic_path(record_of(path)) as written:
+        with array.open("w+b", buffering=0) as raw:
+            target = _NeverFull(raw)
+            with h5py.File(target, "w") as file:
+                for name, descriptor in zip(names, descriptors, strict=True):
+                    if f"{name}/global_descriptor" in file:
+                        raise InputError(
+                            f"{path}: found the image name {name!r} twice, expected it once"
+                        )
+                    file.create_dataset(f"{name}/global_descriptor", data=descriptor)
+            if target.error is not None:
+                raise target.error
+        write_json(written, {_DIGESTS: {"descriptors": sha256_of(array)}} | record)
 
 
-def read_descriptors(path: str | os.PathLike[str]) -> tuple[list[str], Descriptors]:
-    """Read names and descriptors from a file of `writer_for` or of hloc, of any float type.
+class _NeverFull(io.RawIOBase):
+    """A file that keeps the first error of the disk to itself: HDF5 would crash the process."""
 
-    A .npy file is memory-mapped: its rows are read when they are used.
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        count = memoryview(data).nbytes
+        self._try(lambda: self._file.write(data))
+        return count
+
+    def truncate(self, size: int | None = None) -> int:
+        self._try(lambda: self._file.truncate(size))
+        return self.tell() if size is None else size
+
+    def _try(self, change: Any) -> None:
+        if self.error is None:
+            try:
+                change()
+            except OSError as error:
+                self.error = error
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read(memoryview(buffer).nbytes)
+        memoryview(buffer).cast("B")[: len(data)] = data
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+
+def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptors:
+    """Memory-map the array in a .npy file: float32, float16, float64 or bfloat16.
+
+    Args:
+        path: the file.
+        verify: whether to read the file, and compare it with the digest in its record.
 
     Raises:
-        InputError: the file, or the names beside a .npy, is missing, not whole, or holds something
-            else.
+        InputError: there is no such file, it holds no matrix of such numbers, or other bytes than
+            its record says.
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a .npy file of descriptors")
+    if verify:
+        _check_files(path, {"descriptors": path})
+    try:
+        array = np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # numpy's parser of headers raises errors of many kinds
+        raise InputError(f"{path}: not a whole .npy file: {_words(error)}") from error
+    if array.dtype.kind != "f" and array.dtype != np.dtype("V2"):
+        raise InputError(
+            f"{path}: found {array.dtype}, expected an array of floating-point numbers"
+        )
+    return as_rows(array, str(path))
+
+
+def _words(error: BaseException) -> str:
+    lines = str(error).splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def read_descriptors(
+    path: str | os.PathLike[str], *, verify: bool = True
+) -> tuple[list[str], Descriptors]:
+    """Read names and descriptors from a file of `write_descriptors` or of hloc, of any float type.
+
+    A .npy file is memory-mapped: its rows are read when they are used. A note tells of a set
+    without a record of its digests.
+
+    Args:
+        path: the file.
+        verify: whether to read the files, and compare them with their digests.
+
+    Raises:
+        InputError: the file, or the names beside a .npy, is missing, not whole, of another set, or
+            holds something else.
     """
     path = pathlib.Path(path)
     readers = {".npy": _read_npy, ".h5": _read_h5}
     read = choose(f"{path}: suffix of the descriptors' file", path.suffix, readers)
     check_source(path, "a file of descriptors")
-    return read(path)
+    names, descriptors = read(path, verify)
+    check_lines(names, path)
+    return names, descriptors
 
 
-def _read_npy(path: pathlib.Path) -> tuple[list[str], Descriptors]:
+def _check_files(path: pathlib.Path, files: Mapping[str, pathlib.Path]) -> None:
+    """Compare files with the digests in the record of the set in `path`, if it has one."""
+    record = record_of(path)
+    if not record.is_file():
+        tell_unchecked(path)
+        return
+    value = read_json(record, "a record of descriptors")
+    digests = value.get(_DIGESTS) if isinstance(value, dict) else None
+    if not isinstance(digests, dict) or not digests.keys() >= files.keys():
+        raise InputError(
+            f"{record}: found no digests of {', '.join(files)}, expected them: {path.name} and "
+            "this file do not belong together"
+        )
+    for role, file in files.items():
+        if sha256_of(file) != digests[role]:
+            raise InputError(
+                f"{file}: found other bytes than {record.name} says, expected those that were "
+                "written together: they were changed, or an extraction ended between the two; the "
+                "same command finishes it"
+            )
+
+
+def _read_npy(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]:
     listed = _names_of(path)
-    check_source(listed, f"the names of the images in {path.name}")
-    names = listed.read_text(encoding="utf-8").splitlines()
-    descriptors = open_npy(path)
+    text = read_text(listed, f"the names of the images in {path.name}")
+    if verify:
+        _check_files(path, {"descriptors": path, "names": listed})
+    names = text.splitlines()
+    descriptors = open_npy(path, verify=False)
     if len(descriptors) != len(names):
         raise InputError(
             f"{path}: found {len(descriptors)} descriptors, expected {len(names)}, one for each "
@@ -114,9 +262,11 @@ def _read_npy(path: pathlib.Path) -> tuple[list[str], Descriptors]:
     return names, descriptors
 
 
-def _read_h5(path: pathlib.Path) -> tuple[list[str], Descriptors]:
+def _read_h5(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]:
     import h5py
 
+    if verify:
+        _check_files(path, {"descriptors": path})
     names: list[str] = []
     rows: list[np.ndarray] = []
 
@@ -129,14 +279,23 @@ def _read_h5(path: pathlib.Path) -> tuple[list[str], Descriptors]:
                 f"{path}: found {item.dtype} {item.shape} as {name}, expected floats "
                 f"{rows[0].shape if rows else '(descriptor,)'}"
             )
+        # The header may claim any size, or numbers of other files.
+        stored = item.id.get_storage_size() * (1 if item.compression is None else _INFLATION)
+        if item.external or item.is_virtual or item.nbytes > stored:
+            raise InputError(
+                f"{path}: found {item.nbytes} bytes of numbers as {name}, of which the file holds "
+                f"{item.id.get_storage_size()}, expected all of them in this file"
+            )
         names.append(group)
         rows.append(item[()])
 
     try:
         with h5py.File(path) as file:
             file.visititems(take)
-    except OSError as error:
-        raise InputError(f"{path}: not a whole HDF5 file: {error}") from error
+    except InputError:
+        raise
+    except Exception as error:  # damaged files end in errors of many kinds
+        raise InputError(f"{path}: not a whole HDF5 file: {_words(error)}") from error
     if not rows:
         raise InputError(f"{path}: found no dataset global_descriptor, expected one for each image")
     return names, np.stack(rows)

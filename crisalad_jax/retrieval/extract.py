@@ -1,5 +1,7 @@
 """Descriptors of a folder or a list of images, in files or in memory."""
 
+import contextlib
+import functools
 import os
 import pathlib
 from collections.abc import Sequence
@@ -10,20 +12,21 @@ from crisalad_jax.data.images import check_lines, list_images, names_in
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.chunks import check_rows
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
+from crisalad_jax.retrieval.describe import group, read_tokens, useful_batch_size
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
-    config_of,
+    check_suffix,
     read_descriptors,
     targets,
-    writer_for,
+    write_descriptors,
 )
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
+from crisalad_jax.retrieval.partial import partial_folder, read_tokens_partly
 from crisalad_jax.retrieval.pca import Pca, load_pca
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, write_json
+from crisalad_jax.utils.files import check_target
 
 StrPath = str | os.PathLike[str]
 
@@ -57,15 +60,18 @@ def extract(
     k: int = 20,
     pca: StrPath | Pca | None = None,
     on_bad_image: OnBadImage = "stop",
+    verify: bool = True,
     quiet: bool = False,
 ) -> Extracted:
     """Describe images, and write the descriptors where they are asked for.
+
+    With `out`, the same call resumes after a kill, and one process at a time may write there.
 
     Args:
         params: the model's parameters.
         config: the model; images are resized to its `image_size`.
         images: a folder, searched with its subfolders in sorted order, or a list of files.
-        out: a file .npy, with the names beside it, or .h5, as hloc reads it. What was asked for is
+        out: a file .npy, with the names beside it, or .h5, as hloc reads it. How it was made is
             written beside it too, as JSON. None writes nothing.
         weights: the file that the parameters are from, for that JSON and for messages.
         grouping: one of `GROUPINGS`: which images look at each other.
@@ -78,6 +84,7 @@ def extract(
         k: number of pairs of each image.
         pca: components that shorten the descriptors, or a file of them.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
+        verify: whether to check the bytes of `database` and `pca` against their checksums.
         quiet: whether to show no progress bar.
 
     Returns:
@@ -105,42 +112,48 @@ def extract(
         database=database,
         k=k,
     )
-    components = _components(pca, config, weights, unit=pairs is not None)
+    components = _components(pca, config, weights, unit=pairs is not None, verify=verify)
     paths, names = _listed(images, root)
     length = config.descriptor_dim if components is None else len(components.components)
-    others = None if pairs is None else _others(pairs, names, database, length)
-    folder = read_tokens(
-        params,
-        config,
-        paths,
-        batch_size=batch_size,
-        label="images",
-        on_bad_image=on_bad_image,
-        quiet=quiet,
-    )
-    if not folder.readable.any():
-        raise InputError(f"{_source(images)}: found {len(paths)} images, none of them readable")
-    descriptors = group(
-        params, config, folder, grouping, batch_size=batch_size, seed=seed, quiet=quiet
-    )[folder.readable]
-    check_rows(descriptors, f"{_source(images)}: descriptors", range(len(descriptors)), unit=True)
-    if components is not None:
-        descriptors = components.apply(descriptors)
-    readable = [name for name, ok in zip(names, folder.readable, strict=True) if ok]
-    skipped = [name for name, ok in zip(names, folder.readable, strict=True) if not ok]
-    if out is not None:
-        writer_for(out)(pathlib.Path(out), descriptors, readable)
-        record = {
-            "weights": None if weights is None else str(weights),
-            "images": _source(images),
-            "grouping": grouping,
-            "batch_size": batch_size,
-            "seed": seed,
-            "pca": _words(pca),
-            "skipped": skipped,
-            "model": to_plain(config),
-        }
-        write_json(config_of(pathlib.Path(out)), record)
+    others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
+    batch_size = useful_batch_size(batch_size, len(paths))
+    with contextlib.ExitStack() as stack:
+        if out is None:
+            read = functools.partial(read_tokens, label="images")
+        else:
+            folder = stack.enter_context(partial_folder(pathlib.Path(out)))
+            read = functools.partial(read_tokens_partly, folder)
+        tokens = read(
+            params=params,
+            config=config,
+            paths=paths,
+            batch_size=batch_size,
+            on_bad_image=on_bad_image,
+            quiet=quiet,
+        )
+        if not tokens.readable.any():
+            raise InputError(f"{_source(images)}: found {len(paths)} images, none of them readable")
+        descriptors = group(
+            params, config, tokens, grouping, batch_size=batch_size, seed=seed, quiet=quiet
+        )[tokens.readable]
+        source = f"{_source(images)}: descriptors"
+        check_rows(descriptors, source, range(len(descriptors)), unit=True)
+        if components is not None:
+            descriptors = components.apply(descriptors)
+        readable = [name for name, ok in zip(names, tokens.readable, strict=True) if ok]
+        skipped = [name for name, ok in zip(names, tokens.readable, strict=True) if not ok]
+        if out is not None:
+            record = {
+                "weights": None if weights is None else str(weights),
+                "images": _source(images),
+                "grouping": grouping,
+                "batch_size": batch_size,
+                "seed": seed,
+                "pca": _words(pca),
+                "skipped": skipped,
+                "model": to_plain(config),
+            }
+            write_descriptors(out, descriptors, readable, record)
     nearest = None
     if pairs is not None:
         nearest = nearest_pairs(readable, descriptors, *(others or (readable, descriptors)), k=k)
@@ -178,7 +191,7 @@ def check_extraction(
     """
     files: list[pathlib.Path] = []
     if out is not None:
-        writer_for(out)
+        check_suffix(out)
         files = targets(pathlib.Path(out))
     for target in (*files, *([] if pairs is None else [pairs])):
         check_target(target)
@@ -192,12 +205,17 @@ def check_extraction(
 
 
 def _components(
-    pca: StrPath | Pca | None, config: ModelConfig, weights: StrPath | None, *, unit: bool
+    pca: StrPath | Pca | None,
+    config: ModelConfig,
+    weights: StrPath | None,
+    *,
+    unit: bool,
+    verify: bool,
 ) -> Pca | None:
     """Load components, and check that they fit the model and, for pairs, give unit vectors."""
     if pca is None:
         return None
-    components = pca if isinstance(pca, Pca) else load_pca(pca)
+    components = pca if isinstance(pca, Pca) else load_pca(pca, verify=verify)
     components.check(config.descriptor_dim, "model" if weights is None else str(weights))
     if unit and not components.config.renormalise:
         raise InputError(
@@ -242,17 +260,18 @@ def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
 
 
 def _others(
-    pairs: StrPath, names: list[str], database: StrPath | None, length: int
+    pairs: StrPath, names: list[str], database: StrPath | None, length: int, *, verify: bool
 ) -> tuple[list[str], Descriptors] | None:
     """Read the descriptors to pair the images with; None pairs them with themselves."""
     check_names(pairs, names)
     if database is None:
         return None
-    listed, descriptors = read_descriptors(database)
+    listed, descriptors = read_descriptors(database, verify=verify)
     check_names(pairs, listed)
     if descriptors.shape[1] != length:
         raise InputError(
             f"{database}: found descriptors of {descriptors.shape[1]} numbers, expected {length} "
             "as of these images"
         )
+    check_all_rows(descriptors, str(database), unit=True)
     return listed, descriptors

@@ -2,24 +2,25 @@
 
 import dataclasses
 import itertools
-import json
 import os
 import pathlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import safetensors
 from jaxtyping import Float, Float32, Float64
 
+from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.chunks import as_rows, pieces, sample
+from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source, write_safetensors
 from crisalad_jax.utils.progress import Bar, progress_bar
 
-FORMAT = "crisalad-jax pca 1"
-"""The one key of a file's metadata; its value is the `PcaConfig` as JSON."""
+FORMAT = "crisalad-jax pca 2"
+"""The one key of a file's metadata; its value is JSON: the file's checksum and the `PcaConfig`."""
+FORMAT_1 = "crisalad-jax pca 1"
+"""Metadata key of files without a checksum; its value was the `PcaConfig` alone."""
 SAMPLES = 2**14
 """Largest number of descriptors that components are fitted to, as in CricaVPR."""
 _ARRAYS = ("mean", "components", "variances", "total")
@@ -240,21 +241,22 @@ def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
         InputError: the file cannot be written.
     """
     arrays = {name: np.array(getattr(pca, name), order="C") for name in _ARRAYS}
-    write_safetensors(path, arrays, {FORMAT: json.dumps(to_plain(pca.config))})
+    write_sealed(path, arrays, FORMAT, {"config": to_plain(pca.config)})
 
 
-def load_pca(path: str | os.PathLike[str]) -> Pca:
+def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
     """Read components that `save_pca` wrote.
 
     Args:
         path: the file.
+        verify: whether to check that the file's bytes are those that were written.
 
     Returns:
         The components.
 
     Raises:
-        InputError: the file is missing, cut short or no such file, or its arrays do not fit each
-            other.
+        InputError: the file is missing, changed, cut short or no such file, or its arrays do not
+            fit each other.
 
     Example:
         >>> import numpy as np
@@ -265,20 +267,17 @@ def load_pca(path: str | os.PathLike[str]) -> Pca:
         (50, 3)
     """
     path = pathlib.Path(path)
-    check_source(path, "a .safetensors file of principal components")
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            names = set(file.keys())
-            if FORMAT not in metadata or names != set(_ARRAYS):
-                raise InputError(
-                    f"{path}: found arrays {sorted(names)[:3]} and metadata {sorted(metadata)}, "
-                    f"expected {FORMAT!r}, as `crisalad pca` writes it"
-                )
-            arrays = {name: file.get_tensor(name) for name in _ARRAYS}
-            plain = json.loads(metadata[FORMAT])
-    except (safetensors.SafetensorError, OSError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: not a whole file of principal components: {error}") from error
+    expected = f"a file of principal components ({FORMAT!r}), as `crisalad pca` writes it"
+    with checked_safetensors(path, verify=verify):
+        return _load(path, expected)
+
+
+def _load(path: pathlib.Path, expected: str) -> Pca:
+    form, value, arrays = read_sealed(path, (FORMAT, FORMAT_1), expected)
+    if arrays.keys() != set(_ARRAYS):
+        raise InputError(f"{path}: found arrays {sorted(arrays)[:3]}, expected {expected}")
+    arrays = {name: arrays[name] for name in _ARRAYS}
+    plain = value["config"] if form == FORMAT and "config" in value else value
     shape = arrays["components"].shape
     dim, length = shape if len(shape) == 2 else (0, 0)
     shapes = [array.shape for array in arrays.values()]

@@ -1,34 +1,141 @@
-"""Write files atomically, so that a reader never sees half of a file."""
+"""Read regular files, and write files so that a reader never sees half of one."""
 
 import contextlib
-import hashlib
+import errno
+import io
 import json
 import os
 import pathlib
 import re
 import shutil
+import stat
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.lib.format import dtype_to_descr, write_array_header_1_0
 
+from crisalad_jax.utils.checksums import CHECKSUM, check_sealed, sealed_json, tell_unchecked
 from crisalad_jax.utils.errors import InputError
 
 
 def check_source(path: str | os.PathLike[str], expected: str) -> None:
-    """Check that there is a file at `path`; `expected` says of what kind.
+    """Check that there is a regular file at `path`; `expected` says of what kind.
 
     Raises:
-        InputError: there is none, or a folder, or no file can have such a name.
+        InputError: there is none, or something that is no file: a folder, a pipe, a device. Opening
+            a pipe may wait for ever, and a device may never end.
     """
-    path = pathlib.Path(path)
+    found = _no_file(path)
+    if found is not None:
+        raise InputError(f"{path}: found {found}, expected {expected}")
+
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)
+
+
+def _no_file(path: str | os.PathLike[str]) -> str | None:
+    """Return what there is at `path` in place of a regular file; None where it is one."""
     try:
-        kind = "a folder" if path.is_dir() else None if path.is_file() else "no such file"
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
-    if kind is not None:
-        raise InputError(f"{path}: found {kind}, expected {expected}")
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return "no such file"
+    except OSError as error:
+        looped = error.errno == errno.ELOOP
+        return "links in a circle" if looped else f"a file that cannot be read ({error.strerror})"
+    except ValueError as error:
+        return f"a name that no file can have ({error})"
+    return next((words for is_kind, words in _KINDS if is_kind(mode)), None)
+
+
+def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
+    """Read a regular file.
+
+    Args:
+        path: the file.
+        expected: what kind of file, for messages.
+
+    Raises:
+        InputError: as `check_source`, or the file cannot be read.
+    """
+    check_source(path, expected)
+    try:
+        return pathlib.Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror}, expected {expected}"
+        ) from error
+
+
+def read_text(path: str | os.PathLike[str], expected: str) -> str:
+    """Read a regular file of UTF-8 text, with or without a byte order mark.
+
+    Raises:
+        InputError: as `read_bytes`, or other bytes.
+    """
+    try:
+        return read_bytes(path, expected).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: found bytes that are no UTF-8 (at {error.start}), expected {expected}"
+        ) from error
+
+
+def parse_json(text: str | bytes, source: str, expected: str) -> Any:
+    """Parse JSON.
+
+    Args:
+        text: the JSON.
+        source: what the message begins with, such as a file's name.
+        expected: what it should hold.
+
+    Raises:
+        InputError: it is no JSON, or is nested deeper than any that this package writes.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = "nested too deep" if isinstance(error, RecursionError) else error
+        raise InputError(f"{source}: found no JSON ({reason}), expected {expected}") from error
+
+
+def read_json(
+    path: str | os.PathLike[str],
+    expected: str,
+    *,
+    must: Callable[[Any], bool] = lambda _: False,
+    quiet: bool = False,
+) -> Any:
+    """Read the value of a JSON file, and check the checksum that `write_json` put into it.
+
+    Args:
+        path: the file.
+        expected: what kind of file, for messages.
+        must: whether a file with this value must hold a checksum.
+        quiet: whether to tell nothing of a file without one, which the caller then does.
+
+    Returns:
+        The value, without its checksum.
+
+    Raises:
+        InputError: as `read_bytes` and `parse_json`; or the bytes are not those that were written.
+    """
+    data = read_bytes(path, expected)
+    value = parse_json(data, str(path), expected)
+    if isinstance(value, dict) and CHECKSUM in value:
+        check_sealed(data, value.pop(CHECKSUM), path)
+    elif must(value):
+        raise InputError(f"{path}: found no checksum, expected {expected}")
+    elif not quiet:
+        tell_unchecked(path)
+    return value
 
 
 def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> None:
@@ -79,9 +186,77 @@ def remove_temporaries(folder: pathlib.Path) -> None:
             path.unlink()
 
 
+LOCK = ".crisalad-lock"
+"""Name of the file that a folder's writer locks (see `locks.one_writer`)."""
+
+
 def holds_other_files(folder: pathlib.Path) -> bool:
     """Return whether `folder` holds any file, hidden ones included, besides our temporary files."""
-    return not all(map(is_temporary, folder.iterdir()))
+    return not all(is_temporary(path) or path.name == LOCK for path in folder.iterdir())
+
+
+_in_use: set[pathlib.Path] = set()
+"""Temporary files and folders that a block of this process is using now."""
+
+
+@contextlib.contextmanager
+def in_use(path: pathlib.Path) -> Iterator[None]:
+    """Remove a temporary file or folder after the block, or when a signal ends the process."""
+    _in_use.add(path)
+    try:
+        yield
+    finally:
+        _remove(path)
+        _in_use.discard(path)
+
+
+def remove_all_in_use() -> None:
+    """Remove the temporary files of this process, which a signal is ending."""
+    for path in tuple(_in_use):
+        _remove(path)
+
+
+def _remove(path: pathlib.Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def made_folder(folder: pathlib.Path) -> Iterator[None]:
+    """Make a folder and its parents; if the block raises, remove those that are still empty.
+
+    Raises:
+        InputError: they cannot be made.
+    """
+    new = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot make this folder: {error.strerror}") from error
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for each in new:
+                each.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def told_of(path: pathlib.Path) -> Iterator[None]:
+    """Turn an error of the disk in this block into one line that names the file.
+
+    Raises:
+        InputError: in place of any `OSError`.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or " ".join(str(error).split())
+        raise InputError(f"{path}: cannot be written: {reason}") from error
 
 
 @contextlib.contextmanager
@@ -92,20 +267,15 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     made as needed.
 
     Raises:
-        InputError: what `check_target` raises.
+        InputError: what `check_target` raises; or the disk is full, or fails.
     """
     path = pathlib.Path(path)
     check_target(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot make this folder: {error.strerror}") from error
-    temporary = temporary_beside(path)
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with made_folder(path.parent), told_of(path):
+        temporary = temporary_beside(path)
+        with in_use(temporary):
+            yield temporary
+            os.replace(temporary, path)
 
 
 @contextlib.contextmanager
@@ -113,12 +283,14 @@ def durable_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Yield a temporary path as `atomic_path`, and sync the file to disk, safe from power failure.
 
     Raises:
-        InputError: what `check_target` raises.
+        InputError: as `atomic_path`.
     """
+    path = pathlib.Path(path)
     with atomic_path(path) as temporary:
         yield temporary
         _sync(temporary)
-    _sync(pathlib.Path(path).parent)
+    with told_of(path):
+        _sync(path.parent)
 
 
 def _sync(path: pathlib.Path) -> None:
@@ -138,34 +310,16 @@ def write_npy(path: pathlib.Path, array: np.ndarray) -> None:
     """
     array = np.ascontiguousarray(array)
     with path.open("wb") as file:
-        header = np.lib.format.header_data_from_array_1_0(array)
-        np.lib.format.write_array_header_1_0(file, header)
+        file.write(npy_header(array.dtype, array.shape))
         file.write(array.data)
 
 
-def write_safetensors(
-    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
-) -> None:
-    """Write arrays in C order and texts as a safetensors file, whole or not at all.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    import safetensors.numpy  # import here: only writers of weights need it
-
-    with atomic_path(path) as temporary:
-        try:
-            safetensors.numpy.save_file(dict(arrays), temporary, metadata=dict(metadata))
-        except safetensors.SafetensorError as error:  # a full disk too
-            raise InputError(f"{path}: cannot be written: {error}") from error
-        # The library creates files that only their owner can read: widen their mode.
-        temporary.chmod(0o644)
-
-
-def sha256_of(path: str | os.PathLike[str]) -> str:
-    """Compute the SHA-256 digest of a file's bytes, in hexadecimal digits."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def npy_header(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
+    """Return the bytes before the numbers of an array in C order in a .npy file."""
+    file = io.BytesIO()
+    values = {"descr": dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    write_array_header_1_0(file, values)
+    return file.getvalue()
 
 
 def around(page: pathlib.Path, name: str) -> tuple[str, str]:
@@ -192,16 +346,12 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     check_new_folder(path)
-    temporary = temporary_beside(path)
-    try:
-        temporary.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot make this folder: {error.strerror}") from error
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with made_folder(path.parent), told_of(path):
+        temporary = temporary_beside(path)
+        with in_use(temporary):
+            temporary.mkdir()
+            yield temporary
+            os.replace(temporary, path)
 
 
 def check_new_folder(path: str | os.PathLike[str]) -> None:
@@ -218,7 +368,12 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
         raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Write `value` as indented JSON, whole or not at all."""
+def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
+    """Write an object as indented JSON with its checksum, whole or not at all.
+
+    Raises:
+        InputError: as `atomic_path`.
+    """
+    data = sealed_json(value, indent=2)
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+        temporary.write_bytes(data)

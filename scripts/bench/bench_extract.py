@@ -52,7 +52,7 @@ from crisalad_jax.experiments import synthetic
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN, LOCAL_NOISE, LOCAL_WINDOW
 from crisalad_jax.retrieval import describe as describing
-from crisalad_jax.retrieval.descriptor_files import writer_for
+from crisalad_jax.retrieval.descriptor_files import write_descriptors
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.host import usable_cores
 
@@ -186,7 +186,7 @@ def by_torch(both: Sides, batch: int) -> list[Contender]:
                 missing = batch - len(images)
                 filled = torch.nn.functional.pad(images, (0, 0, 0, 0, 0, 0, 0, missing))
                 found.append(model(filled.to(device), alone)[: len(images)].cpu().numpy())
-        writer_for(out)(out, np.concatenate(found), names(folder, paths))
+        write_descriptors(out, np.concatenate(found), names(folder, paths))
 
     def load(folder: pathlib.Path, out: pathlib.Path, watch: Watch) -> None:
         for _ in watch.each(torch_batches(list_images(folder), both.config, batch)):
@@ -208,7 +208,7 @@ def by_us(both: Sides, batch: int) -> list[Contender]:
                 *model, paths, batch_size=batch, label="images", quiet=True
             )
         found = describing.group(*model, tokens, "single", batch_size=batch)
-        writer_for(out)(out, found, names(folder, paths))
+        write_descriptors(out, found, names(folder, paths))
 
     def load(folder: pathlib.Path, out: pathlib.Path, watch: Watch) -> None:
         size = both.config.image_size

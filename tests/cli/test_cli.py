@@ -445,7 +445,7 @@ def test_extract_computes_in_the_type_that_is_asked_for(capfd, tmp_path, shared)
     town = shared / "town"
     succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
     succeeds(capfd, *extract(shared, town, tmp_path / "n.npy", "--compute-dtype", "bfloat16"))
-    config = json.loads((tmp_path / "n.config.json").read_text())
+    config = json.loads((tmp_path / "n.npy.json").read_text())
     assert config["model"]["compute_dtype"] == "bfloat16"
     wide, narrow = (np.load(tmp_path / name) for name in ("d.npy", "n.npy"))
     assert np.abs(narrow - wide).max() > 1e-4  # float32 would be off by 1e-6
@@ -664,7 +664,7 @@ def described(params: Crisalad, paths: list[pathlib.Path]) -> np.ndarray:
     return np.stack(rows)
 
 
-@pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.config.json"])
+@pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.npy.json"])
 def test_extract_knows_at_once_that_one_of_its_files_cannot_be(capfd, tmp_path, shared, name):
     (tmp_path / name).mkdir()
     start = extract(shared, shared / "town", tmp_path / "d.npy")
@@ -685,14 +685,14 @@ def test_extract_writes_descriptors_names_and_configuration(capfd, tmp_path, sha
     town = shared / "town"
     out = succeeds(capfd, *extract(shared, town, tmp_path / "new" / "d.npy"))
     assert "12 descriptors of 48 numbers, grouping single (every image alone)" in out
-    assert files_in(tmp_path / "new") == {"d.npy", "d.names.txt", "d.config.json"}
+    assert files_in(tmp_path / "new") == {"d.npy", "d.names.txt", "d.npy.json"}
     names = (tmp_path / "new" / "d.names.txt").read_text().splitlines()
     assert names == sorted(path.relative_to(town).as_posix() for path in town.rglob("*.jpg"))
     found = np.load(tmp_path / "new" / "d.npy")
     np.testing.assert_allclose(
         found, described(params, [town / name for name in names]), atol=TOLERANCE, rtol=0
     )
-    config = json.loads((tmp_path / "new" / "d.config.json").read_text())
+    config = json.loads((tmp_path / "new" / "d.npy.json").read_text())
     assert config == {
         "weights": str(shared / "weights.safetensors"),
         "images": str(town),
@@ -705,7 +705,7 @@ def test_extract_writes_descriptors_names_and_configuration(capfd, tmp_path, sha
     }
 
     succeeds(capfd, *extract(shared, town, tmp_path / "h" / "d.h5"))
-    assert files_in(tmp_path / "h") == {"d.h5", "d.config.json"}
+    assert files_in(tmp_path / "h") == {"d.h5", "d.h5.json"}
     with h5py.File(tmp_path / "h" / "d.h5", "r") as file:
         for name, row in zip(names, found, strict=True):
             np.testing.assert_array_equal(file[name]["global_descriptor"][()], row)
@@ -797,7 +797,7 @@ def test_extract_skips_bad_images_and_says_so(capfd, tmp_path, shared, town, par
     np.testing.assert_allclose(
         np.load(tmp_path / "d.npy"), described(params, kept), atol=TOLERANCE, rtol=0
     )
-    skipped = json.loads((tmp_path / "d.config.json").read_text())["skipped"]
+    skipped = json.loads((tmp_path / "d.npy.json").read_text())["skipped"]
     assert [town / name for name in skipped] == [paths[0], paths[6], paths[11]]
 
 

@@ -15,7 +15,7 @@ import pytest
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.images import list_images
 from crisalad_jax.retrieval.describe import group, read_tokens
-from crisalad_jax.retrieval.descriptor_files import read_descriptors, writer_for
+from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
 from crisalad_jax.retrieval.maps.manifest import describe_map
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from tests.cli.test_cli import fails, files_in, succeeds
@@ -393,7 +393,7 @@ def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_pat
     ):
         fails(capfd, *extract(database, "x.h5", *more), words=(words,))
     short = tmp_path / "short.h5"
-    writer_for(short)(short, np.eye(3, dtype=np.float32), ["a", "b", "c"])
+    write_descriptors(short, np.eye(3, dtype=np.float32), ["a", "b", "c"])
     wrong = extract(database, "x.h5", "--pairs", two, "--database", short)
     fails(capfd, *wrong, words=("short.h5: found descriptors of 3 numbers, expected 48",))
     spaced = tmp_path / "images"

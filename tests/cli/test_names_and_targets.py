@@ -35,7 +35,7 @@ def test_a_name_that_is_no_line_of_text_is_refused_before_the_work(
     assert files_in(tmp_path / "out") == set()
 
 
-@pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.config.json"])
+@pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.npy.json"])
 def test_pairs_do_not_overwrite_what_extract_writes(capfd, tmp_path, shared, name):
     start = extract(shared, shared / "town", tmp_path / "d.npy", "--pairs", tmp_path / name)
     fails(capfd, *start, words=(f"--pairs: found {tmp_path / name}, which --out writes",))

@@ -40,7 +40,7 @@ def test_extract_writes_shorter_descriptors(capfd, tmp_path, shared):
     out = succeeds(capfd, *extract(shared, town, tmp_path / "s.npy", "--pca", components))
     assert "12 descriptors of 5 numbers" in out
     np.testing.assert_array_equal(np.load(tmp_path / "s.npy"), fitted.apply(whole))
-    config = json.loads((tmp_path / "s.config.json").read_text())
+    config = json.loads((tmp_path / "s.npy.json").read_text())
     assert config["pca"] == str(components)
 
 

@@ -7,7 +7,7 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from crisalad_jax.retrieval.descriptor_files import open_npy, read_descriptors, writer_for
+from crisalad_jax.retrieval.descriptor_files import open_npy, read_descriptors, write_descriptors
 from crisalad_jax.utils.errors import InputError
 
 NAMES = ["a.jpg", "summer/a.jpg", "summer/noon/with space.jpg", "Straße.jpg"]
@@ -20,18 +20,18 @@ def names_in(folder: pathlib.Path) -> set[str]:
 
 def test_npy_rows_follow_the_list_of_names(tmp_path):
     path = tmp_path / "new" / "map.npy"
-    writer_for(path)(path, DESCRIPTORS, NAMES)
+    write_descriptors(path, DESCRIPTORS, NAMES)
     found = np.load(path)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, DESCRIPTORS)
     listed = (tmp_path / "new" / "map.names.txt").read_text(encoding="utf-8")
     assert listed == "a.jpg\nsummer/a.jpg\nsummer/noon/with space.jpg\nStraße.jpg\n"
-    assert names_in(tmp_path / "new") == {"map.npy", "map.names.txt"}
+    assert names_in(tmp_path / "new") == {"map.npy", "map.names.txt", "map.npy.json"}
 
 
 def test_h5_has_a_group_an_image_as_hloc_wants(tmp_path):
     path = tmp_path / "features.h5"
-    writer_for(path)(path, DESCRIPTORS, NAMES)
+    write_descriptors(path, DESCRIPTORS, NAMES)
     with h5py.File(path, "r") as file:
         # hloc finds the images by walking to the datasets and taking the name of their group.
         found = []
@@ -43,37 +43,37 @@ def test_h5_has_a_group_an_image_as_hloc_wants(tmp_path):
             dataset = file[name]["global_descriptor"]
             assert (dataset.shape, dataset.dtype) == ((6,), np.float32)
             np.testing.assert_array_equal(dataset[()], expected)
-    assert names_in(tmp_path) == {"features.h5"}
+    assert names_in(tmp_path) == {"features.h5", "features.h5.json"}
 
 
 def test_h5_with_a_name_twice_is_not_written(tmp_path):
     path = tmp_path / "features.h5"
     with pytest.raises(InputError, match=r"features\.h5: found the image name 'a\.jpg' twice"):
-        writer_for(path)(path, DESCRIPTORS, ["a.jpg", "b.jpg", "c.jpg", "a.jpg"])
+        write_descriptors(path, DESCRIPTORS, ["a.jpg", "b.jpg", "c.jpg", "a.jpg"])
     assert names_in(tmp_path) == set()
 
 
 @pytest.mark.parametrize("suffix", ["npy", "h5"])
 def test_an_older_file_is_replaced(tmp_path, suffix):
     path = tmp_path / f"map.{suffix}"
-    writer_for(path)(path, DESCRIPTORS, NAMES)
+    write_descriptors(path, DESCRIPTORS, NAMES)
     first = path.read_bytes()
-    writer_for(path)(path, DESCRIPTORS[:1], NAMES[:1])
+    write_descriptors(path, DESCRIPTORS[:1], NAMES[:1])
     assert path.read_bytes() != first
-    writer_for(path)(path, DESCRIPTORS, NAMES)
+    write_descriptors(path, DESCRIPTORS, NAMES)
     assert len(path.read_bytes()) == len(first)
 
 
 @pytest.mark.parametrize("name", ["map.csv", "map", "map.npy.gz", "map.NPY"])
 def test_another_suffix_is_refused_before_any_work(name):
     with pytest.raises(InputError, match=rf"{name}: suffix.*expected one of \.h5, \.npy"):
-        writer_for(name)
+        write_descriptors(name)
 
 
 @pytest.mark.parametrize("suffix", ["npy", "h5"])
 def test_what_was_written_is_read(tmp_path, suffix):
     path = tmp_path / f"map.{suffix}"
-    writer_for(path)(path, DESCRIPTORS, NAMES)
+    write_descriptors(path, DESCRIPTORS, NAMES)
     names, descriptors = read_descriptors(path)
     found = dict(zip(names, descriptors, strict=True))
     assert set(found) == set(NAMES)

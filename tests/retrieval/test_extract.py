@@ -56,7 +56,7 @@ def test_into_a_file(params, town, expected, tmp_path):
     names, descriptors = read_descriptors(out)
     assert names == found.names
     np.testing.assert_array_equal(descriptors, expected)
-    record = json.loads((tmp_path / "new" / "d.config.json").read_text())
+    record = json.loads((tmp_path / "new" / "d.npy.json").read_text())
     assert (record["weights"], record["images"]) == ("w.safetensors", str(town))
     assert (record["seed"], record["grouping"], record["pca"]) == (3, "single", None)
 
@@ -73,7 +73,7 @@ def test_components_in_memory(params, town, expected, tmp_path):
     fitted = fit_pca(expected, 3)
     found = run(params, town, tmp_path / "d.npy", pca=fitted)
     np.testing.assert_array_equal(found.descriptors, fitted.apply(expected))
-    assert json.loads((tmp_path / "d.config.json").read_text())["pca"] == "3 components"
+    assert json.loads((tmp_path / "d.npy.json").read_text())["pca"] == "3 components"
     loose = fit_pca(expected, 3, PcaConfig(renormalise=False))
     with pytest.raises(InputError, match="--pairs: found components, which leaves lengths"):
         run(params, town, pca=loose, pairs=tmp_path / "pairs.txt")

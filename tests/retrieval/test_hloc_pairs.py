@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from crisalad_jax.retrieval.descriptor_files import read_descriptors, writer_for
+from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.utils.errors import InputError
 from tests.retrieval.maps.test_stores import unit_rows
@@ -75,7 +75,7 @@ def test_files_of_pairs_and_features_are_as_hloc_has_them(tmp_path, dtype):
     rows = unit_rows(7).astype(dtype)
     listed = ["q/1.jpg", "q/2.jpg", "db/a/1.jpg", "db/a/2.jpg", "db/é.jpg", "db/b.png", "db/c.jpg"]
     for name, part in (("q", slice(2)), ("db", slice(2, None))):
-        writer_for(tmp_path / f"{name}.h5")(tmp_path / f"{name}.h5", rows[part], listed[part])
+        write_descriptors(tmp_path / f"{name}.h5", rows[part], listed[part])
     sides = [read_descriptors(tmp_path / f"{name}.h5") for name in ("q", "db")]
     write_pairs(tmp_path / "pairs.txt", nearest_pairs(*sides[0], *sides[1], k=3))
     found = pairs_as_hloc_reads_them(tmp_path / "pairs.txt", tmp_path / "q.h5", tmp_path / "db.h5")

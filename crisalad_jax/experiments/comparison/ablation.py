@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import pathlib
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
@@ -21,7 +20,7 @@ from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import find_part, from_scratch, recipe
 from crisalad_jax.utils.compiler import jit
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.pytree import named_leaves
 
 AdapterKind = Literal["depthwise", "multi-resolution", "mlp", "none"]
@@ -179,15 +178,16 @@ def adapter_costs_once(out: pathlib.Path) -> list[AdapterCost]:
     """
     path = out / "adapters.json"
     if not path.exists():
-        write_json(path, [cost._asdict() for cost in adapter_costs()])
+        write_json(path, {"costs": [cost._asdict() for cost in adapter_costs()]})
+    value = read_json(path, "costs of adapters")
+    rows = value.get("costs") if isinstance(value, dict) else value
     try:
-        costs = [AdapterCost(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
-    except (OSError, ValueError, TypeError) as error:
+        return [AdapterCost(**row) for row in rows]
+    except TypeError as error:
         raise InputError(
-            f"{path}: cannot read these costs: {error}; delete it, and the same command makes it "
-            "anew"
+            f"{path}: found no costs of adapters ({error}), expected them; delete it, and the same "
+            "command makes it anew"
         ) from error
-    return costs
 
 
 def _model(kind: AdapterKind) -> ModelConfig:

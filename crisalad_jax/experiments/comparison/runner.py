@@ -10,7 +10,6 @@ OUT/speed.json                        the timing of all models
 
 import dataclasses
 import functools
-import json
 import pathlib
 import statistics
 import time
@@ -44,8 +43,9 @@ from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.run_files import checksum_of_benchmark, checksum_of_places
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
+from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, holds_other_files, sha256_of, write_json
+from crisalad_jax.utils.files import check_target, holds_other_files, read_json, write_json
 
 _ROUNDS = 5
 
@@ -77,7 +77,8 @@ def claim(out: pathlib.Path, prepared: Prepared) -> None:
         write_json(path, to_plain(config))
     behind, path = _behind(prepared), out / "behind.json"
     if path.exists():
-        changed = [name for name, digest in read_json(path).items() if behind.get(name) != digest]
+        there = read_result(path)
+        changed = [name for name, digest in there.items() if behind.get(name) != digest]
         if changed:
             raise InputError(
                 f"{out}: {', '.join(changed)}: found changed since this comparison began, expected "
@@ -270,9 +271,15 @@ def _count_sitting(folder: pathlib.Path) -> None:
     """Count a call that begins training, or resumes it after steps it had taken."""
     path, began = folder / "sittings.json", folder / "run" / "metrics.jsonl"
     if not path.exists():
-        write_json(path, 1)
+        write_json(path, {"sittings": 1})
     elif began.exists() and began.stat().st_size:
-        write_json(path, read_json(path) + 1)
+        write_json(path, {"sittings": _sittings(path) + 1})
+
+
+def _sittings(path: pathlib.Path) -> int:
+    """Read the number of sittings; the first version of the file held the number alone."""
+    value = read_json(path, "a number of sittings")
+    return value if isinstance(value, int) else read_result(path, sittings=int)["sittings"]
 
 
 def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) -> dict[str, Any]:
@@ -285,7 +292,7 @@ def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) ->
         "images": images,
         "step_seconds": statistics.median(seconds),
         "seconds_of_steps": sum(seconds),
-        "sittings": read_json(folder / "sittings.json"),
+        "sittings": _sittings(folder / "sittings.json"),
         "device": machine(),
     }
 
@@ -313,20 +320,25 @@ def _describing(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Call
 
 def read_race(out: pathlib.Path) -> tuple[Race, dict[str, Any]]:
     """Read the times that `carry_out` measured, and the rest of their record."""
-    record = read_json(out / "speed.json")
+    record = read_result(out / "speed.json", rounds=dict, device=str, absolute=bool, batch_size=int)
     return Race(record["rounds"]), record
 
 
-def read_json(path: pathlib.Path) -> Any:
+def read_result(path: pathlib.Path, **kinds: type) -> dict[str, Any]:
     """Read a file of results.
 
+    Args:
+        path: the file.
+        kinds: the type of each value that the caller needs, by key.
+
     Raises:
-        InputError: it cannot be read, or is no JSON.
+        InputError: it cannot be read, was changed, or lacks one of these values.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot read this result: {error}; delete it, and the same command makes it "
-            "anew"
-        ) from error
+        value = read_json(path, "a result of a comparison")
+        for key, kind in kinds.items():
+            if not isinstance(value, dict) or not isinstance(value.get(key), kind):
+                raise InputError(f"{path}: found no {key!r} of {kind.__name__}, expected it")
+    except InputError as error:
+        raise InputError(f"{error}; delete it, and the same command makes it anew") from error
+    return value

@@ -13,7 +13,12 @@ from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY
 from crisalad_jax.experiments.comparison.ablation import NOTES, AdapterCost
 from crisalad_jax.experiments.comparison.plan import Prepared, Variant, labels_of, short_names
-from crisalad_jax.experiments.comparison.runner import folder_of, read_json, read_race, result_path
+from crisalad_jax.experiments.comparison.runner import (
+    folder_of,
+    read_race,
+    read_result,
+    result_path,
+)
 from crisalad_jax.experiments.comparison.timing import Race
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.training.trainable import count_trainable
@@ -132,7 +137,15 @@ def _training_records(
     if not variant.trains:
         return []
     return [
-        read_json(folder_of(out, variant.run, seed) / "training.json")
+        read_result(
+            folder_of(out, variant.run, seed) / "training.json",
+            steps=int,
+            images=int,
+            step_seconds=float,
+            seconds_of_steps=float,
+            sittings=int,
+            device=str,
+        )
         for seed in variant.seeds(prepared.config.seeds)
     ]
 
@@ -171,7 +184,7 @@ def _recalls(
 
 
 def _checked(path: pathlib.Path, benchmark: Benchmark) -> dict[str, list[int]]:
-    result = read_json(path)
+    result = read_result(path, benchmark=str, queries=int, database=int, groupings=dict)
     expected = (benchmark.name, len(benchmark.queries), len(benchmark.database))
     if (result["benchmark"], result["queries"], result["database"]) != expected:
         raise InputError(

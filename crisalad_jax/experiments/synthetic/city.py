@@ -1,11 +1,9 @@
 """The city on disk: its views, its two layouts, and the check whether it can be reused."""
 
 import dataclasses
-import json
 import math
 import os
 import pathlib
-import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -28,7 +26,7 @@ from crisalad_jax.experiments.synthetic.view import (
     check_size,
 )
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.files import in_use, made_folder, read_json, told_of, write_json
 
 CITY_NAMES = ("Alderby", "Brackwater")
 """Names of the training cities, which are invented."""
@@ -105,12 +103,10 @@ def write_synthetic_city(
     total = config.train_places * config.images_per_place
     total += config.test_places * (config.database_per_place + config.queries_per_place)
     temporary = root.with_name(f".{root.name}.{uuid.uuid4().hex[:8]}")
-    try:
+    with made_folder(root.parent), in_use(temporary):
         for number, _ in enumerate(_write(temporary, root, config, identity), start=1):
             if progress is not None:
                 progress(number, total)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _write(
@@ -123,15 +119,13 @@ def _write(
     Raises:
         InputError: the city cannot be written there.
     """
-    try:
-        temporary.mkdir(parents=True)
+    with told_of(root):
+        temporary.mkdir()
         for city in range(len(CITY_NAMES)):
             yield from _write_train(temporary / "train", config, city)
         yield from _write_test(temporary / "test" / "images" / "test", config)
         write_json(temporary / "city.json", identity)
         os.replace(temporary, root)
-    except OSError as error:
-        raise InputError(f"{root}: cannot write the city here: {error.strerror}") from error
 
 
 def _holds(root: pathlib.Path, identity: dict) -> bool:
@@ -145,8 +139,8 @@ def _holds(root: pathlib.Path, identity: dict) -> bool:
     if not any(root.iterdir()):
         return False
     try:
-        existing = json.loads((root / "city.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        existing = read_json(root / "city.json", "a synthetic city")
+    except InputError:
         existing = None
     if existing == identity:
         return True

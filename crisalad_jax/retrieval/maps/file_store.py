@@ -1,6 +1,6 @@
 """Descriptors in .npy files, one for each addition, searched exactly by FAISS."""
 
-import bisect
+import math
 import pathlib
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.ties import lower_first
 from crisalad_jax.retrieval.search import Neighbours, exact_similarities, rounding
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import durable_path, write_npy
+from crisalad_jax.utils.files import check_source, durable_path, npy_header, write_npy
 
 _SPARE = 16
 """Number of candidates beyond k, for products that float32 cannot tell apart."""
@@ -27,8 +27,8 @@ class FileStore:
     def __init__(self, folder: pathlib.Path, length: int, dtype: str) -> None:
         """Open a folder of descriptors of `length` numbers; the first `add` makes the folder."""
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
-        names = (path.stem for path in folder.glob("*.npy") if path.stem.isdecimal())
-        self._firsts = sorted(map(int, names))
+        self._counts: dict[int, int] = {}
+        """Number of descriptors in each file, by the number of its first, in ascending order."""
 
     def _path(self, first: int) -> pathlib.Path:
         return self._folder / f"{first:010d}.npy"
@@ -36,37 +36,37 @@ class FileStore:
     def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
         """Write descriptors to a file; see `Store.add`."""
         path = self._path(first)
-        try:
-            with durable_path(path) as temporary:
-                write_npy(temporary, descriptors.astype(self._dtype))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-        # Files that a killed addition left may have these numbers already.
-        del self._firsts[bisect.bisect_left(self._firsts, first) :]
-        self._firsts.append(first)
+        with durable_path(path) as temporary:
+            write_npy(temporary, descriptors.astype(self._dtype))
+        self._counts[first] = len(descriptors)
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
         """Open the file of each addition; see `Store.check`."""
         for first, count in segments:
-            self._open(first, count)
+            self._counts[first] = count
+            self._open(first)
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         """Read the file of one addition; see `Store.read`."""
-        return np.array(self._open(first, count))
+        return np.array(self._open(first))
 
-    def _open(self, first: int, count: int | None = None) -> Float[np.ndarray, "n d"]:
+    def _open(self, first: int) -> Float[np.ndarray, "n d"]:
         path = self._path(first)
+        shape = (self._counts[first], self._length)
+        check_source(path, "a file of a map's descriptors")
+        header = npy_header(self._dtype, shape)
+        size = len(header) + math.prod(shape) * self._dtype.itemsize
         try:
-            rows = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            raise InputError(f"{path}: not a whole file of descriptors: {reason}") from error
-        expected = (len(rows) if count is None else count, self._length)
-        if rows.dtype != self._dtype or rows.shape != expected:
-            raise InputError(
-                f"{path}: found {rows.dtype} {rows.shape}, expected {self._dtype} {expected}"
-            )
-        return rows
+            with path.open("rb") as file:
+                begins = file.read(len(header))
+            if begins != header or path.stat().st_size != size:
+                raise InputError(
+                    f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole "
+                    ".npy file that was written"
+                )
+            return np.memmap(path, self._dtype, "r", len(header), shape)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
     def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`.
@@ -74,7 +74,7 @@ class FileStore:
         FAISS selects candidates by float32 products, whose rounding differs with the segment and
         the number of queries. Their similarities are then summed in float64 and rounded once.
         """
-        firsts = self._firsts[: bisect.bisect_left(self._firsts, count)]
+        firsts = [first for first in self._counts if first < count]
 
         def ask(queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
             return self._exact(queries, self._candidates(queries, k, firsts), firsts)

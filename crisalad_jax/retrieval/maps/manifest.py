@@ -3,11 +3,10 @@
 import contextlib
 import dataclasses
 import datetime
-import json
 import os
 import pathlib
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from crisalad_jax.checkpoints.weights import model_hash
@@ -15,15 +14,24 @@ from crisalad_jax.config.io import from_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.utils.checksums import sealed_json
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import durable_path, is_temporary, remove_temporaries
+from crisalad_jax.utils.files import (
+    LOCK,
+    durable_path,
+    is_temporary,
+    read_json,
+    remove_temporaries,
+)
 from crisalad_jax.utils.notes import tell
 
-FORMAT = 2
-"""Version of the format that this package writes, and the newest that it reads. Maps of format 1
-(package version 0.1) have a hash of all fields that a model had then."""
-DESCRIPTION, SEGMENTS, LOCK = "map.json", "segments", ".lock"
-"""Names of the description, of the folder of additions, and of the lock for appending."""
+FORMAT = 3
+"""Version of the format that this package writes, and the newest that it reads. Maps of format 2
+have records without checksums; those of format 1 (package version 0.1) also have a hash of all
+fields that a model had then."""
+DESCRIPTION, SEGMENTS, LOCKS = "map.json", "segments", (LOCK, ".lock")
+"""Names of the description, of the folder of additions, and of the locks for appending, today's
+first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,25 +92,22 @@ def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
     """
     folder = pathlib.Path(folder)
     path = folder / DESCRIPTION
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
+    if not path.is_file():
         if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: found a file, expected a map's folder") from None
+            raise InputError(f"{folder}: found a file, expected a map's folder")
         # A process killed before it has made the map leaves its lock and temporary files behind.
-        others = sorted(_others(folder, LOCK, SEGMENTS))
+        others = sorted(_others(folder, *LOCKS, SEGMENTS))
         if _others(folder / SEGMENTS):
             others.append(SEGMENTS)
         if others:
             raise InputError(
                 f"{folder}: found {others[0]} and no {DESCRIPTION}, expected a map or an empty "
                 "folder"
-            ) from None
+            )
         return None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot read this map: {error}") from error
-    version = value.get("format") if isinstance(value, dict) else None
-    if type(version) is int and version > FORMAT:
+    value = read_json(path, "a map", must=lambda value: is_checked(_version(value)), quiet=True)
+    version = _version(value)
+    if version > FORMAT:
         raise InputError(
             f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
             "crisalad-jax"
@@ -113,6 +118,17 @@ def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return description
+
+
+def _version(value: Any) -> int:
+    """Return the format that a description says; 0 where it says none."""
+    version = value.get("format") if isinstance(value, dict) else None
+    return version if type(version) is int else 0
+
+
+def is_checked(version: int) -> bool:
+    """Return whether the description and the records of a map of this format hold checksums."""
+    return version >= 3
 
 
 def _others(folder: pathlib.Path, *names: str) -> list[str]:
@@ -146,9 +162,9 @@ def _remove(folder: pathlib.Path) -> None:
     for path in segments.glob("[0-9]*.npy"):
         path.unlink()
     segments.rmdir()
-    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, LOCK}:
-        (folder / DESCRIPTION).unlink(missing_ok=True)
-        (folder / LOCK).unlink()
+    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, *LOCKS}:
+        for name in (DESCRIPTION, *LOCKS):
+            (folder / name).unlink(missing_ok=True)
         folder.rmdir()
 
 
@@ -162,7 +178,7 @@ def check_model(
     Raises:
         InputError: the hashes differ; the message has both.
     """
-    if description.format < FORMAT:
+    if description.format < 2:
         tell(
             f"{folder}: found a map of crisalad-jax 0.1, which cannot tell whether {weights} made "
             "it; `crisalad index` into a new folder makes one that can"
@@ -174,14 +190,12 @@ def check_model(
         )
 
 
-def write_record(path: pathlib.Path, value: Any, indent: int | None = None) -> None:
-    """Write JSON whole or not at all, and flush it to the disk.
+def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | None = None) -> None:
+    """Write an object as JSON with its checksum, whole or not at all, and flush it to the disk.
 
     Raises:
         InputError: the disk is full, or the folder cannot be written to.
     """
-    try:
-        with durable_path(path) as temporary:
-            temporary.write_text(json.dumps(value, indent=indent) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    data = sealed_json(value, indent)
+    with durable_path(path) as temporary:
+        temporary.write_bytes(data)

@@ -7,7 +7,6 @@ is as it was before the addition or after it. docs/maps.md has the format.
 
 import contextlib
 import hashlib
-import json
 import os
 import pathlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,19 +22,21 @@ from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.manifest import (
     DESCRIPTION,
-    LOCK,
     SEGMENTS,
     MapDescription,
     check_model,
     has_images,
+    is_checked,
     read_description,
     undone_without_images,
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import Store, open_store
 from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import remove_temporaries
+from crisalad_jax.utils.files import read_json, remove_temporaries
+from crisalad_jax.utils.locks import one_writer
 
 
 class MapImage(NamedTuple):
@@ -83,23 +84,33 @@ class Map:
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
-        for path in sorted((folder / SEGMENTS).glob("[0-9]*.json")):
+        # A writer adds records in order, so those that are listed now have all before them. It may
+        # add more while they are read.
+        listed = set((folder / SEGMENTS).glob("[0-9]*.json"))
+        while (path := self._record(len(self))).exists():
             self._read_record(path)
+            listed.discard(path)
+        if listed:
+            raise InputError(f"{min(listed)}: expected {path.name} before it, found no such file")
+        if not is_checked(description.format):
+            tell_unchecked(folder)
         store.check([(first, count) for first, count, _ in self._segments])
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str]) -> Self:
+    def open(cls, folder: str | os.PathLike[str], *, verify: bool = True) -> Self:
         """Open a map to search it as it is now; images appended meanwhile are not seen.
 
         Args:
             folder: what `index` made.
+            verify: whether to read all descriptors that are in files, as `verify` does; records
+                are always checked.
 
         Returns:
             The map, a context manager that lets go of its store.
 
         Raises:
-            InputError: there is no map, it has no images yet, or it or its store is damaged, gone,
-                or of a newer version.
+            InputError: there is no map, it has no images yet, or it or its store is damaged,
+                changed, gone, or of a newer version.
 
         Example:
             >>> with Map.open("no-map") as places:
@@ -116,7 +127,14 @@ class Map:
             )
         if not has_images(folder):
             raise InputError(f"{folder}: found a map without images, expected at least one")
-        return cls._opened(folder, description)
+        opened = cls._opened(folder, description)
+        try:
+            if verify and description.store == "files":
+                opened.verify()
+        except BaseException:
+            opened.close()
+            raise
+        return opened
 
     @classmethod
     def _opened(cls, folder: pathlib.Path, description: MapDescription) -> Self:
@@ -155,10 +173,13 @@ class Map:
         return self.folder / SEGMENTS / f"{first:010d}.json"
 
     def _read_record(self, path: pathlib.Path) -> None:
-        if path != self._record(len(self)):
-            raise InputError(f"{path}: expected {self._record(len(self)).name} before it")
+        record = read_json(
+            path,
+            "a record of images",
+            must=lambda _: is_checked(self.description.format),
+            quiet=True,
+        )
         try:
-            record = json.loads(path.read_text(encoding="utf-8"))
             columns = (record["names"], record["bytes"], record["positions"])
             images = [
                 MapImage(str(name), int(size), at and (float(at[0]), float(at[1])), record["root"])
@@ -166,7 +187,9 @@ class Map:
             ]
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
             segment = _Segment(len(self), len(images), str(record["sha256"]))
-        except (OSError, ValueError, LookupError, TypeError) as error:
+            if not images:
+                raise ValueError("no images")
+        except (ValueError, LookupError, TypeError) as error:
             raise InputError(f"{path}: not a whole record of images: {error!r}") from error
         self._take(images, axes, segment)
 
@@ -375,9 +398,9 @@ def open_for_appending(
     with contextlib.ExitStack() as stack:
         try:
             (folder / SEGMENTS).mkdir(parents=True, exist_ok=True)
-            stack.enter_context(_locked(folder))
         except OSError as error:
             raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+        stack.enter_context(one_writer(folder))
         existing = read_description(folder)
         remove_temporaries(folder / SEGMENTS)
         stack.enter_context(undone_without_images(folder))
@@ -386,22 +409,3 @@ def open_for_appending(
                 raise InputError(f"{folder}: found another map than was expected here")
             write_record(folder / DESCRIPTION, to_plain(description), indent=2)
         yield stack.enter_context(Map._opened(folder, description))
-
-
-@contextlib.contextmanager
-def _locked(folder: pathlib.Path) -> Iterator[None]:
-    """Hold the map's lock; it is released at the end of the process at the latest."""
-    import fcntl
-
-    taken = InputError(
-        f"{folder}: another process is appending to this map, expected to be the only one"
-    )
-    with (folder / LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise taken from error
-        # Another process may have removed the map with its lock since this one opened the lock.
-        if os.fstat(file.fileno()).st_nlink == 0:
-            raise taken
-        yield

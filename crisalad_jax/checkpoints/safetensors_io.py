@@ -1,0 +1,112 @@
+"""Read and write safetensors files: arrays by name, and one object of JSON with a checksum."""
+
+import json
+import os
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from crisalad_jax.utils.checksums import BLANK, CHECKSUM, seal_safetensors, tell_unchecked
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path, check_source, parse_json
+
+
+class Contents(NamedTuple):
+    """What a file holds."""
+
+    format: str
+    value: Any
+    """The object beside the arrays, without its checksum."""
+    arrays: dict[str, np.ndarray]
+
+
+def write_safetensors(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
+) -> None:
+    """Write arrays in C order and texts as a safetensors file, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        _write(pathlib.Path(path), temporary, arrays, metadata)
+
+
+def write_sealed(
+    path: str | os.PathLike[str],
+    arrays: Mapping[str, np.ndarray],
+    form: str,
+    value: Mapping[str, Any],
+) -> None:
+    """Write arrays and an object with the file's checksum, whole or not at all.
+
+    Args:
+        path: the file.
+        arrays: in C order, by name.
+        form: the format and its version, the one key of the metadata: safetensors keeps no order of
+            several.
+        value: the object, as JSON values.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    metadata = {form: json.dumps({CHECKSUM: BLANK} | dict(value))}
+    with atomic_path(path) as temporary:
+        _write(pathlib.Path(path), temporary, arrays, metadata)
+        seal_safetensors(temporary)
+
+
+def _write(
+    path: pathlib.Path,
+    temporary: pathlib.Path,
+    arrays: Mapping[str, np.ndarray],
+    metadata: Mapping[str, str],
+) -> None:
+    try:
+        safetensors.numpy.save_file(dict(arrays), temporary, metadata=dict(metadata))
+    except safetensors.SafetensorError as error:  # a full disk too
+        raise InputError(f"{path}: cannot be written: {error}") from error
+    # The library creates files that only their owner can read: widen their mode.
+    temporary.chmod(0o644)
+
+
+def read_sealed(
+    path: pathlib.Path, forms: Sequence[str], expected: str, *, but: str = "\0"
+) -> Contents:
+    """Read a file that `write_sealed` wrote; `checksums.checked_safetensors` checks its bytes.
+
+    Args:
+        path: the file.
+        forms: formats, today's first. Files of others may lack a checksum: a note tells of one that
+            does.
+        expected: what kind of file, for messages.
+        but: beginning of the names of arrays that are not read.
+
+    Raises:
+        InputError: the file is missing, not whole, of another format, or lacks its checksum.
+    """
+    check_source(path, expected)
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            form = next((form for form in forms if form in metadata), None)
+            if form is None:
+                raise InputError(f"{path}: found metadata {sorted(metadata)}, expected {expected}")
+            names = [name for name in file.keys() if not name.startswith(but)]  # noqa: SIM118
+            arrays = {name: file.get_tensor(name) for name in names}
+    except (safetensors.SafetensorError, OSError) as error:
+        raise InputError(
+            f"{path}: not a whole safetensors file ({error}), expected {expected}"
+        ) from error
+    value = parse_json(metadata[form], f"{path} (metadata)", expected)
+    if isinstance(value, dict) and CHECKSUM in value:
+        del value[CHECKSUM]
+    elif form == forms[0]:
+        raise InputError(f"{path} (metadata): found no {CHECKSUM}, expected one in {form!r}")
+    else:
+        tell_unchecked(path)
+    return Contents(form, value, arrays)

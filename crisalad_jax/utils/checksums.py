@@ -1,0 +1,136 @@
+"""Checksums: a file that this package writes holds the SHA-256 of its own bytes.
+
+The digest stands in the file's text, and is computed as if its digits were zeros there. So every
+byte of the file counts, and one rule serves JSON and the metadata of safetensors.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import pathlib
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
+
+CHECKSUM = "checksum"
+"""Key of the digest, the first of its object."""
+BLANK = "0" * 64
+_HEADER_LIMIT = 2**27
+"""Largest header of a safetensors file in bytes; the library allows 100 MB."""
+
+
+def sha256_of(path: str | os.PathLike[str]) -> str:
+    """Compute the SHA-256 digest of a file's bytes, in hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sealed_json(value: Mapping[str, Any], indent: int | None = None) -> bytes:
+    """Return an object as the bytes of a JSON file, with its checksum ahead of all other keys."""
+    data = (json.dumps({CHECKSUM: BLANK} | dict(value), indent=indent) + "\n").encode()
+    return data.replace(BLANK.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
+
+
+def check_sealed(data: bytes, digest: Any, path: object) -> None:
+    """Check that a file's bytes have the checksum that stands in them.
+
+    Args:
+        data: the bytes.
+        digest: the value at `CHECKSUM` among them.
+        path: the file, for the message.
+
+    Raises:
+        InputError: they do not.
+    """
+    if not _is_digest(digest):
+        raise InputError(f"{path}: found checksum {digest!r}, expected 64 hexadecimal digits")
+    blank = data.replace(digest.encode(), BLANK.encode(), 1)
+    if hashlib.sha256(blank).hexdigest() != digest:
+        raise changed(path)
+
+
+def changed(path: object) -> InputError:
+    """Return the error of a file whose bytes do not have their checksum."""
+    return InputError(
+        f"{path}: found other bytes than were written, expected those of its checksum "
+        "(SHA-256): the file is damaged or was changed"
+    )
+
+
+def tell_unchecked(path: object) -> None:
+    """Tell that a file of an earlier version holds no checksum."""
+    tell(f"{path}: found no checksum, as in files of earlier versions; its bytes are not checked")
+
+
+def _is_digest(value: Any) -> bool:
+    digits = "0123456789abcdef"
+    return isinstance(value, str) and len(value) == 64 and all(each in digits for each in value)
+
+
+def seal_safetensors(path: pathlib.Path) -> None:
+    """Replace the zeros in the metadata of a safetensors file by the checksum of the file."""
+    header = _header_of(path)
+    place = header.index(BLANK.encode())
+    digest = sha256_of(path)
+    with path.open("r+b") as file:
+        file.seek(place)
+        file.write(digest.encode())
+
+
+@contextlib.contextmanager
+def checked_safetensors(path: pathlib.Path, *, verify: bool) -> Iterator[None]:
+    """Check a safetensors file's checksum in a thread, while the block reads the file.
+
+    A file without a checksum passes: the block knows which formats have one.
+
+    Raises:
+        InputError: the file has other bytes than its checksum says; also in place of any other
+            `InputError` of the block.
+    """
+    if not verify:
+        yield
+        return
+    with ThreadPoolExecutor(1) as thread:
+        right = thread.submit(_safetensors_are_right, path)
+        try:
+            yield
+        except InputError as error:
+            if not right.result():
+                raise changed(path) from error
+            raise
+        if not right.result():
+            raise changed(path)
+
+
+def _safetensors_are_right(path: pathlib.Path) -> bool:
+    """Return whether a file has its checksum; True where it holds none that can be read."""
+    try:
+        header = _header_of(path)
+        metadata = json.loads(header[8:])["__metadata__"]
+        (digest,) = (json.loads(text)[CHECKSUM] for text in metadata.values())
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return True
+    if not _is_digest(digest) or digest.encode() not in header:
+        return False
+    # A file object's position tells where the rest of the digest begins.
+    digester = hashlib.sha256(header.replace(digest.encode(), BLANK.encode(), 1))
+    with path.open("rb") as file:
+        file.seek(len(header))
+        buffer = memoryview(bytearray(2**20))
+        while count := file.readinto(buffer):
+            digester.update(buffer[:count])
+    return digester.hexdigest() == digest
+
+
+def _header_of(path: pathlib.Path) -> bytes:
+    """Read the length and the JSON at the beginning of a safetensors file."""
+    with path.open("rb") as file:
+        length = file.read(8)
+        count = int.from_bytes(length, "little")
+        if count > _HEADER_LIMIT:
+            raise ValueError("no header of a safetensors file")
+        return length + file.read(count)

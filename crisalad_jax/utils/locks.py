@@ -1,0 +1,66 @@
+"""Locks of folders: one process at a time writes into a run, a map, a comparison or a report."""
+
+import contextlib
+import os
+import pathlib
+import socket
+from collections.abc import Iterator
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import LOCK, in_use, made_folder
+
+
+@contextlib.contextmanager
+def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold the lock of a folder, which is made if needed, while the block writes into it.
+
+    The kernel releases the lock at the end of the process at the latest, so a killed process never
+    blocks the next one.
+
+    Raises:
+        InputError: another process holds it; the message says which, on which host. Or the folder
+            cannot be made or written to.
+    """
+    import fcntl
+
+    folder = pathlib.Path(folder)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(made_folder(folder))
+        path = folder / LOCK
+        try:
+            while True:
+                file = stack.enter_context(path.open("a+", encoding="utf-8"))
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise InputError(
+                        f"{folder}: found another process that writes here{_holder(path)}, "
+                        "expected to be the only one"
+                    ) from error
+                # The last holder may have removed the file between the two calls.
+                if _is_still(path, file.fileno()):
+                    break
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            file.flush()
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+        with in_use(path):
+            yield
+
+
+def _holder(path: pathlib.Path) -> str:
+    """Return the words of a lock's holder in brackets; nothing while it is still writing them."""
+    try:
+        words = path.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
+    return f" ({words})" if words else ""
+
+
+def _is_still(path: pathlib.Path, descriptor: int) -> bool:
+    """Return whether the open file is the one with this name."""
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
