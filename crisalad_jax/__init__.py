@@ -7,6 +7,7 @@ reading pictures takes no jax and a model no file formats.
 import ast
 import importlib
 import operator
+import os
 import pathlib
 import sys
 import warnings
@@ -16,6 +17,8 @@ from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.version import VERSION
 
 __version__ = VERSION
+# OpenCV reads this limit when it is imported; see `data.opencv`.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
 
 
 def _homes() -> dict[str, tuple[str, str | None]]:

@@ -1,7 +1,22 @@
-"""`python -m crisalad_jax` is the command line."""
+"""The program `crisalad`, also `python -m crisalad_jax`: the command line as a process."""
 
 import sys
 
-from crisalad_jax.cli import main
+from crisalad_jax.utils.output import keep_on_without_reader
+from crisalad_jax.utils.signals import end_at_signals
 
-sys.exit(main())
+
+def main() -> None:
+    """Run the command that the arguments name, and end the process with its exit code."""
+    end_at_signals()
+    keep_on_without_reader()
+    # Imported after signals are handled, because it takes a while.
+    from crisalad_jax.cli import main as run_command
+
+    code = run_command()
+    sys.stdout.flush()
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

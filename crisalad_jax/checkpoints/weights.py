@@ -117,9 +117,9 @@ def load_weights(
 
     Raises:
         InputError: the file is missing, changed, cut short or no such file; it needs a part that is
-            not registered; its parameters do not fit its configuration or are not finite (all that are
-            missing, unknown or wrong are listed); its configuration is not `expected` (all fields
-            that differ are listed); or AnyLoc's vocabulary is of another backbone.
+            not registered; its parameters do not fit its configuration or are not finite (all that
+            are missing, unknown or wrong are listed); its configuration is not `expected` (all
+            fields that differ are listed); or AnyLoc's vocabulary is of another backbone.
 
     Example:
         >>> load_weights("none.safetensors")

@@ -1,7 +1,7 @@
 """The command line: parse, make a configuration, call the library; a module for each command.
 
 Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupted, 143 ended by
-SIGTERM with its work saved, 141 the reader of the output is gone, 1 anything else.
+SIGTERM, 129 by SIGHUP, 1 anything else.
 """
 
 import contextlib
@@ -9,7 +9,6 @@ import importlib
 import io
 import itertools
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -20,6 +19,7 @@ from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_f
 from crisalad_jax.utils.errors import InputError, Stopped
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import one_line, printable
 from crisalad_jax.utils.version import VERSION
 
 _COMMANDS = {
@@ -111,10 +111,25 @@ def _load_plugins(given: Sequence[str]) -> None:
             load_plugin(argument)
 
 
+def _limit_pixels(given: Sequence[str]) -> None:
+    """Set the largest image that OpenCV decodes, before OpenCV is imported."""
+    from crisalad_jax.cli.flags import find_flag
+
+    pixels = find_flag(given, "--max-pixels")
+    if pixels is not None:
+        require(
+            pixels.isdecimal() and 0 < int(pixels) < 2**40,
+            f"--max-pixels: found {pixels!r}, expected a number of pixels",
+        )
+        os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = pixels
+
+
 def _run(name: str, given: list[str]) -> None:
     from crisalad_jax.cli import renamed
     from crisalad_jax.utils import compiler
 
+    require("" not in given, "arguments: found an empty one, expected a value")
+    _limit_pixels(given)
     _load_plugins(given)
     arguments = renamed.today(given, lambda line: print(f"crisalad: note: {line}", file=sys.stderr))
     module = importlib.import_module(f"{__name__}.{name}")
@@ -126,7 +141,7 @@ def _run(name: str, given: list[str]) -> None:
 def _show_note(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:
     """Print a note in one line; other warnings stay as Python shows them."""
     if issubclass(category, Note):
-        print(f"crisalad: note: {message}", file=sys.stderr)
+        print(f"crisalad: note: {one_line(message)}", file=sys.stderr)
     else:
         _show_warning(message, category, *rest, **more)
 
@@ -156,12 +171,11 @@ def _exit_code(given: list[str]) -> int:
     except ModuleNotFoundError as error:
         print(f"crisalad: {missing_extra(error, f'crisalad {given[0]}')}", file=sys.stderr)
         return 2
-    except BrokenPipeError:  # as of `crisalad train --help | head`
-        # Else Python would complain when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
     except (InputError, OSError) as error:  # OSError: a full disk, or a fault that no check foresaw
-        print("crisalad:", *str(error).splitlines(), file=sys.stderr)
+        print("crisalad:", one_line(error), file=sys.stderr)
+        return 2
+    except MemoryError:
+        print(f"crisalad: {_OUT_OF_MEMORY}", file=sys.stderr)
         return 2
     except SystemExit as stop:  # from tyro, after --help
         return _tell_of_plugin(stop) or 0
@@ -173,10 +187,24 @@ def _exit_code(given: list[str]) -> int:
         return 130
     except Exception as error:
         code = _tell_of_plugin(error)
+        if code is None and _is_out_of_memory(error):
+            print(f"crisalad: {_OUT_OF_MEMORY}", file=sys.stderr)
+            return 2
         if code is None:
             raise
         return code
     return 0
+
+
+_OUT_OF_MEMORY = (
+    "found not enough memory, expected more, or a smaller --batch-size, --image-size or model"
+)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Return whether the system or a device had no memory left: XLA and OpenCV say it in words."""
+    words = str(error)
+    return any(each in words for each in ("RESOURCE_EXHAUSTED", "Insufficient memory", "bad_alloc"))
 
 
 def _tell_of_plugin(error: BaseException) -> int | None:
@@ -184,5 +212,5 @@ def _tell_of_plugin(error: BaseException) -> int | None:
     failure = plugin_failure(error)
     if failure is None:
         return None
-    print(f"crisalad: {failure} (from Python you see the traceback)", file=sys.stderr)
+    print(f"crisalad: {printable(failure)} (from Python you see the traceback)", file=sys.stderr)
     return 2

@@ -1,9 +1,11 @@
 """Helpers of several commands: the terminal, and loading a model as their flags name it."""
 
 import dataclasses
+import json
+import pathlib
 import sys
-from pathlib import Path
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import jax
 import rich.console
@@ -12,6 +14,8 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils.files import check_target, write_json
+from crisalad_jax.utils.output import printable
 
 # Into a file or a pipe, wide enough that tables do not wrap. Brackets and colons in names are text.
 console = rich.console.Console(
@@ -21,11 +25,42 @@ console = rich.console.Console(
 
 def say(line: str) -> None:
     """Print a line without wrapping it to the terminal's width."""
-    console.print(line, soft_wrap=True, highlight=False)
+    console.print(printable(line), soft_wrap=True, highlight=False)
+
+
+STDOUT = pathlib.Path("-")
+"""Name of the terminal, or of what reads the output, in place of a file of JSON."""
+
+
+def talk_beside(file: pathlib.Path | None) -> None:
+    """Say everything on standard error where JSON is printed on standard output."""
+    console.stderr = file == STDOUT
+
+
+def write_or_print_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
+    """Write an object as JSON, or print it where the file is `STDOUT`.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    if path == STDOUT:
+        print(json.dumps(value, indent=2))
+    else:
+        write_json(path, value)
+
+
+def check_json(path: pathlib.Path | None) -> None:
+    """Check that `write_or_print_json` can write the file, before any work.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if path is not None and path != STDOUT:
+        check_target(path)
 
 
 def load_model(
-    weights: Path | None,
+    weights: pathlib.Path | None,
     *,
     preset: str = "b14",
     seed: int = 0,

@@ -41,6 +41,8 @@ class ComparisonFlags:
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False

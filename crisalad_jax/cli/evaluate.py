@@ -5,11 +5,18 @@ import pathlib
 from typing import Literal
 
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import console, load_model, say
+from crisalad_jax.cli.common import (
+    check_json,
+    console,
+    load_model,
+    say,
+    talk_beside,
+    write_or_print_json,
+)
 from crisalad_jax.cli.tables import grouping_table
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.evaluation.record import evaluation_settings, table_notes, write_results
+from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
 from crisalad_jax.evaluation.similarity import FirstSimilarities
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS, check_grouping, parse_groupings
@@ -17,6 +24,7 @@ from crisalad_jax.retrieval.pca import load_pca
 from crisalad_jax.retrieval.reranking import Reranking, parse_reranking
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
+from crisalad_jax.utils.locks import staged_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +83,8 @@ class Evaluate:
     its pictures."""
     json: pathlib.Path | None = None
     """File for the table as JSON."""
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
@@ -87,6 +97,7 @@ def run(arguments: Evaluate) -> None:
     parse_groupings(groupings)
     check_grouping((), arguments.batch_size, arguments.seed, arguments.seeds)
     _check_files(arguments)
+    talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
     params, config, model_name = load_model(
@@ -142,12 +153,14 @@ def run(arguments: Evaluate) -> None:
     for note in table_notes(results, settings):
         say(note)
     if arguments.json is not None:
-        write_results(arguments.json, results, settings, model_name=model_name)
+        values = results_json(results, settings, model_name=model_name)
+        write_or_print_json(arguments.json, values)
     if arguments.out is not None:
         from crisalad_jax.experiments.report import write_galleries
 
-        write_galleries(arguments.out, benchmark, results, model_name=model_name)
-        write_json(arguments.out / "config.json", settings)
+        with staged_folder(arguments.out) as folder:
+            write_galleries(folder, benchmark, results, model_name=model_name)
+            write_json(folder / "config.json", settings)
     if arguments.report is not None:
         from crisalad_jax.experiments.report import write_report
 
@@ -166,8 +179,7 @@ def run(arguments: Evaluate) -> None:
 
 def _check_files(arguments: Evaluate) -> None:
     """Check before any work that files can be written and flags go together."""
-    if arguments.json is not None:
-        check_target(arguments.json)
+    check_json(arguments.json)
     if arguments.out is not None:
         check_target(arguments.out / "config.json")
     if arguments.report is not None:

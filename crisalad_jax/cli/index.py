@@ -35,6 +35,8 @@ class Index:
     """Type of the matrix products, by default the map's, and in a new map the model's."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False

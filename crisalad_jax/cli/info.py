@@ -5,7 +5,13 @@ import pathlib
 from typing import Any
 
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import console, say
+from crisalad_jax.cli.common import (
+    check_json,
+    console,
+    say,
+    talk_beside,
+    write_or_print_json,
+)
 from crisalad_jax.cli.tables import summary_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.recipes import recipe
@@ -15,7 +21,6 @@ from crisalad_jax.training.summary import (
     summary_lines,
 )
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, write_json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +43,7 @@ class Info:
     batch_size: int = 16
     """Images that look at each other in the cross-image encoder."""
     json: pathlib.Path | None = None
-    """File for the table as JSON."""
+    """File for the table as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
 
@@ -47,11 +52,11 @@ def run(arguments: Info) -> None:
     """Print the table of a model or a map, and write it as JSON where that is asked for."""
     if arguments.verify and arguments.map is None:
         raise InputError("--verify: found without --map, expected both")
-    if arguments.json is not None:
-        check_target(arguments.json)
+    check_json(arguments.json)
+    talk_beside(arguments.json)
     values = _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
     if arguments.json is not None:
-        write_json(arguments.json, values)
+        write_or_print_json(arguments.json, values)
 
 
 def _model(arguments: Info) -> dict[str, Any]:

@@ -6,12 +6,12 @@ from typing import Annotated
 
 import tyro
 
-from crisalad_jax.cli.common import console, say
+from crisalad_jax.cli.common import STDOUT, console, say, talk_beside
 from crisalad_jax.cli.tables import answers_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target
+from crisalad_jax.utils.files import check_target, real_path
 
 _ROWS = 24
 """Largest number of queries in a gallery."""
@@ -41,6 +41,8 @@ class Query:
     """Folder of the map's images, for the gallery, if they are not where they were."""
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
@@ -49,7 +51,8 @@ class Query:
 
 def run(arguments: Query) -> None:
     """Query the map, and print or write its answers."""
-    file = None if arguments.json == pathlib.Path("-") else arguments.json
+    file = None if arguments.json == STDOUT else arguments.json
+    talk_beside(arguments.json)
     _check_files(file, arguments)
     with Map.open(arguments.map) as places:
         answers = query(
@@ -94,5 +97,5 @@ def _check_files(file: pathlib.Path | None, arguments: Query) -> None:
         check_target(gallery)
     elif arguments.map_images is not None:
         raise InputError("--map-images: found without --gallery, expected both")
-    if gallery is not None and file is not None and file.resolve() == gallery.resolve():
+    if gallery is not None and file is not None and real_path(file) == real_path(gallery):
         raise InputError(f"--gallery: found {gallery}, as --json, expected two files")

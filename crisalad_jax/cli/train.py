@@ -42,6 +42,8 @@ class Train:
     the paper's way with that part in place."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     image_size: tuple[int, int] | None = None
@@ -100,7 +102,7 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
         for flag in ("--preset", "--recipe"):
             if find_flag(arguments, flag) is not None:
                 raise InputError(f"{flag}: found beside --config, expected only one of the two")
-        return read_config(TrainConfig, pathlib.Path(given))
+        return read_config(TrainConfig, pathlib.Path(given), quiet=True)
     return recipe(find_flag(arguments, "--preset") or "b14", find_flag(arguments, "--recipe"))
 
 

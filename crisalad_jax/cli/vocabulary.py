@@ -52,6 +52,8 @@ class Vocabulary:
     """Stop at an unreadable image, or leave it out."""
     seed: int = 0
     """Draws the images, patches of each, the first centroids, and a random backbone."""
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False

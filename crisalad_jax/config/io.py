@@ -12,6 +12,7 @@ import numpy as np
 
 from crisalad_jax.config.aliases import upgrade
 from crisalad_jax.config.parts import Part
+from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 
@@ -148,14 +149,22 @@ def _sequence(
     )
 
 
-def read_config(kind: type[_T], path: pathlib.Path) -> _T:
-    """Read a configuration that a run wrote.
+def read_config(kind: type[_T], path: pathlib.Path, *, quiet: bool = False) -> _T:
+    """Read a configuration that a run wrote, or, without a checksum, that a user wrote.
+
+    Args:
+        kind: its class.
+        path: the file.
+        quiet: whether to tell nothing of a file without a checksum.
 
     Raises:
         InputError: the file is missing, is not JSON, was changed since it was written, or holds
             another configuration.
     """
-    value = read_json(path, "a configuration as JSON")
+    try:
+        value = read_json(path, "a configuration as JSON", quiet=quiet)
+    except ChangedFileError as error:
+        raise InputError(f"{error}; to use it as it is, remove the line {CHECKSUM!r}") from error
     return from_plain(kind, value, source=str(path))
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from types import ModuleType
 
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import real_path
 
 ENTRY_POINTS = "crisalad_jax.plugins"
 """Group of entry points under which an installed package names its modules of parts."""
@@ -69,7 +70,7 @@ def _load_file(file: str) -> None:
     path = pathlib.Path(file)
     if not path.is_file():
         raise InputError("found no such file, expected FILE.py or MODULE")
-    path = path.resolve()
+    path = real_path(path)
     # Give files of the same name different modules.
     name = f"crisalad_plugin_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     if name in sys.modules:

@@ -12,11 +12,26 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from crisalad_jax.data.opencv import QUIET
+from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_bytes, real_path
+from crisalad_jax.utils.notes import tell
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 """Suffixes of images for `list_images`, in lower case. Decoding goes by content, not by suffix."""
+_OTHER_SUFFIXES = (
+    ".heic",
+    ".heif",
+    ".avif",
+    ".gif",
+    ".jp2",
+    ".jxl",
+    ".dng",
+    ".cr2",
+    ".nef",
+    ".arw",
+)
+"""Suffixes of images that are not read, so that folders of them are told of."""
 
 _FORMATS = "a JPEG, PNG, WebP, BMP or TIFF image"
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -56,19 +71,14 @@ def read_image(
         The image, in red, green and blue.
 
     Raises:
-        InputError: the file is missing, a folder, empty, cut short, larger than OpenCV's limit of
-            2**30 pixels, or no image of the formats above. Never half a picture.
+        InputError: the file is missing, a folder, empty, cut short, larger than 2**28 pixels
+            (`opencv.MAX_PIXELS`), or no image of the formats above. Never half a picture.
 
     Example:
         >>> read_image(pictures / "0.png").shape
         (60, 80, 3)
     """
-    try:
-        data = pathlib.Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot read: {error.strerror}, expected an image file"
-        ) from error
+    data = read_bytes(path, "an image file")
     if not data:
         raise InputError(f"{path}: found an empty file, expected {_FORMATS}")
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
@@ -85,6 +95,11 @@ def read_image(
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         reason = " ".join(error.err.split())
+        if "MAX_IMAGE_PIXELS" in reason:
+            reason = (
+                f"found more than {os.environ.get(MAX_PIXELS)} pixels, expected fewer "
+                "(--max-pixels raises that)"
+            )
         raise InputError(f"{path}: OpenCV cannot decode this image: {reason}") from error
     if image is None:
         raise InputError(f"{path}: found {len(data)} bytes that do not decode, expected {_FORMATS}")
@@ -143,25 +158,35 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
     Raises:
         InputError: the folder is missing, is a file, or holds no image.
     """
+    if not os.fspath(folder):
+        raise InputError("images: found an empty name, expected a folder of images")
     folder = pathlib.Path(folder)
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing"
         raise InputError(f"{folder}: found {kind}, expected a folder of images")
-    images = []
+    images, others = [], []
+    # Real paths from the top to each folder: a link to one of them would make the walk endless.
+    above = {folder: frozenset({real_path(folder)})}
     for parent, folders, files in os.walk(folder, followlinks=True):
-        # Skip a link to one of its parent folders: the walk would never end.
         here = pathlib.Path(parent)
-        folders[:] = [
-            name
-            for name in folders
-            if not name.startswith(".")
-            and not ((here / name).is_symlink() and _holds((here / name).resolve(), here))
-        ]
-        images += [
-            here / name
-            for name in files
-            if not name.startswith(".") and name.lower().endswith(IMAGE_SUFFIXES)
-        ]
+        inside = []
+        for name in folders:
+            real = real_path(here / name)
+            loops = any(each.is_relative_to(real) for each in above[here])
+            if not name.startswith(".") and not loops:
+                above[here / name] = above[here] | {real}
+                inside.append(name)
+        folders[:] = inside
+        for name in files:
+            if name.lower().endswith(IMAGE_SUFFIXES) and not name.startswith("."):
+                images.append(here / name)
+            elif name.lower().endswith(_OTHER_SUFFIXES) and not name.startswith("."):
+                others.append(here / name)
+    if others:
+        tell(
+            f"{folder}: left out {len(others)} images of types that are not read, as "
+            f"{min(others).name!r}, expected files that end in {' '.join(IMAGE_SUFFIXES)}"
+        )
     if not images:
         raise InputError(
             f"{folder}: found no image, expected files that end in {' '.join(IMAGE_SUFFIXES)}"
@@ -198,7 +223,3 @@ def check_lines(names: Sequence[str], source: object) -> None:
             raise InputError(f"{source}: found a line break in the name {name!r}, expected none")
         if not name.isprintable() and any("\ud800" <= letter <= "\udfff" for letter in name):
             raise InputError(f"{source}: found the name {name!r}, expected UTF-8")
-
-
-def _holds(folder: pathlib.Path, inner: pathlib.Path) -> bool:
-    return inner.resolve().is_relative_to(folder)

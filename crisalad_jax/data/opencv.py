@@ -5,6 +5,11 @@ from collections.abc import Callable
 
 import cv2
 
+MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
+"""Environment variable of the largest image in pixels, which OpenCV reads as it is imported and
+checks before it decodes. A small file can claim an image that fills the memory: this package sets
+2**28, which takes 0.8 GB, where the variable is not set."""
+
 
 class _Setting:
     """A context that changes a setting; any number of threads may be in it."""

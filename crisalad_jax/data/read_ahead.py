@@ -88,7 +88,8 @@ def _begin_work(work: Callable[[Any], Any]) -> None:
     global _work
     _work = work
     cv2.setNumThreads(1)
-    for number in (signal.SIGINT, signal.SIGTERM):  # a terminal or scheduler signals every process
+    # A terminal or a scheduler signals every process.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -16,7 +16,7 @@ from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_plac
 from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
+from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens, useful_batch_size
 from crisalad_jax.retrieval.grouping import (
     DEFAULT_GROUPINGS,
     Grouping,
@@ -109,6 +109,8 @@ def evaluate(
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
     positives = benchmark.ground_truth()
+    images = max(len(benchmark.database), len(benchmark.queries))
+    batch_size = useful_batch_size(batch_size, images)
 
     def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
         tokens = read_tokens(

@@ -10,7 +10,6 @@ from crisalad_jax.evaluation.evaluate import same_place_rule
 from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import Grouping, grouping_words
-from crisalad_jax.utils.files import write_json
 
 StrPath = str | os.PathLike[str]
 _RECALLS = (
@@ -65,26 +64,21 @@ def evaluation_settings(
     }
 
 
-def write_results(
-    path: StrPath,
-    results: Sequence[GroupingResult],
-    settings: dict[str, Any],
-    *,
-    model_name: str,
-) -> None:
-    """Write what an evaluation found as JSON, with its settings.
+def results_json(
+    results: Sequence[GroupingResult], settings: dict[str, Any], *, model_name: str
+) -> dict[str, Any]:
+    """Put what an evaluation found into JSON values, with its settings.
 
     Args:
-        path: the file.
         results: what `evaluate` returned.
         settings: what `evaluation_settings` returned.
         model_name: which weights, for each row.
 
-    Raises:
-        InputError: the file cannot be made.
+    Returns:
+        The values by name.
     """
     names = {"benchmark": settings["benchmark"], "model": model_name}
-    write_json(path, settings | {"results": [names | to_json(result) for result in results]})
+    return settings | {"results": [names | to_json(result) for result in results]}
 
 
 def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> list[str]:

@@ -33,7 +33,9 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, write_json
+from crisalad_jax.utils.locks import one_writer
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
 GROUPINGS = ("single", "shuffled", "sequential")
 """The groupings; without window, because rendered places have no order in time."""
@@ -64,13 +66,21 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
     The training run under `out/run` resumes if it was interrupted.
 
     Raises:
-        InputError: `out` holds other files, or a demo of another configuration.
+        InputError: `out` holds other files, or a demo of another configuration; or another process
+            writes there.
     """
     started = time.monotonic()
-    if out.exists() and not (out / "city").exists() and (not out.is_dir() or any(out.iterdir())):
+    new = not (out / "city").exists()
+    if out.exists() and new and (not out.is_dir() or holds_other_files(out)):
         raise InputError(
             f"{out}: found files but no demo, expected a demo or a new or empty folder"
         )
+    with one_writer(out):
+        remove_temporaries(out)
+        return _demo(config, out, quiet, started)
+
+
+def _demo(config: DemoConfig, out: pathlib.Path, quiet: bool, started: float) -> DemoSummary:
     city = SyntheticCityConfig(
         train_places=config.train_places, test_places=config.test_places, seed=config.seed
     )

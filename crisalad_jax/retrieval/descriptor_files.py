@@ -25,6 +25,7 @@ from crisalad_jax.utils.files import (
     check_source,
     read_json,
     read_text,
+    told_of,
     write_json,
     write_npy,
 )
@@ -98,7 +99,8 @@ def _write_npy(
         atomic_path(_names_of(path)) as listed,
         atomic_path(record_of(path)) as written,
     ):
-        write_npy(array, descriptors)
+        with told_of(path):
+            write_npy(array, descriptors)
         listed.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
         digests = {"descriptors": sha256_of(array), "names": sha256_of(listed)}
         write_json(written, {_DIGESTS: digests} | record)
@@ -229,7 +231,7 @@ def _check_files(path: pathlib.Path, files: Mapping[str, pathlib.Path]) -> None:
     """Compare files with the digests in the record of the set in `path`, if it has one."""
     record = record_of(path)
     if not record.is_file():
-        tell_unchecked(path)
+        tell_unchecked(path, f"no {record.name} with its checksum")
         return
     value = read_json(record, "a record of descriptors")
     digests = value.get(_DIGESTS) if isinstance(value, dict) else None

@@ -26,7 +26,7 @@ from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_
 from crisalad_jax.retrieval.partial import partial_folder, read_tokens_partly
 from crisalad_jax.retrieval.pca import Pca, load_pca
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target
+from crisalad_jax.utils.files import check_target, real_path
 
 StrPath = str | os.PathLike[str]
 
@@ -253,7 +253,7 @@ def _listed(
 
 
 def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
-    whole, holder = path.resolve(), pathlib.Path(root).resolve()
+    whole, holder = real_path(path), real_path(root)
     if not whole.is_relative_to(holder):
         raise InputError(f"--root: found {holder}, expected a folder that holds {whole}")
     return whole.relative_to(holder)

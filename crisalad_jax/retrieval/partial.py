@@ -20,10 +20,11 @@ from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.describe import FolderTokens, tokens_in_batches
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, remove_temporaries, write_json
+from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.locks import one_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.temporaries import remove_temporaries
 
 FORMAT = "crisalad-jax tokens 1"
 SEGMENT = 256
@@ -95,8 +96,9 @@ def read_tokens_partly(
                 batches.append(FolderTokens(*(leaf[:used] for leaf in tokens)))
                 bar.advance(used)
             part = _joined(batches)
-            arrays = {name: np.ascontiguousarray(leaf) for name, leaf in part._asdict().items()}
-            write_sealed(_path(folder, done), arrays, FORMAT, {})
+            if part.readable.any():
+                arrays = {name: np.ascontiguousarray(leaf) for name, leaf in part._asdict().items()}
+                write_sealed(_path(folder, done), arrays, FORMAT, {})
             parts.append(part)
             done += len(part.readable)
     return _joined(parts)

@@ -14,7 +14,7 @@ from tensorboardX.proto.event_pb2 import (  # made by protobuf when it is import
 from tensorboardX.summary import scalar
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.utils.files import atomic_path, read_text
 
 
 class MetricsLog:
@@ -78,10 +78,12 @@ def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
         InputError: the file is missing, or a line is no record of a step.
     """
     try:
-        lines = path.read_text(encoding="utf-8").split("\n")
+        lines = read_text(path, "a log of a run").split("\n")
         records = [json.loads(line) for line in lines[:-1]]
         if not all(isinstance(r, dict) and type(r.get("step")) is int for r in records):
             raise ValueError("a line has no step")
         return records
-    except (OSError, ValueError) as error:
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot read this log of a run: {error}") from error

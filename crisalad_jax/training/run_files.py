@@ -20,7 +20,9 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import holds_other_files, remove_temporaries, write_json
+from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
 
 @dataclasses.dataclass
@@ -49,14 +51,22 @@ class RunFiles:
     """The files in a run's folder; the primary process alone writes them."""
 
     def __init__(self, out: pathlib.Path, config: TrainConfig) -> None:
-        """Claim the folder `out` for a run with this configuration; raises as `claim_run`."""
-        claim_run(out, config)
-        for folder in (out, out / "best"):
-            remove_temporaries(folder)
-        self._out, self._config = out, config
-        self._states = StateStore(out / "state")
-        self._log: MetricsLog | None = None
-        self._saved: tuple[int, RunRecord] | None = None
+        """Claim the folder `out` for a run with this configuration, until it is closed.
+
+        Raises:
+            InputError: what `claim_run` raises; or another process writes there.
+        """
+        check_run(out, config)
+        with contextlib.ExitStack() as opened:
+            opened.enter_context(one_writer(out))
+            claim_run(out, config)
+            for folder in (out, out / "best"):
+                remove_temporaries(folder)
+            self._out, self._config = out, config
+            self._states = StateStore(out / "state")
+            self._log: MetricsLog | None = None
+            self._saved: tuple[int, RunRecord] | None = None
+            self._lock = opened.pop_all()
 
     def load(self, like: TrainState) -> SavedState | None:
         """Load the saved state; see `StateStore.load`."""
@@ -100,7 +110,7 @@ class RunFiles:
 
     def close(self) -> None:
         """Wait for files that are being written, and close them."""
-        with self._writing(), contextlib.ExitStack() as closed:
+        with self._lock, self._writing(), contextlib.ExitStack() as closed:
             if self._log is not None:
                 closed.callback(self._log.close)
             closed.callback(self._states.close)

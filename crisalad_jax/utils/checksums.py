@@ -50,20 +50,23 @@ def check_sealed(data: bytes, digest: Any, path: object) -> None:
         raise InputError(f"{path}: found checksum {digest!r}, expected 64 hexadecimal digits")
     blank = data.replace(digest.encode(), BLANK.encode(), 1)
     if hashlib.sha256(blank).hexdigest() != digest:
-        raise changed(path)
+        raise ChangedFileError(path)
 
 
-def changed(path: object) -> InputError:
-    """Return the error of a file whose bytes do not have their checksum."""
-    return InputError(
-        f"{path}: found other bytes than were written, expected those of its checksum "
-        "(SHA-256): the file is damaged or was changed"
-    )
+class ChangedFileError(InputError):
+    """A file whose bytes do not have their checksum."""
+
+    def __init__(self, path: object) -> None:
+        """Take the file, for the message."""
+        super().__init__(
+            f"{path}: found other bytes than were written, expected those of its checksum "
+            "(SHA-256): the file is damaged or was changed"
+        )
 
 
-def tell_unchecked(path: object) -> None:
-    """Tell that a file of an earlier version holds no checksum."""
-    tell(f"{path}: found no checksum, as in files of earlier versions; its bytes are not checked")
+def tell_unchecked(path: object, missing: str = "no checksum") -> None:
+    """Tell that a file, as of an earlier version or another program, has no checksum."""
+    tell(f"{path}: found {missing}, as of earlier versions or other programs; not checked")
 
 
 def _is_digest(value: Any) -> bool:
@@ -100,10 +103,10 @@ def checked_safetensors(path: pathlib.Path, *, verify: bool) -> Iterator[None]:
             yield
         except InputError as error:
             if not right.result():
-                raise changed(path) from error
+                raise ChangedFileError(path) from error
             raise
         if not right.result():
-            raise changed(path)
+            raise ChangedFileError(path)
 
 
 def _safetensors_are_right(path: pathlib.Path) -> bool:

@@ -6,6 +6,7 @@ folder.
 
 import json
 import re
+import socket
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -55,6 +56,8 @@ def join_processes(coordinator: str, count: int | None, index: int | None) -> No
         given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
         # Otherwise JAX would ask the scheduler which devices this process has.
         given["cluster_detection_method"] = "deactivate"
+        if index == 0:
+            _check_port(coordinator)
     jax.config.update("jax_num_cpu_devices", 1)
     # JAX's own handler of SIGTERM would hide the signal from this program.
     jax.config.update("jax_enable_preemption_service", False)
@@ -62,6 +65,25 @@ def join_processes(coordinator: str, count: int | None, index: int | None) -> No
         jax.distributed.initialize(**given)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"processes: cannot meet the others: {error}") from error
+
+
+def _check_port(address: str) -> None:
+    """Check that process 0 can listen at this address: JAX would end the process without a word.
+
+    Raises:
+        InputError: it cannot.
+    """
+    port = int(address.rpartition(":")[2])
+    try:
+        # JAX listens at this port of all interfaces.
+        with socket.socket(socket.AF_INET) as listener:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(("", port))
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"--coordinator-address: found port {port}, which cannot be listened at "
+            f"({getattr(error, 'strerror', None) or error}), expected a free one"
+        ) from error
 
 
 def is_primary() -> bool:

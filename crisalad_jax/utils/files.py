@@ -6,10 +6,7 @@ import io
 import json
 import os
 import pathlib
-import re
-import shutil
 import stat
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -18,6 +15,7 @@ from numpy.lib.format import dtype_to_descr, write_array_header_1_0
 
 from crisalad_jax.utils.checksums import CHECKSUM, check_sealed, sealed_json, tell_unchecked
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 
 def check_source(path: str | os.PathLike[str], expected: str) -> None:
@@ -138,6 +136,11 @@ def read_json(
     return value
 
 
+def real_path(path: str | os.PathLike[str]) -> pathlib.Path:
+    """Return the absolute path without links; unlike pathlib it takes links in a circle."""
+    return pathlib.Path(os.path.realpath(path))
+
+
 def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> None:
     """Check that a file can be made at `path`, before the work whose result it is to hold.
 
@@ -152,6 +155,8 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
             made or written to; or it has another suffix.
     """
     path = pathlib.Path(path)
+    if path.name in ("", "-"):
+        raise InputError(f"{path}: found no name of a file, expected one")
     if suffix is not None and path.suffix != suffix:
         raise InputError(f"{path}: found the suffix {path.suffix!r}, expected {suffix}")
     try:
@@ -167,82 +172,6 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         raise InputError(
             f"{path}: cannot be made: found {nearest}, expected a folder that can be written to"
         )
-
-
-def temporary_beside(path: pathlib.Path) -> pathlib.Path:
-    """Return an unused temporary name in the folder of `path`, with its suffix."""
-    return path.with_name(f".crisalad-{uuid.uuid4().hex[:12]}{path.suffix}")
-
-
-def is_temporary(path: pathlib.Path) -> bool:
-    """Return whether `path` has a name that `temporary_beside` made."""
-    return re.fullmatch(r"\.crisalad-[0-9a-f]{12}(\..*)?", path.name) is not None
-
-
-def remove_temporaries(folder: pathlib.Path) -> None:
-    """Remove the temporary files that a killed writer left in `folder`, and nothing else."""
-    for path in filter(is_temporary, folder.glob(".*")):
-        if path.is_file():
-            path.unlink()
-
-
-LOCK = ".crisalad-lock"
-"""Name of the file that a folder's writer locks (see `locks.one_writer`)."""
-
-
-def holds_other_files(folder: pathlib.Path) -> bool:
-    """Return whether `folder` holds any file, hidden ones included, besides our temporary files."""
-    return not all(is_temporary(path) or path.name == LOCK for path in folder.iterdir())
-
-
-_in_use: set[pathlib.Path] = set()
-"""Temporary files and folders that a block of this process is using now."""
-
-
-@contextlib.contextmanager
-def in_use(path: pathlib.Path) -> Iterator[None]:
-    """Remove a temporary file or folder after the block, or when a signal ends the process."""
-    _in_use.add(path)
-    try:
-        yield
-    finally:
-        _remove(path)
-        _in_use.discard(path)
-
-
-def remove_all_in_use() -> None:
-    """Remove the temporary files of this process, which a signal is ending."""
-    for path in tuple(_in_use):
-        _remove(path)
-
-
-def _remove(path: pathlib.Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with contextlib.suppress(OSError):
-            path.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def made_folder(folder: pathlib.Path) -> Iterator[None]:
-    """Make a folder and its parents; if the block raises, remove those that are still empty.
-
-    Raises:
-        InputError: they cannot be made.
-    """
-    new = [each for each in (folder, *folder.parents) if not each.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot make this folder: {error.strerror}") from error
-    try:
-        yield
-    except BaseException:
-        with contextlib.suppress(OSError):
-            for each in new:
-                each.rmdir()
-        raise
 
 
 @contextlib.contextmanager

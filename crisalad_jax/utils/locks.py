@@ -7,7 +7,14 @@ import socket
 from collections.abc import Iterator
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LOCK, in_use, made_folder
+from crisalad_jax.utils.files import told_of
+from crisalad_jax.utils.temporaries import (
+    LOCK,
+    in_use,
+    made_folder,
+    remove_temporaries,
+    temporary_beside,
+)
 
 
 @contextlib.contextmanager
@@ -47,6 +54,24 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
             raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
         with in_use(path):
             yield
+
+
+@contextlib.contextmanager
+def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """Yield a temporary folder; on success move its files into `out`, pages last, else remove it.
+
+    Raises:
+        InputError: as `one_writer`; or the disk is full.
+    """
+    out = pathlib.Path(out)
+    with one_writer(out), told_of(out):
+        remove_temporaries(out)
+        temporary = temporary_beside(out / "files")
+        with in_use(temporary):
+            temporary.mkdir()
+            yield temporary
+            for path in sorted(temporary.iterdir(), key=lambda path: path.suffix == ".html"):
+                os.replace(path, out / path.name)
 
 
 def _holder(path: pathlib.Path) -> str:

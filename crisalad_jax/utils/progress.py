@@ -5,6 +5,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from crisalad_jax.utils.output import printable
+
 
 class Bar:
     """A progress bar, or only its messages where no bar is drawn."""
@@ -21,14 +23,14 @@ class Bar:
     def say(self, line: str) -> None:
         """Print a line that stays, above the bar."""
         if self._progress is not None:
-            self._progress.console.print(line, soft_wrap=True, highlight=False)
+            self._progress.console.print(printable(line), soft_wrap=True, highlight=False)
 
 
 class _Lines(Bar):
     """The messages alone, for installations without rich (every extra installs it)."""
 
     def say(self, line: str) -> None:
-        print(line, file=sys.stderr)
+        print(printable(line), file=sys.stderr)
 
 
 @contextlib.contextmanager

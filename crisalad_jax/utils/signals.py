@@ -1,14 +1,46 @@
-"""Defer the signals that end a program until its work is saved."""
+"""Signals that end a program: at once, or after its work is saved.
+
+This module imports nothing but the standard library, so that the command line can handle signals
+before it imports anything else.
+"""
 
 import contextlib
+import os
 import signal
 import threading
 from collections.abc import Iterator
 from types import FrameType
+from typing import Any
 
 from crisalad_jax.utils.errors import Stopped
+from crisalad_jax.utils.temporaries import remove_all_in_use
 
-_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+_SHOW_CURSOR = "\x1b[?25h\n"
+"""What a terminal needs after a progress bar that was cut off."""
+
+
+def end_at_signals() -> None:
+    """End this process at a signal with one line, its temporary files removed.
+
+    Nothing is raised. An exception at any moment may be swallowed: inside of an import, of a
+    library's callback or of a destructor. Files with a final name are whole at any moment, so that
+    the end of the process loses nothing else.
+    """
+    for number in _SIGNALS:
+        # Ignored signals, as under nohup, stay ignored.
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    for each in _SIGNALS:
+        signal.signal(each, signal.SIG_IGN)
+    remove_all_in_use()
+    how = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+    with contextlib.suppress(OSError):
+        os.write(2, f"{_SHOW_CURSOR if os.isatty(2) else ''}crisalad: {how}\n".encode())
+    os._exit(128 + number)
 
 
 class SignalState:
@@ -19,6 +51,7 @@ class SignalState:
         self.number = 0
         """Number of the last one; 0 for none."""
         self._at_once = False
+        self._before: dict[int, Any] = {}
 
     def check(self) -> None:
         """Raise `Stopped` if a signal has come."""
@@ -36,17 +69,31 @@ class SignalState:
             self._at_once = False
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Record a signal, as its handler; raise on the second one."""
+        """Record a signal, as its handler; the second one means: do not wait."""
         first, self.number = self.number == 0, number
-        if not first:  # a second signal means: do not wait
+        if not first:
+            earlier = self._before.get(number)
+            if callable(earlier):
+                earlier(number, frame)
             raise KeyboardInterrupt
         if self._at_once:
             raise Stopped(number)
 
+    def defer(self) -> None:
+        """Handle all signals that are not ignored."""
+        for number in _SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self.handle)
+
+    def restore(self) -> None:
+        """Give the signals back to their handlers."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
 
 @contextlib.contextmanager
 def defer_signals() -> Iterator[SignalState]:
-    """Defer SIGTERM and SIGINT (Ctrl-C) to `SignalState.check` while the block runs.
+    """Defer SIGTERM, SIGHUP and SIGINT (Ctrl-C) to `SignalState.check` while the block runs.
 
     Python sets handlers in the main thread alone: in other threads this changes nothing.
     """
@@ -54,9 +101,8 @@ def defer_signals() -> Iterator[SignalState]:
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    before = {number: signal.signal(number, stop.handle) for number in _SIGNALS}
+    stop.defer()
     try:
         yield stop
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        stop.restore()

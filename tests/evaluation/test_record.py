@@ -7,7 +7,7 @@ import pytest
 
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.evaluation.record import evaluation_settings, table_notes, write_results
+from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
 from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
 from crisalad_jax.evaluation.similarity import FirstSimilarities, similarity_map
 from crisalad_jax.retrieval.search import Neighbours
@@ -44,8 +44,7 @@ def test_settings_are_what_was_asked(settings, benchmark):
 
 def test_results_are_written_with_them(settings, benchmark, tmp_path):
     results = [result("single"), result("single", "transvpr:3")]
-    write_results(tmp_path / "new" / "r.json", results, settings, model_name="mine")
-    found = json.loads((tmp_path / "new" / "r.json").read_text())
+    found = json.loads(json.dumps(results_json(results, settings, model_name="mine")))
     rows = found.pop("results")
     assert found == settings
     names = {"benchmark": benchmark.name, "model": "mine"}

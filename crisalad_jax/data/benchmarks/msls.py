@@ -18,6 +18,7 @@ from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, listing, shown
 from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source
 
 MSLS_CITIES = {
     "val": ("cph", "sf"),
@@ -229,6 +230,7 @@ _Table = list[dict[str, str]]
 
 
 def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> _Table:
+    check_source(path, "a table of UTF-8 CSV")
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, restval="")

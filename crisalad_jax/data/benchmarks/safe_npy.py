@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_bytes
 
 _KINDS = re.compile(r"[?biufcSUO]\d{0,5}")
 _LARGEST_ITEM = 2**16
@@ -46,10 +47,9 @@ def read_npy(path: pathlib.Path) -> np.ndarray:
     Raises:
         InputError: the file is missing, damaged, or holds anything else.
     """
+    data = read_bytes(path, "a .npy file")
     try:
-        return _load(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        return _load(data)
     except Exception as error:  # a damaged pickle can raise anything at all
         reason = " ".join(str(error).split())
         raise InputError(

@@ -10,7 +10,7 @@ from crisalad_jax.experiments.comparison.plan import ComparisonConfig, prepare
 from crisalad_jax.experiments.comparison.runner import carry_out
 from crisalad_jax.experiments.comparison.summary import Summary, summarise
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
-from crisalad_jax.utils.files import around, check_target
+from crisalad_jax.utils.files import around, check_target, real_path
 
 
 def compare(
@@ -44,7 +44,7 @@ def compare(
     """
     out = pathlib.Path(out)
     check_target(out / "config.json")
-    place = out.resolve().name
+    place = real_path(out).name
     if page is not None:
         around(pathlib.Path(page), place)
     prepared = prepare(config)

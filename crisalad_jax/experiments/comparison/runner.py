@@ -45,7 +45,9 @@ from crisalad_jax.training.run_files import checksum_of_benchmark, checksum_of_p
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, holds_other_files, read_json, write_json
+from crisalad_jax.utils.files import check_target, read_json, write_json
+from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.temporaries import holds_other_files
 
 _ROUNDS = 5
 
@@ -120,9 +122,14 @@ def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = 
 
     Raises:
         InputError: what `claim`, `fit` and `evaluate` raise; a result that is not whole, or of
-            another set than is given now.
+            another set than is given now; or another process writes there.
         Stopped: what `fit` raises; the same call resumes.
     """
+    with one_writer(out):
+        _carry_out(prepared, out, say, quiet)
+
+
+def _carry_out(prepared: Prepared, out: pathlib.Path, say: Say, quiet: bool) -> None:
     claim(out, prepared)
     say(_start_words(prepared.config))
     left = [unit for unit in prepared.units if not _is_done(prepared, out, *unit)]

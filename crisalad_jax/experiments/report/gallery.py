@@ -17,6 +17,7 @@ from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report.style import DPI, GREY, INK, RIGHT, WRONG, fit_width, save
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.locks import staged_folder
 
 _NAME = 28
 """Largest number of characters of a name: at 7 points they are as wide as a picture."""
@@ -165,19 +166,20 @@ def write_galleries(
     Raises:
         InputError: an image cannot be read, or a picture not be written.
     """
-    pictures = []
-    for result in results:
-        name = re.sub(r"[/:]", "-", result.label).replace(" + ", "_")
-        pictures.append(Path(out) / f"gallery_{name}.png")
-        prediction_gallery(
-            pictures[-1],
-            benchmark.queries,
-            benchmark.database,
-            *result.neighbours,
-            benchmark.ground_truth(),
-            title=f"{benchmark.name}, {model_name}, {result.label}",
-        )
-    return pictures
+    names = []
+    with staged_folder(out) as folder:
+        for result in results:
+            label = re.sub(r"[/:]", "-", result.label).replace(" + ", "_")
+            names.append(f"gallery_{label}.png")
+            prediction_gallery(
+                folder / names[-1],
+                benchmark.queries,
+                benchmark.database,
+                *result.neighbours,
+                benchmark.ground_truth(),
+                title=f"{benchmark.name}, {model_name}, {result.label}",
+            )
+    return [Path(out) / name for name in names]
 
 
 def answers_gallery(

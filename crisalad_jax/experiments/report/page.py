@@ -20,7 +20,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.grouping import GROUPINGS, Grouping
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.utils.locks import staged_folder
 
 PAGE = "index.html"
 
@@ -51,17 +51,32 @@ def write_report(
         similarities: what `similarity.similarity_map` gives of the first grouping.
 
     Raises:
-        InputError: no groupings or ground truth, a recall outside 0 to 1, or an image that cannot
-            be read.
+        InputError: no groupings or ground truth, a recall outside 0 to 1, an image that cannot be
+            read, or files that cannot be written: then none of them is.
     """
     if not groupings:
         raise InputError("groupings: found none, expected at least one")
     for grouping in groupings:
         check_fractions(grouping.label, grouping.recalls)
+    with staged_folder(out) as folder:
+        _write(folder, benchmark, groupings, params, config, model_name, settings, similarities)
+    return pathlib.Path(out) / PAGE
+
+
+def _write(
+    folder: pathlib.Path,
+    benchmark: Benchmark,
+    groupings: Sequence[GroupingResult],
+    params: Crisalad,
+    config: ModelConfig,
+    model_name: str,
+    settings: Mapping[str, Any],
+    similarities: Float[np.ndarray, "rows columns"] | None,
+) -> None:
     neighbours = groupings[0].neighbours
     verdicts = judge(neighbours, benchmark.ground_truth())
     shown = choose_shown(neighbours.similarities[:, 0], verdicts)
-    subject = Subject(pathlib.Path(out), benchmark, neighbours, verdicts)
+    subject = Subject(folder, benchmark, neighbours, verdicts)
     context = {
         "title": benchmark.name,
         "model_name": model_name,
@@ -79,10 +94,7 @@ def write_report(
         "matrix": sections.matrix(subject, similarities),
         "settings": json.dumps(settings, indent=2),
     }
-    path = subject.out / PAGE
-    with atomic_path(path) as temporary:
-        temporary.write_text(render(context), encoding="utf-8")
-    return path
+    (folder / PAGE).write_text(render(context), encoding="utf-8")
 
 
 def render(context: Mapping[str, Any], template: str = "page.html") -> str:

@@ -4,7 +4,6 @@ import dataclasses
 import math
 import os
 import pathlib
-import uuid
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -26,7 +25,8 @@ from crisalad_jax.experiments.synthetic.view import (
     check_size,
 )
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import in_use, made_folder, read_json, told_of, write_json
+from crisalad_jax.utils.files import read_json, told_of, write_json
+from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 CITY_NAMES = ("Alderby", "Brackwater")
 """Names of the training cities, which are invented."""
@@ -102,7 +102,7 @@ def write_synthetic_city(
         return
     total = config.train_places * config.images_per_place
     total += config.test_places * (config.database_per_place + config.queries_per_place)
-    temporary = root.with_name(f".{root.name}.{uuid.uuid4().hex[:8]}")
+    temporary = temporary_beside(root)
     with made_folder(root.parent), in_use(temporary):
         for number, _ in enumerate(_write(temporary, root, config, identity), start=1):
             if progress is not None:

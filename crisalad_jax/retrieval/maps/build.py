@@ -15,7 +15,7 @@ from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions, read_positions, utm_positions
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.describe import group, tokens_in_batches
+from crisalad_jax.retrieval.describe import group, tokens_in_batches, useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.manifest import (
     MapDescription,
@@ -27,6 +27,7 @@ from crisalad_jax.retrieval.maps.manifest import (
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.progress import progress_bar
 
 SEGMENT = 256
@@ -145,12 +146,13 @@ def index_images(
                 [names[i] for i in chosen],
                 [sizes[i] for i in chosen],
                 np.concatenate([part.descriptors for part in waiting]),
-                root=root.resolve().as_posix(),
+                root=real_path(root).as_posix(),
                 positions=positions,
             )
         waiting.clear()
 
     there = len(target)
+    batch_size = useful_batch_size(batch_size, len(paths))
     stream = describe_alone(params, config, new, batch_size=batch_size, on_bad_image=on_bad_image)
     with progress_bar(
         "images", len(paths), "images", quiet=quiet, done=len(paths) - len(new)

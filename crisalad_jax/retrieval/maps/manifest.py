@@ -16,14 +16,9 @@ from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.utils.checksums import sealed_json
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import (
-    LOCK,
-    durable_path,
-    is_temporary,
-    read_json,
-    remove_temporaries,
-)
+from crisalad_jax.utils.files import durable_path, read_json, real_path
 from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.temporaries import LOCK, is_temporary, remove_temporaries
 
 FORMAT = 3
 """Version of the format that this package writes, and the newest that it reads. Maps of format 2
@@ -73,7 +68,7 @@ def describe_map(
     """
     return MapDescription(
         model=model_hash(params, config),
-        weights=str(weights.resolve()),
+        weights=str(real_path(weights)),
         config=config,
         descriptor_length=config.descriptor_dim,
         store=store_name(store, folder, dtype),

@@ -35,8 +35,9 @@ from crisalad_jax.retrieval.maps.store import Store, open_store
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, remove_temporaries
+from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.temporaries import remove_temporaries
 
 
 class MapImage(NamedTuple):

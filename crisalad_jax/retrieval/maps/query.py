@@ -10,6 +10,7 @@ import numpy as np
 
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.build import describe_alone
 from crisalad_jax.retrieval.maps.map import Map, MapImage
@@ -107,6 +108,7 @@ def query(
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
     paths = _listed(images)
+    batch_size = useful_batch_size(batch_size, len(paths))
     places.check_params(params)
     config = places.description.config
     parts: list[Neighbours] = []

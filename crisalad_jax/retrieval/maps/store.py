@@ -16,6 +16,7 @@ from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import real_path
 
 DTYPES = ("float32", "float16")
 """Types that descriptors may be stored as."""
@@ -68,7 +69,7 @@ def store_name(name: str, folder: pathlib.Path, dtype: str) -> str:
         raise InputError(f"dtype: found {dtype}, expected float32, which {name} keeps")
     address = name.removeprefix(_MILVUS)
     if not check_address(address):
-        path, folder = pathlib.Path(address).resolve(), folder.resolve()
+        path, folder = real_path(address), real_path(folder)
         address = str(path.relative_to(folder) if path.is_relative_to(folder) else path)
     return _MILVUS + address
 
@@ -93,5 +94,5 @@ def open_store(
         return FileStore(folder / "segments", length, dtype)
     address = name.removeprefix(_MILVUS)
     if not check_address(address):
-        address = str(folder.resolve() / address)
+        address = str(real_path(folder) / address)
     return MilvusStore(address, collection, length, new=new)

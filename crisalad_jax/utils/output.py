@@ -1,0 +1,67 @@
+"""What a program prints: in any encoding, without escape sequences, also if nobody reads on."""
+
+import io
+import os
+import sys
+from typing import Any, TextIO
+
+
+def printable(text: str) -> str:
+    """Return a text with its control characters escaped: names of files may hold any.
+
+    A terminal would obey them. Line breaks stay.
+
+    Example:
+        >>> printable("a\\x1b[2Jb")
+        'a\\\\x1b[2Jb'
+    """
+    return "".join(
+        each if each.isprintable() or each == "\n" else ascii(each)[1:-1] for each in text
+    )
+
+
+def one_line(error: object) -> str:
+    """Return an error's message in one printable line."""
+    return printable(" ".join(str(error).split()))
+
+
+def keep_on_without_reader() -> None:
+    """Let the program go on where the reader of its output is gone, as after `| head`.
+
+    Letters that the encoding lacks are escaped. Standard error stays as it is: who reads that knows
+    that the program goes on.
+    """
+    if sys.stdout is not None:
+        sys.stdout = _going_on(sys.stdout)
+
+
+def _going_on(stream: TextIO) -> TextIO:
+    raw = _UntilClosed(stream.fileno())
+    return io.TextIOWrapper(
+        io.BufferedWriter(raw),
+        encoding=stream.encoding,
+        errors="backslashreplace",
+        line_buffering=stream.isatty(),
+    )
+
+
+class _UntilClosed(io.RawIOBase):
+    """A file that drops what is written after its reader is gone."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def write(self, data: Any) -> int:
+        try:
+            return os.write(self._descriptor, data)
+        except BrokenPipeError:
+            return memoryview(data).nbytes
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def writable(self) -> bool:
+        return True
