@@ -18,7 +18,7 @@ from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, describe, self_mask
+from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
@@ -69,8 +69,10 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
     """Check that a model can be exported in this way, before the work of tracing it.
 
     Raises:
-        InputError: weights inside of 2 GiB or more; or transport that must converge.
+        InputError: parameters of another configuration; weights inside of 2 GiB or more; or
+            transport that must converge.
     """
+    check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
     if how.weights_inside and size >= _LARGEST:
         raise InputError(

@@ -19,7 +19,7 @@ from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
@@ -57,8 +57,8 @@ def save_weights(
         extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
 
     Raises:
-        InputError: the folder cannot be made, or the file not be written; or AnyLoc's vocabulary is
-            of another backbone.
+        InputError: parameters that `load_weights` would refuse; the folder cannot be made, or the
+            file not be written; or AnyLoc's vocabulary is of another backbone.
 
     Example:
         >>> import jax, tempfile
@@ -70,6 +70,7 @@ def save_weights(
         >>> config == PRESETS["tiny"]
         True
     """
+    check_params(params, config, stored=True)
     config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}

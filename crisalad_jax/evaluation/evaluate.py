@@ -15,7 +15,7 @@ from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
 from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens, useful_batch_size
 from crisalad_jax.retrieval.grouping import (
     DEFAULT_GROUPINGS,
@@ -79,9 +79,9 @@ def evaluate(
         A result for each grouping, and with `rerank` a second one.
 
     Raises:
-        InputError: no ground truth, an image cannot be read, components that are not for this model
-            or make no unit vectors, or what `parse_groupings`, `check_grouping`, `Reranking.check`
-            and `Reranker` raise.
+        InputError: parameters of another configuration, no ground truth, an image cannot be read,
+            components that are not for this model or make no unit vectors, or what
+            `parse_groupings`, `check_grouping`, `Reranking.check` and `Reranker` raise.
 
     Example:
         >>> import jax, shutil
@@ -97,6 +97,7 @@ def evaluate(
         >>> result.recalls[1]
         1.0
     """
+    check_params(params, config)
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
     if pca is not None:

@@ -3,7 +3,9 @@
 DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
 """
 
+import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,7 +17,8 @@ from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise, split_key
-from crisalad_jax.nn.pixels import normalise
+from crisalad_jax.nn.misfits import misfits, not_finite, shortened
+from crisalad_jax.nn.pixels import check_pixels, normalise
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
@@ -72,9 +75,107 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
 
 def parameter_shapes(config: ModelConfig) -> Crisalad:
     """Return shapes and types of all parameters (`jax.ShapeDtypeStruct`); nothing is computed."""
-    return jax.eval_shape(functools.partial(init_crisalad, config=config), jax.random.key(0))
+    return _shapes(config, str(jnp.result_type(float)))
 
 
+@functools.lru_cache(maxsize=64)
+def _shapes(config: ModelConfig, default: str) -> Crisalad:
+    """Make the tree for JAX's `default` type of floats, which its 64-bit mode changes."""
+    return jax.eval_shape(lambda: init_crisalad(jax.random.key(0), config))
+
+
+def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> None:
+    """Check that parameters are those of a configuration: names, shapes, types and classes.
+
+    Traced parameters pass as arrays do, and so do those that training has cast or cut:
+    `config.compute_dtype` may stand for float32, and blocks may be in several stacks.
+
+    Args:
+        params: the parameters.
+        config: the model.
+        stored: whether a file is to keep them, which takes whole, finite float32 arrays alone.
+
+    Raises:
+        InputError: they are not; all misfits are listed, or the first of many.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS
+        >>> params = init_crisalad(jax.random.key(0), PRESETS["tiny"])
+        >>> check_params(params, PRESETS["tiny"])
+        >>> check_params(dataclasses.replace(params, aggregator=None), PRESETS["tiny"])
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: params: not of this configuration: aggregator. ...
+    """
+    _check_classes(params, config)
+    template = parameter_shapes(config)
+    if stored:
+        problems = misfits(params, template, {jnp.dtype("float32")}) or not_finite(params)
+    else:
+        dtypes = {jnp.dtype(name) for name in ("float32", "float64", config.compute_dtype)}
+        problems = misfits(params, template, dtypes)
+        if problems:
+            joined = _joined(params, config)
+            problems = problems if joined is None else misfits(joined, template, dtypes)
+    if problems:
+        raise InputError(f"params: not of this configuration: {shortened(problems)}")
+
+
+def _joined(params: Crisalad, config: ModelConfig) -> Crisalad | None:
+    """Return the shapes of parameters whose blocks training has cut; None where they do not fit."""
+    try:
+        backbone = jax.eval_shape(config.backbone.join_blocks, params.backbone)
+    except Exception:  # there may be anything in the place of the blocks
+        return None
+    return dataclasses.replace(params, backbone=backbone)
+
+
+def _check_classes(params: Any, config: Any) -> None:
+    if not isinstance(params, Crisalad):
+        raise InputError(
+            f"params: found {type(params).__name__}, expected Crisalad, of `init_crisalad` or "
+            "`load(FILE).params`"
+        )
+    if not isinstance(config, ModelConfig):
+        raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
+
+
+def _door(second: str, check: Callable[[Any], None]) -> Callable[..., Any]:
+    """Make a decorator that checks what a trace cannot, before the call of a compiled function.
+
+    Args:
+        second: name of the second argument, after `params` and before `config`.
+        check: raises InputError where the second argument has wrong values.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            given = dict(zip(("params", second, "config"), args, strict=False), **options)
+            if len(given.keys() & {"params", second, "config"}) < 3:
+                return function(*args, **options)  # which raises Python's own error
+            _check_classes(given["params"], given["config"])
+            check(given[second])
+            try:
+                return function(*args, **options)
+            except TypeError:
+                check_params(given["params"], given["config"])  # a leaf may be no array
+                raise
+
+        return call
+
+    return decorate
+
+
+def _check_token_class(tokens: Any) -> None:
+    if not isinstance(tokens, Tokens):
+        raise InputError(
+            f"tokens: found {type(tokens).__name__}, expected Tokens, of `extract_tokens`"
+        )
+
+
+@_door("images", check_pixels)
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def describe(
     params: Crisalad,
@@ -98,7 +199,8 @@ def describe(
     Args:
         params: from `init_crisalad` or a weight file.
         images: 8-bit pixels, which are normalised here as `config.normalisation` says, or floats
-            that already are. The sides are multiples of 14; they need not be `config.image_size`.
+            that already are (pixels of 0 to 1 or to 255 as floats are refused). The sides are
+            multiples of 14; they need not be `config.image_size`.
         config: the model, static.
         mask: which images attend to which.
         key: draws the dropout (a `jax.random.key`); None means inference.
@@ -108,9 +210,9 @@ def describe(
         Descriptors of length 1, in float32 at least.
 
     Raises:
-        InputError: while tracing, for images of the wrong type, rank, channels or sides, or with
-            too few patches for the clusters; a mask of another shape; or a batch is no multiple of
-            `micro_batch`.
+        InputError: parameters that are not of the configuration; while tracing, for images of the
+            wrong type, rank, channels or sides, none, or with too few patches for the clusters; a
+            mask of another shape; or a batch is no multiple of `micro_batch`.
 
     Example:
         >>> import jax, numpy as np
@@ -125,6 +227,7 @@ def describe(
     return attend_across_images(params, tokens, config, mask=mask, key=cross_key)
 
 
+@_door("images", check_pixels)
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def extract_tokens(
     params: Crisalad,
@@ -190,6 +293,7 @@ def extract_tokens(
     return jax.tree.map(join, jax.lax.map(once, jax.tree.map(split, (images, keys))))
 
 
+@_door("images", check_pixels)
 @functools.partial(compiler.jit, static_argnames="config")
 def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
     """Extract the features of every image that the aggregator requests.
@@ -213,8 +317,11 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         >>> extract_features(params, np.zeros((1, 98, 98, 3), np.uint8), config).patches.shape
         (1, 49, 128)
     """
+    check_params(params, config)
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
+    if images.shape[0] == 0:
+        raise InputError("images: found none, expected at least one")
     config.check_image_size((images.shape[1], images.shape[2]))
     if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):
         raise InputError(
@@ -228,6 +335,7 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         return config.backbone.apply(params.backbone, pixels, request, remat=config.remat)
 
 
+@_door("images", check_pixels)
 @functools.partial(compiler.jit, static_argnames="config")
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
@@ -242,6 +350,7 @@ def unit_features(
     return l2_normalise(at_least_float32(extract_features(params, images, config).patches))
 
 
+@_door("tokens", _check_token_class)
 @functools.partial(compiler.jit, static_argnames="config")
 def attend_across_images(
     params: Crisalad,
@@ -266,7 +375,8 @@ def attend_across_images(
         Descriptors of length 1, in float32 at least.
 
     Raises:
-        InputError: while tracing, for a mask of another shape.
+        InputError: parameters or tokens that are not of the configuration, or, while tracing, a
+            mask of another shape.
 
     Example:
         >>> import jax, numpy as np
@@ -277,6 +387,8 @@ def attend_across_images(
         >>> attend_across_images(params, tokens, config, mask=self_mask(2)).shape
         (2, 576)
     """
+    check_params(params, config)
+    _check_token_shapes(tokens, config)
     if params.cross_image is not None:
         options = config.cross_image
         enter = functools.partial(as_sequence, global_token=options.global_token)
@@ -298,6 +410,19 @@ def attend_across_images(
     return jax.vmap(functools.partial(to_descriptor, aggregator=config.aggregator))(tokens)
 
 
+def _check_token_shapes(tokens: Tokens, config: ModelConfig) -> None:
+    shape = config.token_shape
+    found = tokens.global_token.shape, tokens.local.shape
+    count = tokens.local.shape[0]
+    expected = (count, shape.global_dim), (count, shape.tokens, shape.token_dim)
+    if found != expected:
+        raise InputError(
+            f"tokens: found a global token of shape {found[0]} and local tokens of {found[1]}, "
+            f"expected {expected[0]} and {expected[1]}"
+        )
+
+
+@_door("images", check_pixels)
 @functools.partial(compiler.jit, static_argnames="config")
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig

@@ -1,10 +1,15 @@
 """Normalise 8-bit pixels on the device, so that images are transferred as bytes."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, UInt8
 
 from crisalad_jax.config.checks import choose
+from crisalad_jax.utils.errors import InputError
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
@@ -12,6 +17,63 @@ LOCAL_WINDOW = 21
 """Side in pixels of the box of local contrast normalisation: one and a half patches."""
 LOCAL_NOISE = 0.02
 """Smallest deviation, as a share of full scale: a night photograph's noise, not to be amplified."""
+
+_BYTES_FROM = 30.0
+"""Numbers above this are pixels of 0 to 255. ImageNet's normalisation gives at most 2.7, and that
+of local contrast at most 21, the root of its window's size."""
+_SPREAD = 0.5
+"""Least range of pixels of 0 to 1. Normalised images that lie inside of it are nearly uniform."""
+
+
+def check_pixels(images: Any) -> None:
+    """Check that images are an array, and that floats are normalised and no plain pixels.
+
+    Traced values are not known, and pass.
+
+    Args:
+        images: 8-bit pixels, or floats.
+
+    Raises:
+        InputError: they are no array, or floats of 0 to 255 or of 0 to 1.
+
+    Example:
+        >>> import numpy as np
+        >>> check_pixels(np.full((1, 14, 14, 3), 255.0))
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: images: found float64 from 255 to 255, ...
+    """
+    if not isinstance(images, np.ndarray | jax.Array):
+        hint = " (np.stack makes one)" if isinstance(images, list | tuple) else ""
+        raise InputError(
+            f"images: found {type(images).__name__}, expected an array of shape "
+            f"(image, height, width, 3){hint}"
+        )
+    if isinstance(images, Tracer) or not images.size:
+        return
+    if not jnp.issubdtype(images.dtype, jnp.floating):
+        return
+    if isinstance(images, np.ndarray):
+        low, high = float(images.min()), float(images.max())
+    elif images.is_fully_addressable:
+        low, high = map(float, _range(images))
+    else:
+        return  # parts of it lie with other processes
+    if high > _BYTES_FROM:
+        how = "images.round().astype(np.uint8)"
+    elif low >= 0 and high <= 1 and high - low >= _SPREAD:
+        how = "(255 * images).round().astype(np.uint8)"
+    else:
+        return
+    raise InputError(
+        f"images: found {images.dtype} from {low:.3g} to {high:.3g}, which are pixels, expected "
+        f"floats that are normalised, or uint8: {how}"
+    )
+
+
+@jax.jit
+def _range(images: Float[Array, "..."]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    return images.min(), images.max()
 
 
 def normalise(image: UInt8[Array, "height width 3"], how: str) -> Float[Array, "height width 3"]:

@@ -11,7 +11,7 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import check_lines, list_images, names_in
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import group, read_tokens, useful_batch_size
 from crisalad_jax.retrieval.descriptor_files import (
@@ -91,9 +91,10 @@ def extract(
         Names and descriptors of the images that could be read.
 
     Raises:
-        InputError: what `check_extraction` raises; components or a database of another length; no
-            image, an image that cannot be read, or none that can; a name that is no line of text or
-            does not lie under `root`; or a file that cannot be read or written.
+        InputError: what `check_params` and `check_extraction` raise; components or a database of
+            another length; no image, an image that cannot be read, or none that can; a name that is
+            no line of text or does not lie under `root`; or a file that cannot be read or
+            written.
 
     Example:
         >>> import jax
@@ -103,6 +104,7 @@ def extract(
         >>> extract(params, config, pictures, quiet=True).descriptors.shape
         (4, 576)
     """
+    check_params(params, config)
     check_extraction(
         out,
         grouping=grouping,

@@ -126,14 +126,14 @@ def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
     config = dataclasses.replace(config, cross_image=RELATED)
     generator = np.random.default_rng(0)
     shape = config.token_shape
+    encoder = init_cross_image(jax.random.key(0), shape.token_dim, RELATED)
+    params = dataclasses.replace(params, cross_image=encoder)
     tokens = jax.tree.map(
         lambda leaf: jnp.asarray(generator.normal(size=(3, *leaf.shape[1:])), jnp.float32),
         jax.eval_shape(functools.partial(extract_tokens, config=config), params, pictures(0)),
     )._replace(transport=None)
     assert tokens.global_token.shape == (3, shape.global_dim)
     assert tokens.local.shape == (3, shape.tokens, shape.token_dim)
-    encoder = init_cross_image(jax.random.key(0), shape.token_dim, RELATED)
-    params = dataclasses.replace(params, cross_image=encoder)
     other = jax.tree.map(lambda leaf: leaf.at[2].add(1.0), tokens)
 
     among, changed = (attend_across_images(params, each, config) for each in (tokens, other))

@@ -14,7 +14,7 @@ from crisalad_jax.data.images import list_images, names_in
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions, read_positions, utm_positions
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.describe import group, tokens_in_batches, useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.manifest import (
@@ -216,9 +216,9 @@ def index(
         What became of the images.
 
     Raises:
-        InputError: no image, or none that can be read; positions of none of them; a map of another
-            model or of other settings; what `index_images`, `describe_map` and
-            `open_for_appending` raise.
+        InputError: parameters of another configuration; no image, or none that can be read;
+            positions of none of them; a map of another model or of other
+            settings; what `index_images`, `describe_map` and `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -230,6 +230,7 @@ def index(
         >>> index(params, config, pictures, folder / "map", weights=weights, quiet=True).added
         4
     """
+    check_params(params, config)
     check_grouping((), batch_size, seed=0)
     images, out = pathlib.Path(images), pathlib.Path(out)
     description = read_description(out)

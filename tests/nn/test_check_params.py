@@ -1,0 +1,343 @@
+"""Parameters of another configuration, and images of another kind: refused at every public door."""
+
+import dataclasses
+import pathlib
+import re
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.export import ExportConfig, export_model, write_export
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.places import read_places
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc
+from crisalad_jax.nn.config import ModelConfig, with_aggregator
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.misfits import misfits
+from crisalad_jax.nn.model import (
+    Crisalad,
+    attend_across_images,
+    check_params,
+    describe,
+    extract_features,
+    extract_tokens,
+    init_crisalad,
+    parameter_shapes,
+    transport_masses,
+    unit_features,
+)
+from crisalad_jax.retrieval.extract import extract
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.step import (
+    cast_frozen,
+    init_train_state,
+    make_train_step,
+    step_config,
+)
+from crisalad_jax.training.trainable import merge_params, split_params
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import MODEL, RECIPE, random_params
+
+PARAMS = random_params(MODEL)
+IMAGES = np.random.default_rng(0).integers(0, 256, (2, 42, 56, 3), dtype=np.uint8)
+LABELS = np.array([0, 0])
+
+
+def changed(**aggregator: Any) -> ModelConfig:
+    return dataclasses.replace(
+        MODEL, aggregator=dataclasses.replace(MODEL.aggregator, **aggregator)
+    )
+
+
+def trained(config: ModelConfig) -> Any:
+    return dataclasses.replace(RECIPE, model=config)
+
+
+def a_step(params: Crisalad, config: ModelConfig, out: pathlib.Path, shared: pathlib.Path) -> None:
+    """A state of MODEL in a step of the other configuration."""
+    options = {"steps": 2}
+    state, frozen = init_train_state(
+        PARAMS, "head", step_config(RECIPE, **options), key=jax.random.key(0)
+    )
+    state = state._replace(trainable=params)
+    step = make_train_step(trained(config), **options)
+    step(state, jax.tree.map(lambda _: None, frozen), IMAGES, LABELS, jax.random.key(0))
+
+
+DOORS: dict[str, Callable[..., Any]] = {
+    "describe": lambda params, config, out, shared: describe(params, IMAGES, config),
+    "extract_tokens": lambda params, config, out, shared: extract_tokens(params, IMAGES, config),
+    "extract_features": lambda params, config, out, shared: extract_features(
+        params, IMAGES, config
+    ),
+    "unit_features": lambda params, config, out, shared: unit_features(params, IMAGES, config),
+    "transport_masses": lambda params, config, out, shared: transport_masses(
+        params, IMAGES, config
+    ),
+    "attend_across_images": lambda params, config, out, shared: attend_across_images(
+        params, extract_tokens(PARAMS, IMAGES, MODEL), config
+    ),
+    "describe, jitted": lambda params, config, out, shared: jax.jit(
+        lambda params: describe(params, IMAGES, config)
+    )(params),
+    "describe, mapped": lambda params, config, out, shared: jax.vmap(
+        lambda images: describe(params, images, config)
+    )(IMAGES[None]),
+    "init_train_state": lambda params, config, out, shared: init_train_state(
+        params, "head", step_config(trained(config), steps=2)
+    ),
+    "a step": a_step,
+    "fit": lambda params, config, out, shared: fit(
+        trained(config),
+        read_places(shared / "city", min_images=2),
+        out / "run",
+        initial=params,
+        quiet=True,
+    ),
+    "extract": lambda params, config, out, shared: extract(
+        params, config, shared / "town", out / "d.npy", quiet=True
+    ),
+    "index": lambda params, config, out, shared: index(
+        params, config, shared / "town", out / "map", weights=out / "none", quiet=True
+    ),
+    "evaluate": lambda params, config, out, shared: evaluate(
+        params, config, open_benchmark(shared / "town"), quiet=True
+    ),
+    "export_model": lambda params, config, out, shared: export_model(
+        params, config, ExportConfig(platforms=("cpu",))
+    ),
+    "write_export": lambda params, config, out, shared: write_export(
+        out / "export", params, config, ExportConfig(platforms=("cpu",))
+    ),
+    "save_weights": lambda params, config, out, shared: save_weights(
+        out / "w.safetensors", params, config
+    ),
+}
+MISFITS: dict[str, tuple[Any, ModelConfig, str]] = {
+    "clusters": (
+        PARAMS,
+        changed(clusters=2),
+        "aggregator.score.fc2.weight found float32 (16, 4), expected float32 (16, 2); "
+        "aggregator.score.fc2.bias found float32 (4,), expected float32 (2,)",
+    ),
+    "dustbin": (PARAMS, changed(dustbin="token"), "aggregator.dust_bin unknown"),
+    "no encoder": (
+        dataclasses.replace(PARAMS, cross_image=None),
+        MODEL,
+        "cross_image.layers.0.attn.qkv.weight missing; ",
+    ),
+    "one encoder too many": (
+        PARAMS,
+        dataclasses.replace(MODEL, cross_image=CrossImageConfig(layers=0)),
+        "cross_image.layers.0.attn.qkv.weight unknown; ",
+    ),
+    "half precision": (
+        jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), PARAMS),
+        MODEL,
+        "found bfloat16 (",
+    ),
+    "half a model": (split_params(PARAMS, MODEL, "head")[0], MODEL, "patch_embed.weight missing"),
+    "another class": (
+        dataclasses.replace(PARAMS, aggregator=dict(vars(PARAMS.aggregator))),
+        MODEL,
+        "found dict, expected Salad",
+    ),
+    "no Crisalad": ((PARAMS, MODEL), MODEL, "params: found tuple, expected Crisalad"),
+}
+
+ELSEWHERE = {
+    ("a step", "no Crisalad"),
+    ("a step", "another class"),
+    ("describe, jitted", "no Crisalad"),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+@pytest.mark.parametrize("misfit", MISFITS)
+@pytest.mark.usefixtures("_unchecked")
+def test_every_door_refuses_parameters_of_another_configuration(
+    door: str, misfit: str, tmp_path: pathlib.Path, shared: pathlib.Path
+) -> None:
+    params, config, words = MISFITS[misfit]
+    if (door, misfit) in ELSEWHERE:
+        pytest.skip("JAX refuses it before the door is reached")
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        DOORS[door](params, config, tmp_path, shared)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_a_leaf_that_is_no_array_is_named() -> None:
+    broken = dataclasses.replace(
+        PARAMS, backbone=dataclasses.replace(PARAMS.backbone, cls_token="token")
+    )
+    words = r"^params: not of this .*: backbone\.cls_token found str, expected float32 \(32,\)$"
+    with pytest.raises(InputError, match=words):
+        describe(broken, IMAGES, MODEL)
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_a_configuration_of_another_kind_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^config: found str, expected ModelConfig$"):
+        describe(PARAMS, IMAGES, "tiny")
+
+
+def test_many_misfits_are_cut_short() -> None:
+    with pytest.raises(InputError, match=r"(.* missing; ){5}and 19 more$"):
+        check_params(dataclasses.replace(PARAMS, cross_image=None), MODEL)
+
+
+def test_numpy_arrays_and_free_fields_make_no_misfit() -> None:
+    expected = np.asarray(describe(PARAMS, IMAGES, MODEL))
+    arrays = jax.tree.map(np.asarray, PARAMS)
+    np.testing.assert_array_equal(describe(arrays, IMAGES, MODEL), expected)
+    other = dataclasses.replace(
+        MODEL,
+        image_size=(56, 56),
+        backbone=dataclasses.replace(MODEL.backbone, position_init="sincos"),
+        cross_image=dataclasses.replace(MODEL.cross_image, dropout=0.5),
+        remat="full",
+    )
+    np.testing.assert_array_equal(describe(PARAMS, IMAGES, other), expected)
+
+
+@pytest.mark.parametrize("trainable", ["head", "adapters+head", "last-1-blocks+head"])
+def test_what_training_has_cast_and_cut_still_fits(trainable: str) -> None:
+    config = dataclasses.replace(MODEL, compute_dtype="bfloat16")
+    chosen, frozen = split_params(PARAMS, config, trainable)
+    cast = cast_frozen(frozen, config)
+    assert any(leaf.dtype == jnp.bfloat16 for leaf in jax.tree.leaves(cast))
+    whole = jax.tree.map(
+        lambda a, b: b if a is None else a, chosen, cast, is_leaf=lambda leaf: leaf is None
+    )
+    check_params(whole, config)
+    check_params(merge_params(chosen, frozen, config), config, stored=True)
+    with pytest.raises(InputError, match="not of this configuration"):
+        check_params(whole, config, stored=True)
+
+
+def test_a_vocabularys_backbone_makes_no_misfit() -> None:
+    alone = CrossImageConfig(layers=0)
+    config = with_aggregator(MODEL, "anyloc", "tiny", cross_image=alone)
+    params = init_crisalad(jax.random.key(0), config)
+    check_params(
+        dataclasses.replace(params, aggregator=AnyLoc(params.aggregator.words, "a")), config
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_no_file_of_weights_holds_what_cannot_be_loaded(value: float, tmp_path) -> None:
+    path = tmp_path / "weights.safetensors"
+    leaves = named_leaves(PARAMS)
+    broken = jax.tree.unflatten(
+        jax.tree.structure(PARAMS),
+        [
+            leaf.at[0].set(value) if name.endswith("cls_token") else leaf
+            for name, leaf in leaves.items()
+        ],
+    )
+    with pytest.raises(
+        InputError, match=r"^params: .*: backbone\.cls_token holds NaN or infinity$"
+    ):
+        save_weights(path, broken, MODEL)
+    assert not path.exists()
+    save_weights(path, PARAMS, MODEL)
+    assert load_weights(path, expected=MODEL)[1] == MODEL
+
+
+def test_shapes_follow_the_64_bit_mode() -> None:
+    assert parameter_shapes(MODEL).backbone.cls_token.dtype == jnp.float32
+    with jax.enable_x64(True):
+        assert parameter_shapes(MODEL).backbone.cls_token.dtype == jnp.float64
+    assert parameter_shapes(MODEL).backbone.cls_token.dtype == jnp.float32
+
+
+def test_misfits_are_told_of_names_shapes_and_types() -> None:
+    expected = {"a": np.ones(3), "b": np.ones((2, 2), np.float32), "c": np.ones(1)}
+    found = {"a": np.ones(2), "b": np.ones((2, 2), np.float16), "d": np.ones(1)}
+    assert misfits(found, expected) == [
+        "a found float64 (2,), expected float64 (3,)",
+        "b found float16 (2, 2), expected float32 (2, 2)",
+        "c missing",
+        "d unknown",
+    ]
+    assert misfits(expected, expected) == []
+    assert misfits([np.ones(2)], (np.ones(2),)) == ["found list, expected tuple"]
+
+
+DOORS_OF_IMAGES: dict[str, Callable[[Any], Any]] = {
+    "describe": lambda images: describe(PARAMS, images, MODEL),
+    "extract_tokens": lambda images: extract_tokens(PARAMS, images, MODEL),
+    "extract_features": lambda images: extract_features(PARAMS, images, MODEL),
+}
+PICTURES: dict[str, tuple[Any, str]] = {
+    "a list": (
+        list(IMAGES),
+        "found list, expected an array of shape (image, height, width, 3) (np",
+    ),
+    "a name": ("a.jpg", "found str, expected an array of shape (image, height, width, 3)"),
+    "one image": (IMAGES[0], "found shape (42, 56, 3), expected (image, height, width, 3)"),
+    "channels": (IMAGES[..., :1], "found shape (2, 42, 56, 1), expected (image, height, width, 3)"),
+    "none": (IMAGES[:0], "found none, expected at least one"),
+    "int32": (IMAGES.astype(np.int32), "found int32, expected uint8 pixels, or floats"),
+    "0 to 255": (
+        IMAGES.astype(np.float32),
+        "found float32 from 0 to 255, which are pixels, expected floats that are normalised, or "
+        "uint8: images.round().astype(np.uint8)",
+    ),
+    "0 to 255 of JAX": (jnp.asarray(IMAGES, jnp.float32), "found float32 from 0 to 255, which are"),
+    "resized by cubic splines": (IMAGES * 1.04 - 5.0, "found float64 from -5 to 260, which are"),
+    "0 to 1": (
+        IMAGES / 255,
+        "found float64 from 0 to 1, which are pixels, expected floats that are normalised, or "
+        "uint8: (255 * images).round().astype(np.uint8)",
+    ),
+}
+
+
+@pytest.mark.parametrize("door", DOORS_OF_IMAGES)
+@pytest.mark.parametrize("kind", PICTURES)
+@pytest.mark.usefixtures("_unchecked")
+def test_every_door_refuses_images_of_another_kind(door: str, kind: str) -> None:
+    images, words = PICTURES[kind]
+    with pytest.raises(InputError, match=f"^images: {re.escape(words)}") as caught:
+        DOORS_OF_IMAGES[door](images)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_a_step_refuses_pixels_as_floats() -> None:
+    options = {"steps": 2}
+    state, frozen = init_train_state(PARAMS, "head", step_config(RECIPE, **options))
+    with pytest.raises(InputError, match=r"^images: found float64 from 0 to 1, which"):
+        make_train_step(RECIPE, **options)(state, frozen, IMAGES / 255, LABELS, jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    # ImageNet's range, the largest outlier of a window of 21 x 21, a bright and a uniform image.
+    [(-2.118, 2.64), (-3.0, 20.98), (0.0, 2.64), (0.2, 0.6), (0.0, 0.0), (1.0, 1.0)],
+)
+def test_normalised_floats_are_described(low: float, high: float) -> None:
+    images = np.linspace(low, high, IMAGES.size, dtype=np.float32).reshape(IMAGES.shape)
+    assert np.isfinite(describe(PARAMS, images, MODEL)).all()
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_tokens_of_another_model_are_refused() -> None:
+    tokens = extract_tokens(PARAMS, IMAGES, MODEL)
+    shorter = tokens._replace(local=tokens.local[:, :2], transport=None)
+    words = r"^tokens: found .* local tokens of \(2, 2, 8\), expected .* and \(2, 4, 8\)"
+    with pytest.raises(InputError, match=words):
+        attend_across_images(PARAMS, shorter, MODEL)
+    with pytest.raises(InputError, match=r"^tokens: found ndarray, expected Tokens"):
+        attend_across_images(PARAMS, IMAGES, MODEL)
