@@ -1,9 +1,16 @@
 """The optimiser and its learning rate, equal to torch's."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import optax
 
 from crisalad_jax.training.config import OptimiserConfig
+from crisalad_jax.utils.notes import tell
+
+WARMUP_SHARE = 5
+"""Divisor of a run's steps: a warm-up takes a fifth of them at most. The 30 steps of `scratch` are
+a sixth of the demo's 180, and far less of its own 150 epochs."""
 
 
 def learning_rate_schedule(
@@ -29,6 +36,36 @@ def learning_rate_schedule(
         peak / config.warmup_steps, peak, max(config.warmup_steps - 1, 1)
     )
     return _of_real_steps(optax.join_schedules([warmup, decay], [config.warmup_steps]))
+
+
+def with_short_warmup(config: OptimiserConfig, steps: int) -> OptimiserConfig:
+    """Shorten a warm-up to its largest share of a run.
+
+    Args:
+        config: the optimiser.
+        steps: number of steps of the run.
+
+    Returns:
+        The optimiser, as it is where its warm-up is short enough.
+
+    Example:
+        >>> with_short_warmup(OptimiserConfig(warmup_steps=30), 32).warmup_steps
+        6
+    """
+    longest = steps // WARMUP_SHARE
+    return dataclasses.replace(config, warmup_steps=min(config.warmup_steps, longest))
+
+
+def tell_long_warmup(config: OptimiserConfig, steps: int) -> None:
+    """Tell in a note if a warm-up takes more than its largest share of a run's steps."""
+    longest = steps // WARMUP_SHARE
+    if config.warmup_steps > longest:
+        left = max(steps - config.warmup_steps, 0)
+        tell(
+            f"OptimiserConfig.warmup_steps: found {config.warmup_steps} for a run of {steps} steps,"
+            f" which leaves {left} at the learning rate and its decay; at most {longest} would be a"
+            " fifth"
+        )
 
 
 def _of_real_steps(schedule: optax.Schedule) -> optax.Schedule:

@@ -19,13 +19,24 @@ from crisalad_jax.losses import Loss, LossConfig, LossResult, LossValue, metric_
 from crisalad_jax.losses.base import call_loss, check_value
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import split_key
-from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens, valid_mask
+from crisalad_jax.nn.model import (
+    Crisalad,
+    attend_across_images,
+    check_params,
+    extract_tokens,
+    valid_mask,
+)
+from crisalad_jax.nn.pixels import check_pixels
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
+from crisalad_jax.training.optimiser import (
+    learning_rate_schedule,
+    make_optimiser,
+    tell_long_warmup,
+)
 from crisalad_jax.training.trainable import split_params
-from crisalad_jax.utils import compiler, devices
+from crisalad_jax.utils import compiler, devices, distributed
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
@@ -114,6 +125,8 @@ def init_train_state(
 ) -> tuple[TrainState, PyTree]:
     """Make the state before the first step, and the frozen parameters, which no step changes.
 
+    A note tells if the warm-up takes more than a fifth of the run.
+
     Args:
         params: the model to start from.
         trainable: see `split_params`.
@@ -124,14 +137,15 @@ def init_train_state(
         (state, frozen). The state is a copy, so `params` stay of use.
 
     Raises:
-        InputError: what `split_params` raises; or the loss needs a key, or classes.
+        InputError: what `check_params` and `split_params` raise; or the loss needs a key, or
+            classes.
 
     Example:
         >>> import jax
         >>> from crisalad_jax import init_crisalad, recipe, step_config
         >>> config = recipe("tiny")
         >>> params = init_crisalad(jax.random.key(0), config.model)
-        >>> static = step_config(config, steps=10)
+        >>> static = step_config(config, steps=1000)
         >>> state, frozen = init_train_state(params, config.trainable, static)
         >>> int(state.step)
         0
@@ -140,6 +154,9 @@ def init_train_state(
         isinstance(config, StepConfig),
         f"config: found {type(config).__name__}, expected the StepConfig of `step_config`",
     )
+    check_params(params, config.model)
+    if isinstance(config.optimiser, OptimiserConfig) and distributed.is_primary():
+        tell_long_warmup(config.optimiser, config.steps)
     chosen, frozen = split_params(params, config.model, trainable)
     # Copied, because a step uses up the buffers of its state, and `params` are the caller's.
     chosen = jax.tree.map(jnp.copy, chosen)
@@ -258,7 +275,8 @@ def make_train_step(
         `train_step`. The state that goes in is used up.
 
     Raises:
-        InputError: what `step_config` raises; and from `step`, labels of 2^31 or more.
+        InputError: what `step_config` raises; and from `step`, labels of 2^31 or more, a state of
+            another configuration, or images that are no array of pixels.
 
     Example:
         >>> import jax, numpy as np, optax
@@ -290,6 +308,7 @@ def make_train_step(
         key: PRNGKeyArray,
         valid: Bool[Array | np.ndarray, " image"] | None = None,
     ) -> tuple[TrainState, Metrics]:
+        check_pixels(images)
         # JAX would keep the lower half of each, and join places that differ in the upper one.
         # Its own arrays have no such labels, and may be traced or still be computed.
         if not isinstance(labels, jax.Array) and np.max(labels, initial=0) >= 2**31:

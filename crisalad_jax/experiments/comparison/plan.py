@@ -11,6 +11,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.experiments.comparison.ablation import (
@@ -28,14 +29,14 @@ from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.batches import groups_of, steps_per_epoch
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.optimiser import with_short_warmup
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
 
 EPOCHS = 6
 """Number of epochs from random weights: all methods on two small sets, three seeds each, take less
 than an hour on two cores."""
-_WARMUP_SHARE = 5
-"""Divisor of a short run's steps: it warms up for a fifth of them at most."""
 _VIEWS = 4
 """Largest number of images of a place in a batch, as in all recipes of the paper."""
 
@@ -69,7 +70,8 @@ class ComparisonConfig:
     """Number of runs of each method, with seeds from 0."""
 
     def __post_init__(self) -> None:
-        """Check the ranges and the names."""
+        """Check the types, the ranges and the names."""
+        check_types(self)
         check_grouping((), self.batch_size, 0, self.seeds)
         parse_groupings(self.grouping.split(","))
         what = "--methods" if self.kind == "compare" else "--rows"
@@ -139,6 +141,8 @@ class Prepared(NamedTuple):
 def prepare(config: ComparisonConfig) -> Prepared:
     """Read the sets and make and check all configurations, weights from files included.
 
+    A note tells which runs warm up for fewer steps than their recipes, because they are short.
+
     Raises:
         InputError: a file cannot be read or holds another method's weights; something has to be
             trained or clustered without a training set; a method does not fit the images or its
@@ -158,11 +162,19 @@ def prepare(config: ComparisonConfig) -> Prepared:
         )
     places, views = _places(config) if need else (None, _VIEWS)
     variants = []
+    shortened: dict[str, list[str]] = {}
     for draft in drafts:
         training = draft.training
         if places is not None and draft.run not in weights:
             training = _fitted(training, config, len(places.place_id), views)
-            own = _own_training_set(draft, training, config, places)
+            own, steps = _own_training_set(draft, training, config, places)
+            optimiser = with_short_warmup(training.optimiser, steps)
+            if config.backbone is not None:  # from nothing `_fitted` has shortened it
+                training = dataclasses.replace(training, optimiser=optimiser)
+            before, after = draft.training.optimiser.warmup_steps, training.optimiser.warmup_steps
+            if draft.learns and after < before:
+                words = f"found {before} steps, shortened to {after} of the run's {steps}"
+                shortened.setdefault(words, []).append(draft.name)
         else:
             own = None
         file = weights.get(draft.run)
@@ -173,21 +185,23 @@ def prepare(config: ComparisonConfig) -> Prepared:
     for variant in variants:
         _check(variant, config, benchmarks)
     _check_backbone(config, variants)
+    for words, names in shortened.items():
+        tell(f"warm-up: {words}, for {', '.join(names)}")
     return Prepared(config, variants, places, benchmarks)
 
 
 def _own_training_set(
     draft: Variant, training: TrainConfig, config: ComparisonConfig, places: Places
-) -> Places:
-    """Choose a variant's training set, and check that its epochs have batches."""
+) -> tuple[Places, int]:
+    """Choose a variant's training set, and count the steps of a run, whose epochs have batches."""
     assert config.train is not None
     if training.min_images_of_place < training.min_images:
         places = read_places(config.train, min_images=training.min_images_of_place)
     try:
-        steps_per_epoch(training, groups_of(training, places))
+        steps = steps_per_epoch(training, groups_of(training, places))
     except InputError as error:
         raise InputError(f"{draft.name}: {error}") from error
-    return places
+    return places, steps * training.epochs
 
 
 def _drafts(config: ComparisonConfig) -> Iterator[Variant]:
@@ -283,12 +297,10 @@ def _fitted(
         return training
     size = min(training.places_per_batch * training.images_per_place // views, places)
     epochs = config.epochs or EPOCHS
-    optimiser = training.optimiser
-    warmup = min(optimiser.warmup_steps, places // size * epochs // _WARMUP_SHARE)
     return dataclasses.replace(
         training,
         loss=_own_places(training.loss),
-        optimiser=dataclasses.replace(optimiser, warmup_steps=warmup),
+        optimiser=with_short_warmup(training.optimiser, places // size * epochs),
         places_per_batch=size,
         images_per_place=views,
         min_images=views,

@@ -1,13 +1,16 @@
 """What a comparison is made of, and what is refused before any work."""
 
 import dataclasses
+import warnings
 
 import pytest
 
 from crisalad_jax.experiments.comparison import METHODS, ComparedMethod, ComparisonConfig, prepare
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.training.recipes import from_scratch, recipe
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
+from crisalad_jax.utils.notes import Note
 from tests.cli.test_cli import fails
 from tests.conftest import MODEL
 
@@ -45,6 +48,33 @@ def test_from_a_backbone_recipes_are_as_they_are(settings, shared):
         images_per_place=3,
         min_images=3,
     )
+
+
+def test_a_shortened_warm_up_is_told_and_stands_in_the_configuration(settings):
+    """Of one step an epoch: eight places make one batch; the recipe warms up for 30."""
+    names = ("crisalad", "salad")
+    with pytest.warns(Note) as caught:
+        prepared = prepare(ComparisonConfig(**settings | {"names": names, "epochs": 32}))
+    assert [str(each.message) for each in caught] == [
+        "warm-up: found 30 steps, shortened to 6 of the run's 32, for crisalad, salad"
+    ]
+    assert {v.training.optimiser.warmup_steps for v in prepared.variants} == {6}
+
+
+def test_a_recipe_from_a_backbone_warms_up_for_a_fifth_too(settings, shared, monkeypatch):
+    def slow(model, preset):
+        return TrainConfig(model=model, optimiser=OptimiserConfig(warmup_steps=30))
+
+    monkeypatch.setitem(RECIPES, "slow", slow)
+    changes = {"backbone": str(shared / "weights.safetensors"), "names": ("slow",)}
+    for epochs, warmup in ((10, 2), (150, 30)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            config = ComparisonConfig(**settings | changes | {"epochs": epochs})
+            (variant,) = prepare(config).variants
+        notes = [str(each.message) for each in caught if each.category is Note]
+        assert variant.training.optimiser.warmup_steps == warmup
+        assert len(notes) == (warmup < 30)
 
 
 def test_a_method_is_a_line():
@@ -102,8 +132,10 @@ def test_nothing_to_train_on(flags, capfd, tmp_path):
 
 
 def test_an_occupied_place(flags, capfd, tmp_path):
+    """By runs of 150 steps, whose warm-up is not shortened: a note would be another line."""
     (tmp_path / "letter.txt").write_text("mine")
-    fails(capfd, *flags, "--out", tmp_path, words=(tmp_path, "found files but no comparison"))
+    flags = (*flags, "--epochs", 150, "--out", tmp_path)
+    fails(capfd, *flags, words=(tmp_path, "found files but no comparison"))
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
 
