@@ -84,7 +84,8 @@ def _config(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
     if unknown:
         problems.append(f"found {', '.join(unknown)}, expected {', '.join(fields)} @ {path}")
     given = {
-        name: _value(hints[name], value[name], f"{path}.{name}", problems)
+        # A map's description has a field `config`, as the whole is called.
+        name: _value(hints[name], value[name], path if path == name else f"{path}.{name}", problems)
         for name in fields
         if name in value
     }

@@ -8,6 +8,7 @@ import pytest
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.config.io import from_plain
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
@@ -419,6 +420,18 @@ def test_a_field_of_another_type_is_refused_by_its_name(kind, fields, found, exp
     with pytest.raises(InputError, match=words) as caught:
         kind(**fields)
     assert "\n" not in str(caught.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Described:
+    config: CrossImageConfig
+
+
+def test_a_field_called_config_is_said_once():
+    """A map's description has one."""
+    words = r"^map\.json: found 'two', expected int @ config\.layers$"
+    with pytest.raises(InputError, match=words):
+        from_plain(Described, {"config": {"layers": "two"}}, source="map.json")
 
 
 @pytest.mark.usefixtures("_unchecked")

@@ -60,8 +60,9 @@ def centroids_of(params: Crisalad) -> np.ndarray:
 
 
 @CONFIGS
-def test_a_centroid_is_the_mean_of_the_features_nearest_to_it(config, fresh, paths) -> None:
+def test_a_centroid_is_the_mean_of_the_features_nearest_to_it(config, paths) -> None:
     """Of all features of all images: with 12 patches an image, none are left out."""
+    fresh = random_params(config)
     centroids = centroids_of(with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH))
     images = np.stack([resize_image(read_image(path), config.image_size) for path in paths])
     batches = images.reshape(-1, BATCH, *images.shape[1:])
