@@ -30,6 +30,18 @@ def read_whole(folder: pathlib.Path, entry: dict[str, Any]) -> bytes:
     return data
 
 
+def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
+    """The manifest, whose checksum is that of its bytes with zeros in the checksum's place."""
+    path = folder / "manifest.json"
+    data = path.read_bytes()
+    manifest = json.loads(data)
+    digest = manifest.pop("checksum", "")
+    zeros = data.replace(digest.encode(), b"0" * 64, 1)
+    if hashlib.sha256(zeros).hexdigest() != digest:
+        raise SystemExit(f"{path}: found other bytes than were written")
+    return manifest
+
+
 def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
     """The function of images (batch, height, width, 3), uint8, to descriptors."""
     program = jax.export.deserialize(bytearray(read_whole(folder, manifest["program"])))
@@ -76,7 +88,7 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=16)
     given = parser.parse_args()
 
-    manifest = json.loads((given.export / "manifest.json").read_text(encoding="utf-8"))
+    manifest = read_manifest(given.export)
     files = {p.relative_to(given.images).as_posix(): p for p in given.images.rglob("[!.]*")}
     names = sorted(name for name in files if name.lower().endswith(SUFFIXES))
     if not names:

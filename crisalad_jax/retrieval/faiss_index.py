@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, pieces, sample
 from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.checksums import append_checksum, check_appended
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source
 from crisalad_jax.utils.progress import progress_bar
@@ -168,7 +169,9 @@ def _trained_lists(database: Float[np.ndarray, "n d"], seed: int) -> Any:
 
 
 def save_index(path: str | os.PathLike[str], index: Index) -> None:
-    """Write an index in faiss's format, whole or not at all.
+    """Write an index in faiss's format with its checksum behind it, whole or not at all.
+
+    faiss itself reads the file too, and not as far as the checksum.
 
     Raises:
         InputError: the file cannot be written.
@@ -178,16 +181,23 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
             faiss.write_index(index.faiss_index, str(temporary))
         except RuntimeError as error:
             raise InputError(f"{path}: cannot be written: {_first_line(error)}") from error
+        append_checksum(temporary)
 
 
-def load_index(path: str | os.PathLike[str]) -> Index:
-    """Read an index that `save_index` wrote.
+def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
+    """Read an index that `save_index` wrote; a note tells of one without a checksum.
+
+    Args:
+        path: the file.
+        verify: whether to check that the file's bytes are those that were written.
 
     Raises:
-        InputError: there is no such file, or it holds no index of `KINDS`.
+        InputError: there is no such file, it was changed, or it holds no index of `KINDS`.
     """
     path = pathlib.Path(path)
     check_source(path, "a faiss index")
+    if verify:
+        check_appended(path)
     try:
         index = faiss.read_index(str(path))
     except (RuntimeError, MemoryError) as error:
