@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 import json
 import os
 import pathlib
@@ -20,6 +21,7 @@ import safetensors.numpy
 
 import crisalad_jax
 from crisalad_jax.checkpoints import weights
+from crisalad_jax.checkpoints.safetensors_io import write_sealed
 from crisalad_jax.checkpoints.weights import (
     is_ours,
     load_extras,
@@ -74,9 +76,11 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
     (length,) = struct.unpack("<Q", data[:8])
     header = json.loads(data[8 : 8 + length])
     metadata = header.pop("__metadata__")
-    assert metadata.keys() == {"crisalad-jax 2"}
-    told = json.loads(metadata["crisalad-jax 2"])
-    assert told.keys() == {"config", "version", "parts", "aggregator"}
+    assert metadata.keys() == {"crisalad-jax 3"}
+    told = json.loads(metadata["crisalad-jax 3"])
+    assert list(told) == ["checksum", "config", "version", "parts", "aggregator"]
+    blank = data.replace(told["checksum"].encode(), b"0" * 64)
+    assert hashlib.sha256(blank).hexdigest() == told["checksum"]
     assert told["config"] == to_plain(MODEL)
     assert told["version"] == crisalad_jax.__version__
     assert {field: name for field, (name, _) in told["parts"].items()} == {
@@ -147,11 +151,23 @@ def test_aggregators_that_a_model_does_not_have_are_free(tmp_path, shared):
 
 
 def rewrite(shared: pathlib.Path, path: pathlib.Path, change, metadata=None) -> None:
-    """The shared weights with changed arrays, or other metadata."""
+    """The shared weights with changed arrays, or other metadata; none of them with a checksum."""
     arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
     change(arrays)
     ours = {"crisalad-jax 2": json.dumps({"config": to_plain(MODEL)})}
     safetensors.numpy.save_file(arrays, path, metadata=ours if metadata is None else metadata)
+
+
+def reseal(shared: pathlib.Path, path: pathlib.Path, value, change=lambda arrays: None) -> None:
+    """The shared weights with other metadata and changed arrays, and the checksum of both."""
+    arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
+    change(arrays)
+    write_sealed(path, arrays, weights.FORMAT, value)
+
+
+def told_of(path: pathlib.Path, key: str) -> dict[str, Any]:
+    with safetensors.safe_open(path, framework="numpy") as file:
+        return json.loads(file.metadata()[key])
 
 
 # What version 0.1 wrote for MODEL, to the letter: the settings of eleven aggregators side by side.
@@ -191,9 +207,10 @@ def test_a_file_of_version_0_1_loads_bit_for_bit(tmp_path, params):
     extra = {"extra.backbone.mask_token": np.ones((1, 32), np.float32)}
     metadata = {"crisalad-jax 1": json.dumps(PLAIN_OF_VERSION_0_1)}
     safetensors.numpy.save_file(arrays | extra, path, metadata=metadata)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)  # it says nothing of sources
+    # It says nothing of sources.
+    with pytest.warns(Note, match=f"^{path}: found no checksum") as told:
         found, config = load_weights(path, expected=MODEL)
+    assert len(told) == 1
     assert config == MODEL
     assert_equal(found, params)
     assert is_ours(path)
@@ -201,6 +218,47 @@ def test_a_file_of_version_0_1_loads_bit_for_bit(tmp_path, params):
     # As it would be written today.
     save_weights(tmp_path / "again.safetensors", found, config)
     assert_equal(load_weights(tmp_path / "again.safetensors")[0], params)
+
+
+def test_a_file_of_the_second_format_loads_bit_for_bit(tmp_path, shared, params):
+    """Which had all that today's have, but for a checksum."""
+    path = tmp_path / "w.safetensors"
+    value = told_of(shared / "weights.safetensors", "crisalad-jax 3")
+    del value["checksum"]
+    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(value)})
+    with pytest.warns(Note, match=f"^{path}: found no checksum") as told:
+        found, config = load_weights(path, expected=MODEL)
+    assert len(told) == 1
+    assert config == MODEL
+    assert_equal(found, params)
+    assert is_ours(path)
+
+
+def test_a_file_of_the_third_format_without_a_checksum_is_refused(tmp_path, shared):
+    path = tmp_path / "w.safetensors"
+    metadata = {"crisalad-jax 3": json.dumps({"config": to_plain(MODEL)})}
+    rewrite(shared, path, lambda arrays: None, metadata)
+    for verify in (True, False):
+        with pytest.raises(InputError, match=rf"^{path} \(metadata\): found no checksum, expected"):
+            load_weights(path, verify=verify)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_weights_that_changed_are_refused_unless_they_are_not_verified(tmp_path, shared, inside):
+    """A number's last bit, or a field of the configuration that no parameter depends on."""
+    path = tmp_path / "w.safetensors"
+    data = bytearray((shared / "weights.safetensors").read_bytes())
+    if inside:
+        data[-1] ^= 1
+    else:
+        old = b'\\"compute_dtype\\": \\"float32\\"'
+        assert data.count(old) == 1
+        data = data.replace(old, b'\\"compute_dtype\\":\\"bfloat16\\"')
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=f"^{path}: found other bytes than were written"):
+        load_weights(path)
+    _, config = load_weights(path, verify=False)
+    assert config.compute_dtype == ("float32" if inside else "bfloat16")
 
 
 @pytest.mark.parametrize(
@@ -298,12 +356,16 @@ SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
 )
 def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words):
     path = tmp_path / "w.safetensors"
-    rewrite(shared, path, change)
-    with pytest.raises(InputError, match=f"^{path}: weights do not fit: ") as error:
-        load_weights(path)
-    assert "\n" not in str(error.value)
-    for word in words:
-        assert word in str(error.value)
+    for write in (
+        functools.partial(rewrite, shared, path, change),
+        functools.partial(reseal, shared, path, {"config": to_plain(MODEL)}, change),
+    ):
+        write()
+        with pytest.raises(InputError, match=f"^{path}: weights do not fit: ") as error:
+            load_weights(path)
+        assert "\n" not in str(error.value)
+        for word in words:
+            assert word in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -311,11 +373,11 @@ def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words)
     [
         ({}, r"found metadata \[\]"),
         ({"format": "pt"}, r"found metadata \['format'\]"),
-        ({"crisalad-jax 1": ""}, "found no configuration in its metadata"),
-        ({"crisalad-jax 1": "{"}, "found no configuration in its metadata"),
+        ({"crisalad-jax 1": ""}, r"\(metadata\): found no JSON \(Expecting value"),
+        ({"crisalad-jax 1": "{"}, r"\(metadata\): found no JSON \(Expecting property name"),
         ({"crisalad-jax 1": "[]"}, "found list"),
         ({"crisalad-jax 1": '{"clusters": 3}'}, "clusters"),
-        ({"crisalad-jax 1": "[" * 10**5}, "found no configuration in its metadata"),
+        ({"crisalad-jax 1": "[" * 10**5}, r"\(metadata\): found no JSON \(nested too deep\)"),
         ({"crisalad-jax 1": '{"encoder": {"layers": 99999999999}}'}, "of up to 99999999999"),
         ({"crisalad-jax 1": '{"encoder": {"layers": 900}}'}, "far from the sizes"),
         (
@@ -323,13 +385,13 @@ def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words)
             "far from the sizes",
         ),
         ({"crisalad-jax 1": '{"backbone": {"dim": 9000000000000}}'}, "of up to 9000000000000"),
-        ({"crisalad-jax 2": ""}, "found no configuration in its metadata"),
-        ({"crisalad-jax 2": "{"}, "found no configuration in its metadata"),
+        ({"crisalad-jax 2": ""}, r"\(metadata\): found no JSON \(Expecting value"),
+        ({"crisalad-jax 2": "{"}, r"\(metadata\): found no JSON \(Expecting property name"),
         ({"crisalad-jax 2": "[]"}, "found no configuration in its metadata, expected 'config'"),
         ({"crisalad-jax 2": "{}"}, "found no configuration in its metadata, expected 'config'"),
         ({"crisalad-jax 2": '{"config": []}'}, "found list"),
         ({"crisalad-jax 2": '{"config": {"clusters": 3}}'}, "clusters"),
-        ({"crisalad-jax 2": "[" * 10**5}, "found no configuration in its metadata"),
+        ({"crisalad-jax 2": "[" * 10**5}, r"\(metadata\): found no JSON \(nested too deep\)"),
         ({"crisalad-jax 2": '{"config": {}, "parts": []}'}, "found parts of list, expected an ob"),
         ({"crisalad-jax 2": '{"config": {}, "aggregator": 3}'}, "found aggregator of int, expect"),
         (
@@ -345,6 +407,10 @@ def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words)
             {"crisalad-jax 2": '{"config": {"backbone": {"name": "vit", "dim": 9000000000000}}}'},
             "of up to 9000000000000",
         ),
+        ({"crisalad-jax 3": ""}, r"\(metadata\): found no JSON \(Expecting value"),
+        ({"crisalad-jax 3": "[]"}, r"\(metadata\): found no checksum, expected one in 'crisalad-j"),
+        ({"crisalad-jax 3": "{}"}, r"\(metadata\): found no checksum, expected one in 'crisalad-j"),
+        ({"crisalad-jax 3": '{"checksum": 3}'}, "found other bytes than were written"),
     ],
 )
 def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
@@ -356,13 +422,49 @@ def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("length", [0, 5, 40, 5000, -1])
-def test_a_file_cut_short_is_refused(tmp_path, shared, length):
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ({}, "found no configuration in its metadata, expected 'config'"),
+        ({"config": []}, "found list"),
+        ({"config": {"clusters": 3}}, "clusters"),
+        ({"config": {}, "parts": []}, "found parts of list, expected an ob"),
+        ({"config": {}, "aggregator": 3}, "found aggregator of int, expect"),
+        ({"config": {"cross_image": {"layers": 900}}}, "far from the sizes"),
+        ({"config": {"backbone": {"name": "vit", "dim": 9 * 10**12}}}, "of up to 9000000000000"),
+    ],
+)
+def test_foreign_metadata_with_a_right_checksum_are_refused(tmp_path, shared, value, words):
+    path = tmp_path / "w.safetensors"
+    reseal(shared, path, value)
+    with pytest.raises(InputError, match=words) as error:
+        load_weights(path)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("length", "words"),
+    [
+        *((length, "not a whole safetensors file") for length in (0, 5, 40, 5000)),
+        # The header is there, with the checksum.
+        (-1, "found other bytes than were written"),
+    ],
+)
+def test_a_file_cut_short_is_refused(tmp_path, shared, length, words):
     path = tmp_path / "w.safetensors"
     path.write_bytes((shared / "weights.safetensors").read_bytes()[:length])
-    with pytest.raises(InputError, match=f"^{path}: not a whole safetensors file") as error:
+    with pytest.raises(InputError, match=f"^{path}: {words}") as error:
         load_weights(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_file_of_earlier_versions_cut_short_is_refused(tmp_path, shared):
+    whole, path = tmp_path / "whole.safetensors", tmp_path / "w.safetensors"
+    rewrite(shared, whole, lambda arrays: None)
+    path.write_bytes(whole.read_bytes()[:-1])
+    with pytest.raises(InputError, match=f"^{path}: not a whole safetensors file"):
+        load_weights(path)
 
 
 def test_no_file_or_another_one_is_refused(tmp_path):
@@ -551,7 +653,7 @@ def test_a_step_that_is_not_registered_is_named(tmp_path, shared):
     plain = to_plain(MODEL)
     plain["aggregator"]["sinkhorn"]["step"] = {"name": "capacity"}
     path = tmp_path / "w.safetensors"
-    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps({"config": plain})})
+    reseal(shared, path, {"config": plain})
     words = "step: found 'capacity', expected one of .*plug-in missing.* @ config.aggregator.sinkh"
     with pytest.raises(InputError, match=words):
         load_weights(path)
@@ -590,10 +692,10 @@ def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
 
 def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypatch):
     path = tmp_path / "w.safetensors"
-    with safetensors.safe_open(shared / "weights.safetensors", framework="numpy") as file:
-        told = json.loads(file.metadata()["crisalad-jax 2"])
-    told["parts"]["aggregator.dustbin"][1] = "0" * 64
-    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(told)})
+    told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
+    del told["checksum"]
+    told["parts"]["aggregator.dustbin"][1] = "0" * 64  # as the checksum is before it is known
+    reseal(shared, path, told)
     (note,) = notes_of(path)
     assert f"{path}: found another source of aggregator.dustbin column than" in note
     assert notes_of(shared / "weights.safetensors") == []
@@ -606,5 +708,8 @@ def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypa
 def test_sources_that_are_none_are_passed_over(tmp_path, shared, parts):
     path = tmp_path / "w.safetensors"
     told = {"config": to_plain(MODEL), "version": crisalad_jax.__version__, "parts": parts}
-    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(told)})
+    reseal(shared, path, told)
     assert notes_of(path) == []
+    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(told)})
+    (note,) = notes_of(path)
+    assert note.startswith(f"{path}: found no checksum")

@@ -1,21 +1,31 @@
 """`crisalad pca`, and `extract --pca`."""
 
+import hashlib
 import json
+import pathlib
 
 import ml_dtypes
 import numpy as np
 import pytest
 
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, load_pca, save_pca
+from crisalad_jax.utils.files import write_json
 from tests.cli.test_cli import extract, fails, succeeds
 
 DESCRIPTORS = np.random.default_rng(0).standard_normal((60, 48)).astype(np.float32)
+
+
+def record(path: pathlib.Path) -> None:
+    """Write the digest of descriptors beside them: a note tells of those that have none."""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    write_json(path.with_name(f"{path.name}.json"), {"files": {"descriptors": digest}})
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float16, ml_dtypes.bfloat16])
 def test_what_is_fitted_is_written(capfd, tmp_path, kind):
     rows = DESCRIPTORS.astype(kind)
     np.save(tmp_path / "d.npy", rows)
+    record(tmp_path / "d.npy")
     path = tmp_path / "new" / "pca.safetensors"
     out = succeeds(
         capfd,
@@ -71,7 +81,7 @@ def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
     weights = shared / "weights.safetensors"
     for components, words in (
         (tmp_path / "none", (f"{tmp_path / 'none'}: found no such file",)),
-        (weights, (f"{weights}: found arrays", "as `crisalad pca` writes it")),
+        (weights, (f"{weights}: found metadata", "as `crisalad pca` writes it")),
         (tmp_path / "long.safetensors", (f"{weights}: found descriptors of length 48", "50")),
     ):
         start = extract(shared, shared / "no-folder", tmp_path / "d.npy", "--pca", components)
@@ -82,6 +92,12 @@ def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
     np.save(tmp_path / "o.npy", np.array([None]), allow_pickle=True)
     (tmp_path / "cut.npy").write_bytes((tmp_path / "d.npy").read_bytes()[:500])
     (tmp_path / "t.npy").write_text("nothing")
+    for name in "diot":
+        record(tmp_path / f"{name}.npy")
+    record(tmp_path / "cut.npy")
+    np.save(tmp_path / "changed.npy", DESCRIPTORS)
+    record(tmp_path / "changed.npy")
+    np.save(tmp_path / "changed.npy", -DESCRIPTORS)
     for name, more, words in (
         ("d.npy", ("--dim", 49), ("dim: found 49, expected 1 to 48",)),
         ("d.npy", ("--seed", -3, "--samples", 50), ("seed: found -3, expected at least 0",)),
@@ -91,6 +107,7 @@ def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
         ("o.npy", (), ("o.npy: not a whole .npy file",)),
         ("cut.npy", (), ("cut.npy: not a whole .npy file",)),
         ("t.npy", (), ("t.npy: not a whole .npy file",)),
+        ("changed.npy", (), ("changed.npy: found other bytes than changed.npy.json says",)),
     ):
         fails(
             capfd,

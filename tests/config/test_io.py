@@ -17,6 +17,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import RECIPES, recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.notes import Note
 
 CHANGED = dataclasses.replace(
     recipe("tiny"), cities=("Aston", "Brill"), patience=4, augmentation=recipe("b14").augmentation
@@ -132,9 +133,27 @@ def test_a_file_that_is_no_configuration_is_named(tmp_path: pathlib.Path, conten
 
 
 def test_a_missing_file_is_named(tmp_path: pathlib.Path):
-    for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(InputError, match=f"^{path}: cannot read"):
+    for path, found in ((tmp_path / "none.json", "no such file"), (tmp_path, "a folder")):
+        with pytest.raises(InputError, match=f"^{path}: found {found}, expected a configuration"):
             read_config(ModelConfig, path)
+
+
+def test_a_written_configuration_that_was_changed_is_refused(tmp_path: pathlib.Path):
+    path = tmp_path / "config.json"
+    write_json(path, to_plain(recipe("tiny")))
+    text = path.read_text()
+    assert text.count('"seed": 0') == 1
+    path.write_text(text.replace('"seed": 0', '"seed": 1'))
+    with pytest.raises(InputError, match=f"^{path}: found other bytes than were written"):
+        read_config(TrainConfig, path)
+
+
+def test_a_configuration_without_a_checksum_is_read_with_a_note(tmp_path: pathlib.Path):
+    path = tmp_path / "config.json"
+    path.write_text('{"seed": 7}')
+    with pytest.warns(Note, match=f"^{path}: found no checksum") as told:
+        assert read_config(TrainConfig, path) == TrainConfig(seed=7)
+    assert len(told) == 1
 
 
 @pytest.mark.parametrize(

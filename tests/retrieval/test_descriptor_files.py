@@ -7,7 +7,12 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from crisalad_jax.retrieval.descriptor_files import open_npy, read_descriptors, write_descriptors
+from crisalad_jax.retrieval.descriptor_files import (
+    check_suffix,
+    open_npy,
+    read_descriptors,
+    write_descriptors,
+)
 from crisalad_jax.utils.errors import InputError
 
 NAMES = ["a.jpg", "summer/a.jpg", "summer/noon/with space.jpg", "Straße.jpg"]
@@ -65,9 +70,13 @@ def test_an_older_file_is_replaced(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("name", ["map.csv", "map", "map.npy.gz", "map.NPY"])
-def test_another_suffix_is_refused_before_any_work(name):
-    with pytest.raises(InputError, match=rf"{name}: suffix.*expected one of \.h5, \.npy"):
-        write_descriptors(name)
+def test_another_suffix_is_refused_before_any_work(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = rf"{name}: suffix.*expected one of \.h5, \.npy"
+    for refuse in (check_suffix, lambda name: write_descriptors(name, DESCRIPTORS, NAMES)):
+        with pytest.raises(InputError, match=words):
+            refuse(name)
+    assert names_in(tmp_path) == set()
 
 
 @pytest.mark.parametrize("suffix", ["npy", "h5"])
@@ -156,7 +165,7 @@ def test_files_that_are_no_descriptors_are_named(tmp_path):
     path = tmp_path / "map.npy"
     with path.open("wb") as file:
         np.savez(file, DESCRIPTORS)
-    with pytest.raises(InputError, match=r"map\.npy: found an archive, expected an array of float"):
+    with pytest.raises(InputError, match=r"map\.npy: not a whole \.npy file: the magic string is"):
         open_npy(path)
     for array, words in (
         (DESCRIPTORS[0], r"map\.npy: found shape \(6,\), expected \(images, descriptor\)"),

@@ -1,15 +1,18 @@
 """Principal components against numpy's singular values, and what they are defined by."""
 
 import dataclasses
+import json
 import pathlib
 
 import numpy as np
 import pytest
 import safetensors.numpy
 
+from crisalad_jax.checkpoints.safetensors_io import write_sealed
 from crisalad_jax.retrieval import pca
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, load_pca, save_pca
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 
 PLAIN = PcaConfig(renormalise=False)
 
@@ -167,9 +170,10 @@ def test_files_of_something_else_are_named(tmp_path):
     with pytest.raises(InputError, match=r"pca\.safetensors: found no such file"):
         load_pca(path)
     safetensors.numpy.save_file({"mean": np.zeros(3, np.float32)}, path)
-    with pytest.raises(
-        InputError, match=r"found arrays \['mean'\] and metadata \[\], expected 'cri"
-    ):
+    with pytest.raises(InputError, match=r"found metadata \[\], expected .*'crisalad-jax pca 2'"):
+        load_pca(path)
+    write_sealed(path, {"mean": np.zeros(3, np.float32)}, pca.FORMAT, {"config": {}})
+    with pytest.raises(InputError, match=r"found arrays \['mean'\], expected .*of principal comp"):
         load_pca(path)
     for changes, words in (
         ({"mean": found.mean[:7]}, r"of shapes \[\(7,\), \(5, 12\)"),
@@ -180,6 +184,46 @@ def test_files_of_something_else_are_named(tmp_path):
         with pytest.raises(InputError, match=words):
             load_pca(path)
     save_pca(path, found)
-    path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(InputError, match="not a whole file of principal components"):
+    data = path.read_bytes()
+    for length, words in (
+        (len(data) - 9, "found other bytes than were written"),
+        (60, "not a whole safetensors file .*expected a file of principal components"),
+        (0, "not a whole safetensors file"),
+    ):
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=rf"pca\.safetensors: {words}"):
+            load_pca(path)
+
+
+def test_components_that_changed_are_refused_unless_they_are_not_verified(tmp_path):
+    found = fit_pca(_descriptors(30, 12), 5)
+    path = tmp_path / "pca.safetensors"
+    save_pca(path, found)
+    data = bytearray(path.read_bytes())
+    place = bytes(data).index(found.mean.tobytes())
+    data[place] ^= 1  # the last bit of a number's fraction
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"pca\.safetensors: found other bytes than were written"):
         load_pca(path)
+    again = load_pca(path, verify=False)
+    assert again.mean[0] != found.mean[0]
+    np.testing.assert_array_equal(again.components, found.components)
+
+
+def test_components_of_the_first_format_load_with_a_note(tmp_path):
+    """Whose metadata were the configuration alone."""
+    found = fit_pca(_descriptors(30, 12), 5, PcaConfig(whiten=True, renormalise=False))
+    arrays = {
+        name: np.array(array, order="C")
+        for name, array in found._asdict().items()
+        if name != "config"
+    }
+    path = tmp_path / "pca.safetensors"
+    metadata = {"crisalad-jax pca 1": json.dumps(dataclasses.asdict(found.config))}
+    safetensors.numpy.save_file(arrays, path, metadata=metadata)
+    with pytest.warns(Note, match=r"pca\.safetensors: found no checksum") as told:
+        again = load_pca(path)
+    assert len(told) == 1
+    assert again.config == found.config
+    for a, b in zip(again[:4], found[:4], strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -14,12 +14,15 @@ from crisalad_jax.utils.files import (
     check_new_folder,
     check_target,
     durable_path,
+    read_json,
+    write_json,
+    write_npy,
+)
+from crisalad_jax.utils.temporaries import (
     holds_other_files,
     is_temporary,
     remove_temporaries,
     temporary_beside,
-    write_json,
-    write_npy,
 )
 
 
@@ -96,10 +99,14 @@ def test_a_check_makes_nothing(tmp_path: pathlib.Path, monkeypatch: pytest.Monke
 def test_json_is_written_whole_or_not_at_all(tmp_path: pathlib.Path):
     path = tmp_path / "x.json"
     write_json(path, {"a": [1, 2.5, None]})
-    assert json.loads(path.read_text()) == {"a": [1, 2.5, None]}
+    whole = path.read_bytes()
+    value = json.loads(whole)
+    assert list(value) == ["checksum", "a"]
+    assert value["a"] == [1, 2.5, None]
+    assert read_json(path, "numbers") == {"a": [1, 2.5, None]}
     with pytest.raises(TypeError):
         write_json(path, {"a": object()})
-    assert json.loads(path.read_text()) == {"a": [1, 2.5, None]}
+    assert path.read_bytes() == whole
     assert os.listdir(tmp_path) == ["x.json"]
 
 

@@ -22,6 +22,7 @@ from crisalad_jax.experiments.comparison import (
 )
 from crisalad_jax.nn.model import init_crisalad
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json, write_json
 from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH, STEPS, assert_equal
 
@@ -109,12 +110,12 @@ def test_only_what_is_missing_is_done_again(finished, flags, capfd, monkeypatch)
     after = stamps(finished)
     changed = {str(path) for path in after if after[path] != before.get(path)}
     assert changed == {"crisalad/seed-1/test-0.json", "results.json"}
-    seconds = '"seconds": '
-    assert _without(missing.read_text(), seconds) == _without(content, seconds)
+    differing = ('"seconds": ', '"checksum": ')  # of how long it took, and of the file's bytes
+    assert _without(missing.read_text(), *differing) == _without(content, *differing)
 
 
-def _without(text: str, start: str) -> list[str]:
-    return [line for line in text.splitlines() if not line.strip().startswith(start)]
+def _without(text: str, *starts: str) -> list[str]:
+    return [line for line in text.splitlines() if not line.strip().startswith(starts)]
 
 
 def test_interrupted_between_training_and_evaluation(finished, flags, capfd, tmp_path, monkeypatch):
@@ -157,12 +158,26 @@ def test_a_run_that_was_cut_short_goes_on(finished, flags, capfd, tmp_path):
 def test_a_file_of_results_that_is_cut_short(finished, flags, capfd):
     path = finished / "crisalad" / "seed-0" / "test-0.json"
     path.write_text(path.read_text()[:40])
-    fails(capfd, *flags, "--out", finished, words=(path, "cannot read this result", "delete it"))
+    fails(capfd, *flags, "--out", finished, words=(path, "found no JSON", "delete it"))
+
+
+@pytest.mark.parametrize(
+    "name", ["crisalad/seed-0/test-0.json", "crisalad/seed-1/training.json", "speed.json"]
+)
+def test_a_file_of_results_that_was_changed(finished, flags, capfd, name):
+    path = finished / name
+    text = path.read_text()
+    path.write_text(
+        text.replace('"device": "', '"device": "x').replace('"queries": 5', '"queries": 6')
+    )
+    assert path.read_text() != text
+    words = (path, "found other bytes than were written", "delete it, and the same command")
+    fails(capfd, *flags, "--out", finished, words=words)
 
 
 def test_a_result_of_another_set(finished, flags, capfd):
     path = finished / "crisalad" / "seed-0" / "test-0.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"queries": 4}))
+    write_json(path, read_json(path, "a result") | {"queries": 4})
     words = (path, "with 4 queries and 7 database images, expected", "with 5 and 7; delete it")
     fails(capfd, *flags, "--out", finished, words=words)
 

@@ -1,9 +1,11 @@
 """Maps: what they say of themselves, what they refuse, and that a kill leaves them whole."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import pathlib
+import socket
 import subprocess
 import sys
 
@@ -13,7 +15,14 @@ import pytest
 
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions
-from crisalad_jax.retrieval.maps.manifest import check_model, describe_map, read_description
+from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.maps.manifest import (
+    MapDescription,
+    check_model,
+    describe_map,
+    read_description,
+    write_record,
+)
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
@@ -22,6 +31,7 @@ from tests import killed_appends
 from tests.conftest import MODEL, random_params
 from tests.killed_appends import append_until, description, names, rows
 from tests.retrieval.maps.test_stores import brute_force
+from tests.utils.test_checksums import flips
 
 ROOT = pathlib.Path(__file__).parents[3]
 LENGTH = killed_appends.LENGTH
@@ -43,7 +53,23 @@ def folder(tmp_path) -> pathlib.Path:
 
 
 def edit(path: pathlib.Path, **changes) -> None:
+    """As a user might, who leaves the checksum as it is."""
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def reseal(path: pathlib.Path, **changes) -> None:
+    """With the checksum of what is written: what is found wrong is the value."""
+    value = json.loads(path.read_text()) | changes
+    del value["checksum"]
+    write_record(path, value)
+
+
+def spoil_rows(path: pathlib.Path, row: int, factor: float) -> None:
+    """Change a descriptor of an addition, and the digest in its record."""
+    spoilt = np.load(path)
+    spoilt[row] *= factor
+    np.save(path, spoilt)
+    reseal(path.with_suffix(".json"), sha256=hashlib.sha256(spoilt.tobytes()).hexdigest())
 
 
 # Killed
@@ -125,8 +151,116 @@ def test_verify_names_the_descriptors_that_changed(folder):
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
-    with Map.open(folder) as found, pytest.raises(InputError, match=r"0000000003: .*3 to 6 have"):
-        found.verify()
+    words = r"0000000003: .*3 to 6 have"
+    with pytest.raises(InputError, match=words), Map.open(folder):
+        pass
+    with Map.open(folder, verify=False) as found:
+        assert len(found) == 7
+        for read in (found.verify, lambda: found.summary(verify=True)):
+            with pytest.raises(InputError, match=words):
+                read()
+
+
+def test_a_map_that_is_not_verified_is_opened_without_reading_descriptors(folder, monkeypatch):
+    read = []
+    real = FileStore.read
+    monkeypatch.setattr(
+        FileStore, "read", lambda self, *where: read.append(where) or real(self, *where)
+    )
+    with Map.open(folder, verify=False) as found:
+        assert read == []
+        assert not found.summary()["verified"]
+    with Map.open(folder):
+        assert read == [(0, 1), (1, 2), (3, 4)]
+
+
+@pytest.mark.parametrize(
+    "name", ["map.json", "segments/0000000001.json", "segments/0000000003.npy"]
+)
+def test_one_other_byte_anywhere_in_a_map_is_refused(folder, name):
+    path = folder / name
+    whole = path.read_bytes()
+    tried = 0
+    for place, data in flips(whole, 60):
+        path.write_bytes(data)
+        with pytest.raises(InputError) as error, Map.open(folder):
+            pass
+        words = str(error.value)
+        # Descriptors are named by their numbers.
+        assert str(folder / name.removesuffix(".npy")) in words, (place, words)
+        assert "\n" not in words
+        tried += 1
+    assert tried == 60
+    path.write_bytes(whole)
+    assert killed_appends.check(folder) == 7
+
+
+# Of earlier versions
+
+
+def unsealed(path: pathlib.Path, **changes) -> None:
+    value = json.loads(path.read_text()) | changes
+    del value["checksum"]
+    path.write_text(json.dumps(value) + "\n")
+
+
+def make_format_2(folder: pathlib.Path) -> None:
+    """As version 0.2 wrote it: no file had a checksum of itself."""
+    unsealed(folder / "map.json", format=2)
+    for path in (folder / "segments").glob("*.json"):
+        unsealed(path)
+
+
+def test_a_map_of_format_2_opens_with_one_note_and_grows(folder):
+    make_format_2(folder)
+    made = dataclasses.replace(description("files"), format=2)
+    for added in (0, 2):
+        with pytest.warns(Note, match="map: found no checksum") as told:
+            found = Map.open(folder)
+        assert len(told) == 1
+        assert found.description == made
+        assert [image.name for image in found.images] == names(0, 7 + added)
+        np.testing.assert_array_equal(np.concatenate(list(found.descriptors)), rows(0, 7 + added))
+        found.close()
+        if not added:
+            with pytest.warns(Note, match="map: found no checksum") as told:
+                append_two(folder, made)
+            assert len(told) == 1
+    assert json.loads((folder / "map.json").read_text())["format"] == 2
+
+
+def append_two(folder: pathlib.Path, made: MapDescription) -> None:
+    with open_for_appending(folder, made) as target:
+        target.append(names(7, 2), [7, 7], rows(7, 2), root="/images")
+
+
+def test_what_was_added_to_a_map_of_format_2_is_checked(folder):
+    make_format_2(folder)
+    made = dataclasses.replace(description("files"), format=2)
+    with pytest.warns(Note):
+        append_two(folder, made)
+    edit(folder / "segments" / "0000000007.json", bytes=[7, 8])
+    words = r"0000000007\.json: found other bytes than were written"
+    with pytest.raises(InputError, match=words), Map.open(folder):
+        pass
+
+
+def test_a_changed_descriptor_of_a_map_of_format_2_is_found(folder):
+    make_format_2(folder)
+    path = folder / "segments" / "0000000001.npy"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.warns(Note), pytest.raises(InputError, match="1 to 2 have changed since"):
+        Map.open(folder)
+
+
+@pytest.mark.parametrize("name", ["map.json", "segments/0000000001.json"])
+def test_a_map_of_format_3_cannot_lose_a_checksum(folder, name):
+    unsealed(folder / name)
+    words = rf"{pathlib.PurePath(name).stem}\.json: found no checksum, expected a"
+    with pytest.raises(InputError, match=words), Map.open(folder):
+        pass
 
 
 # The model
@@ -138,7 +272,7 @@ def test_a_description_is_read_as_it_was_written(tmp_path):
         assert target.description == made
     assert read_description(tmp_path / "map") == made
     assert made.descriptor_length == MODEL.descriptor_dim
-    assert (made.grouping, made.format, made.store) == ("single", 2, "files")
+    assert (made.grouping, made.format, made.store) == ("single", 3, "files")
     other = describe_map(random_params(MODEL), MODEL, tmp_path / "w", tmp_path / "map")
     assert made.collection != other.collection
 
@@ -163,10 +297,12 @@ def test_a_map_of_version_0_1_takes_weights_on_trust_and_says_so():
 def test_one_process_appends_at_a_time(folder):
     with (
         open_for_appending(folder, description("files")),
-        pytest.raises(InputError, match="map: another process is appending to this map"),
+        pytest.raises(InputError, match="map: found another process that writes here") as error,
         open_for_appending(folder, description("files")),
     ):
         pass
+    assert f"(process {os.getpid()} on {socket.gethostname()})" in str(error.value)
+    assert "\n" not in str(error.value)
     append_until(folder, 8)
 
 
@@ -174,19 +310,34 @@ def test_one_process_appends_at_a_time(folder):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda m: edit(m / "map.json", format=3), "found a map of format 3, expected at most 2"),
-        (lambda m: (m / "map.json").write_text('{"model'), "map.json: cannot read this map"),
-        (lambda m: edit(m / "map.json", dtype="int3"), "map.json: dtype: found 'int3', expected"),
-        (lambda m: edit(m / "map.json", store="no"), "map.json: store: found 'no', expected files"),
+        (lambda m: reseal(m / "map.json", format=4), "found a map of format 4, expected at most 3"),
+        (lambda m: edit(m / "map.json", format=4), "map.json: found other bytes than were written"),
+        (lambda m: edit(m / "map.json", format=2), "map.json: found other bytes than were written"),
+        (lambda m: (m / "map.json").write_text('{"model'), "map.json: found no JSON (Unterminated"),
+        (lambda m: reseal(m / "map.json", dtype="int3"), "map.json: dtype: found 'int3', expected"),
+        (lambda m: reseal(m / "map.json", store="n"), "map.json: store: found 'n', expected files"),
+        (lambda m: edit(m / "map.json", store="n"), "map.json: found other bytes than were"),
         (lambda m: (m / "map.json").write_text("[]"), "map.json: found list, expected an object"),
         (lambda m: (m / "map.json").unlink(), "map: found segments and no map.json"),
         (
             lambda m: (m / "segments" / "0000000001.json").write_text('{"root": "/im'),
+            "0000000001.json: found no JSON (Unterminated",
+        ),
+        (
+            lambda m: (m / "segments" / "0000000001.json").write_text("[]"),
+            "0000000001.json: found no checksum, expected a record of images",
+        ),
+        (
+            lambda m: reseal(m / "segments" / "0000000001.json", bytes=[7]),
             "0000000001.json: not a whole record of images",
         ),
         (
-            lambda m: edit(m / "segments" / "0000000001.json", bytes=[7]),
+            lambda m: reseal(m / "segments" / "0000000001.json", names=[], bytes=[], positions=[]),
             "0000000001.json: not a whole record of images",
+        ),
+        (
+            lambda m: edit(m / "segments" / "0000000001.json", bytes=[7, 8]),
+            "0000000001.json: found other bytes than were written",
         ),
         (
             lambda m: (m / "segments" / "0000000001.json").unlink(),
@@ -194,7 +345,7 @@ def test_one_process_appends_at_a_time(folder):
         ),
         (
             lambda m: (m / "segments" / "0000000001.npy").unlink(),
-            "0000000001.npy: not a whole file of descriptors: No such file",
+            "0000000001.npy: found no such file, expected a file of a map's descriptors",
         ),
     ],
 )
@@ -330,7 +481,8 @@ def test_what_others_put_into_a_map_that_fails_is_kept(tmp_path):
 
     with pytest.raises(ZeroDivisionError):
         fail()
-    assert sorted(os.listdir(tmp_path / "map")) == [".lock", "map.json", "notes.txt"]
+    assert sorted(os.listdir(tmp_path / "map")) == ["map.json", "notes.txt"]
+    assert (tmp_path / "map" / "notes.txt").read_text() == "x"
     append_until(tmp_path / "map", 1)
 
 
@@ -345,10 +497,7 @@ def test_a_map_without_images_is_made_anew_as_another(tmp_path):
 
 @pytest.mark.parametrize("value", [np.nan, 2.0])
 def test_a_row_of_a_file_that_is_no_descriptor_is_named(folder, value):
-    path = folder / "segments" / "0000000003.npy"
-    spoilt = np.load(path)
-    spoilt[2] *= value
-    np.save(path, spoilt)
+    spoil_rows(folder / "segments" / "0000000003.npy", row=2, factor=value)
     with (
         Map.open(folder) as found,
         pytest.raises(InputError, match=r"0000000003\.npy: row 2 is (not finite|of length 2),"),

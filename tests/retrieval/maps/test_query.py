@@ -114,7 +114,7 @@ def test_a_table(answers):
     ("images", "options", "words"),
     [
         ([], {}, "images: found none, expected images or folders of them"),
-        (["none.jpg"], {}, "none.jpg: cannot read"),
+        (["none.jpg"], {}, "none.jpg: found no such file"),
         (["none.jpg"], {"k": 0}, "k: found 0, expected at least 1"),
         (["none.jpg"], {"batch_size": 0}, "batch size: found 0"),
     ],

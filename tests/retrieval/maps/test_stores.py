@@ -1,6 +1,7 @@
 """Both stores against brute force in float64, and against each other."""
 
 import fcntl
+import os
 import pathlib
 
 import numpy as np
@@ -94,9 +95,9 @@ def test_read_gives_the_very_numbers(store):
 
 def test_descriptors_that_are_missing_are_an_error(store):
     fill(store, unit_rows(3), (3,))
-    with pytest.raises(InputError, match=r"found (3|float32|no)|No such file"):
+    with pytest.raises(InputError, match=r"found (3|no such file)"):
         store.check([(0, 3), (3, 1)])
-    with pytest.raises(InputError, match=r"found|No such file"):
+    with pytest.raises(InputError, match=r"found (0|no such file)"):
         store.read(3, 1)
 
 
@@ -108,9 +109,11 @@ def test_both_give_the_same_answers(tmp_path):
     answers = []
     for number, name in enumerate(STORES):
         first = opened(tmp_path, name)
-        fill(first, rows, ((40,), (3, 17, 20))[number])
+        sizes = ((40,), (3, 17, 20))[number]
+        fill(first, rows, sizes)
         first.close()
         again = opened(tmp_path, name, new=False)
+        again.check([(sum(sizes[:i]), size) for i, size in enumerate(sizes)])
         answers.append([again.search(queries, k, 40) for k in (1, 3, 40)])
         again.close()
     for ours, theirs in zip(*answers, strict=True):
@@ -130,21 +133,46 @@ def test_float16_files_are_half_as_large_and_search_what_they_hold(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    "spoil",
     [
-        (lambda data: data[:-1], "not a whole file of descriptors"),
-        (lambda data: b"", "not a whole file of descriptors"),
-        (lambda data: b"no array" * 20, "not a whole file of descriptors"),
-        (lambda data: data.replace(b"(3, 24)", b"(2, 24)"), r"found float32 \(2, 24\), expected"),
-        (lambda data: data.replace(b"<f4", b"<i4"), r"found int32 \(3, 24\), expected float32"),
+        lambda data: data[:-1],
+        lambda data: data + b"\0",
+        lambda data: b"",
+        lambda data: b"no array" * 52,
+        lambda data: data.replace(b"(3, 24)", b"(2, 24)"),
+        lambda data: data.replace(b"(3, 24)", b"(24, 3)"),
+        lambda data: data.replace(b"<f4", b"<i4"),
+        lambda data: data.replace(b"False", b"True "),
+        lambda data: data.replace(b", }  ", b",}   "),
     ],
 )
-def test_a_damaged_file_is_found_when_the_map_is_opened(tmp_path, spoil, words):
+def test_a_damaged_file_is_found_when_the_map_is_opened(tmp_path, spoil):
+    """Without reading its numbers: by its header, byte for byte, and its size."""
     store = opened(tmp_path, "files")
     fill(store, unit_rows(3), (3,))
     path = tmp_path / "segments" / "0000000000.npy"
-    path.write_bytes(spoil(path.read_bytes()))
-    with pytest.raises(InputError, match=rf"0000000000\.npy: {words}"):
+    spoilt = spoil(path.read_bytes())
+    assert spoilt != path.read_bytes()
+    path.write_bytes(spoilt)
+    words = r"0000000000\.npy: found other bytes than of float32 \(3, 24\), expected the whole"
+    with pytest.raises(InputError, match=words):
+        store.check([(0, 3)])
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path):
+    """Opening a pipe would wait for a writer."""
+    store = opened(tmp_path, "files")
+    fill(store, unit_rows(3), (3,))
+    path = tmp_path / "segments" / "0000000000.npy"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(
+        InputError, match=r"0000000000\.npy: found a pipe, expected a file of a map"
+    ):
+        store.check([(0, 3)])
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match=r"0000000000\.npy: found a folder, expected a file of a"):
         store.check([(0, 3)])
 
 

@@ -214,7 +214,7 @@ def test_what_does_not_fit_is_found_before_any_work(
     monkeypatch.setattr("crisalad_jax.retrieval.describe.read_tokens", None)
     rerank = parse_reranking(given)
     with pytest.raises(InputError, match=words):
-        evaluate(random_params(PLAIN), config, benchmark, rerank=rerank, quiet=True)
+        evaluate(random_params(config), config, benchmark, rerank=rerank, quiet=True)
 
 
 def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark) -> None:
