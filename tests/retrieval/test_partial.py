@@ -1,0 +1,502 @@
+"""Extractions that are cut short: what is done is kept, and the files are of one set or none."""
+
+import hashlib
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+
+import h5py
+import jax
+import numpy as np
+import pytest
+
+from crisalad_jax.data.images import list_images
+from crisalad_jax.retrieval import extract as extract_module
+from crisalad_jax.retrieval import partial
+from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
+from crisalad_jax.retrieval.extract import Extracted, extract
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
+from tests.conftest import BATCH, MODEL, write_picture
+
+ROOT = pathlib.Path(__file__).parents[2]
+IMAGES = 12
+PARTS = IMAGES // BATCH
+
+KILLED_EXTRACTION = """
+import os, pathlib, signal, sys
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.retrieval import extract, partial
+from tests.conftest import BATCH
+
+write, left = partial.write_sealed, int(sys.argv[4])
+
+def killed(*arguments):
+    global left
+    write(*arguments)
+    left -= 1
+    if not left:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+partial.SEGMENT, partial.write_sealed = BATCH, killed
+weights, images, out = map(pathlib.Path, sys.argv[1:4])
+params, config = load_weights(weights)
+extract.extract(params, config, images, out, batch_size=BATCH, quiet=True)
+"""
+# A child for each rename, which dies before it; prints how many there are.
+KILLED_WRITES = """
+import os, pathlib, signal, sys
+import numpy as np
+from crisalad_jax.retrieval.descriptor_files import write_descriptors
+
+folder, suffix = pathlib.Path(sys.argv[1]), sys.argv[2]
+old, new = (np.load(folder / name) for name in ("old.npy", "new.npy"))
+names = (folder / "names.txt").read_text().splitlines()
+real = os.replace
+step = 0
+while True:
+    out = folder / str(step) / f"d{suffix}"
+    write_descriptors(out, old, names[: len(old)], {"set": "old"})
+    child = os.fork()
+    if child == 0:
+        left = step
+
+        def dying(*arguments):
+            global left
+            if not left:
+                os.kill(os.getpid(), signal.SIGKILL)
+            left -= 1
+            real(*arguments)
+
+        os.replace = dying
+        write_descriptors(out, new, names, {"set": "new"})
+        os._exit(0)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code == 0:
+        break
+    assert code == -signal.SIGKILL, code
+    step += 1
+print(step)
+"""
+
+
+def run(params, images, out, **options) -> Extracted:
+    return extract(params, MODEL, images, out, **{"batch_size": BATCH, "quiet": True} | options)
+
+
+def contents(folder: pathlib.Path) -> dict[str, bytes]:
+    """All files, hidden ones included."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module")
+def town(shared) -> pathlib.Path:
+    images = shared / "town"
+    assert len(list_images(images)) == IMAGES
+    return images
+
+
+@pytest.fixture(scope="module")
+def whole(params, town, tmp_path_factory) -> dict[str, bytes]:
+    """The files of an extraction that nothing interrupts, in one segment."""
+    folder = tmp_path_factory.mktemp("whole")
+    run(params, town, folder / "d.npy")
+    found = contents(folder)
+    assert found.keys() == {"d.npy", "d.names.txt", "d.npy.json"}
+    return found
+
+
+@pytest.fixture
+def described(monkeypatch) -> list[str]:
+    """The names of the images that are computed from now on; a batch makes a segment."""
+    names: list[str] = []
+    real = partial.tokens_in_batches
+
+    def spied(params, config, paths, **options):
+        names.extend(path.name for path in paths)
+        return real(params, config, paths, **options)
+
+    monkeypatch.setattr(partial, "SEGMENT", BATCH)
+    monkeypatch.setattr(partial, "tokens_in_batches", spied)
+    return names
+
+
+def names_from(town: pathlib.Path, first: int) -> list[str]:
+    return [path.name for path in list_images(town)[first:]]
+
+
+def cut_short(monkeypatch, params, images, out, *, after: int, error=KeyboardInterrupt, **options):
+    """Run until so many segments are there, and then into an error."""
+    real, left = partial.write_sealed, after
+
+    def failing(*arguments):
+        nonlocal left
+        real(*arguments)
+        left -= 1
+        if not left:
+            raise error("cut short")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(partial, "write_sealed", failing)
+        with pytest.raises(error) as caught:
+            run(params, images, out, **options)
+    return caught.value
+
+
+def segments(out: pathlib.Path) -> list[str]:
+    return sorted(path.name for path in out.with_name(f"{out.name}.partial").glob("*.safetensors"))
+
+
+# What is done is kept
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, InputError])
+@pytest.mark.parametrize("after", range(1, PARTS + 1))
+def test_the_same_call_does_the_rest_with_the_same_bits(
+    params, town, whole, described, tmp_path, monkeypatch, after, error
+):
+    out = tmp_path / "d.npy"
+    found = cut_short(monkeypatch, params, town, out, after=after, error=error)
+    kept = [f"{BATCH * i:010d}.safetensors" for i in range(after)]
+    assert segments(out) == kept
+    assert os.listdir(tmp_path) == ["d.npy.partial"]
+    assert set(os.listdir(tmp_path / "d.npy.partial")) == {"plan.json", *kept}
+    if error is InputError:
+        advice = f"what is done is kept in {out}.partial, and the same command goes on"
+        assert str(found) == f"cut short ({advice})"
+    described.clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)
+        result = run(params, town, out)
+    assert described == names_from(town, BATCH * after)
+    assert contents(tmp_path) == whole
+    assert result.descriptors.tobytes() == np.load(out).tobytes()
+
+
+@pytest.mark.slow
+def test_a_killed_extraction_goes_on(shared, params, town, whole, described, tmp_path):
+    out = tmp_path / "d.npy"
+    program = [sys.executable, "-c", KILLED_EXTRACTION, shared / "weights.safetensors", town, out]
+    done = subprocess.run([*map(str, program), "2"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert segments(out) == ["0000000000.safetensors", f"{BATCH:010d}.safetensors"]
+    run(params, town, out)
+    assert described == names_from(town, 2 * BATCH)
+    assert contents(tmp_path) == whole
+
+
+def test_what_a_kill_leaves_within_the_folder_does_no_harm(
+    params, town, whole, described, tmp_path, monkeypatch
+):
+    """Its lock, and a segment under a temporary name."""
+    out = tmp_path / "d.npy"
+    cut_short(monkeypatch, params, town, out, after=1)
+    folder = tmp_path / "d.npy.partial"
+    (folder / ".crisalad-lock").write_text("process 1 on elsewhere\n")
+    (folder / ".crisalad-0123456789ab.safetensors").write_bytes(b"half")
+    described.clear()
+    run(params, town, out)
+    assert described == names_from(town, BATCH)
+    assert contents(tmp_path) == whole
+
+
+@pytest.mark.parametrize("grouping", ["sequential", "window", "shuffled"])
+def test_what_is_done_serves_other_groupings_too(
+    params, town, described, tmp_path, monkeypatch, grouping
+):
+    """Tokens do not depend on the grouping, the components or the name of the weights."""
+    out = tmp_path / "d.npy"
+    cut_short(monkeypatch, params, town, out, after=2)
+    described.clear()
+    found = run(params, town, out, grouping=grouping, weights="w.safetensors", seed=3)
+    assert described == names_from(town, 2 * BATCH)
+    expected = run(params, town, tmp_path / "e.npy", grouping=grouping, seed=3)
+    assert found.descriptors.tobytes() == expected.descriptors.tobytes()
+    alone = run(params, town, tmp_path / "f.npy")
+    assert not np.allclose(found.descriptors, alone.descriptors, atol=1e-4)
+
+
+def test_an_image_that_is_skipped_is_skipped_again(params, town, described, tmp_path, monkeypatch):
+    images, out = tmp_path / "town", tmp_path / "d.npy"
+    shutil.copytree(town, images)
+    bad = list_images(images)[1]
+    bad.write_bytes(b"no image")
+    cut_short(monkeypatch, params, images, out, after=2, on_bad_image="skip")
+    described.clear()
+    found = run(params, images, out, on_bad_image="skip")
+    assert described == names_from(images, 2 * BATCH)
+    assert found.skipped == [bad.relative_to(images).as_posix()]
+    expected = run(params, images, tmp_path / "e.npy", on_bad_image="skip")
+    assert found.descriptors.tobytes() == expected.descriptors.tobytes()
+    assert found.names == expected.names
+    # Where it is an error, it is one however much is done.
+    cut_short(monkeypatch, params, images, out, after=2, on_bad_image="skip")
+    with pytest.raises(InputError, match=rf"{bad.name}.* \(what is done is kept in {out}\.partial"):
+        run(params, images, out)
+
+
+# Begun anew
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        *("picture", "fewer", "order", "model"),
+        # Programs of their own are compiled.
+        *(pytest.param(other, marks=pytest.mark.slow) for other in ("config", "batch size")),
+    ],
+)
+def test_other_work_is_begun_anew_with_a_note(
+    params, town, described, tmp_path, monkeypatch, other
+):
+    images, out = tmp_path / "town", tmp_path / "d.npy"
+    shutil.copytree(town, images)
+    listed = list_images(images)
+    cut_short(monkeypatch, params, listed, out, after=2)
+    options = {}
+    if other == "picture":
+        write_picture(listed[-1], seed=99)
+    elif other == "fewer":
+        listed = listed[:-1]
+    elif other == "order":
+        listed = listed[::-1]
+    elif other == "model":
+        params = jax.tree.map(lambda leaf: leaf * 0.9, params)
+    elif other == "config":
+        options["config"] = MODEL.resized((56, 56))
+    else:
+        options["batch_size"] = BATCH - 1
+    described.clear()
+
+    def again(out: pathlib.Path) -> Extracted:
+        config = options.get("config", MODEL)
+        size = options.get("batch_size", BATCH)
+        return extract(params, config, listed, out, batch_size=size, quiet=True)
+
+    words = r"d\.npy\.partial: found work on other images or of another model; it is begun anew"
+    with pytest.warns(Note, match=words) as told:
+        found = again(out)
+    assert len(told) == 1
+    assert described == [path.name for path in listed]
+    assert not out.with_name("d.npy.partial").exists()
+    expected = again(tmp_path / "e.npy")
+    assert found.descriptors.tobytes() == expected.descriptors.tobytes()
+
+
+@pytest.mark.parametrize("how", ["flipped", "cut", "empty", "removed", "other", "weights", "plan"])
+def test_what_is_damaged_is_described_again(
+    shared, params, town, whole, described, tmp_path, monkeypatch, how
+):
+    out = tmp_path / "d.npy"
+    cut_short(monkeypatch, params, town, out, after=PARTS)
+    folder = tmp_path / "d.npy.partial"
+    path = folder / f"{BATCH:010d}.safetensors"
+    data = bytearray(path.read_bytes())
+    if how == "flipped":
+        data[-1] ^= 1
+        path.write_bytes(data)
+    elif how == "removed":
+        path.unlink()
+    elif how == "weights":
+        shutil.copy(shared / "weights.safetensors", path)
+    elif how == "plan":
+        (folder / "plan.json").write_text((folder / "plan.json").read_text()[:-9])
+    else:
+        path.write_bytes({"cut": data[:-5], "empty": b"", "other": b"no tokens" * 9}[how])
+    described.clear()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", Note)
+        run(params, town, out)
+    assert described == names_from(town, 0 if how == "plan" else BATCH)
+    assert sum(issubclass(one.category, Note) for one in told) == (how == "plan")
+    assert contents(tmp_path) == whole
+
+
+# One at a time, and nothing left
+
+
+def test_a_second_extraction_to_the_same_file_is_refused(
+    params, town, whole, described, tmp_path, monkeypatch
+):
+    out, real, refused = tmp_path / "d.npy", partial.write_sealed, []
+
+    def meanwhile(*arguments):
+        monkeypatch.setattr(partial, "write_sealed", real)  # only after the first segment
+        real(*arguments)
+        before = contents(tmp_path)
+        with pytest.raises(InputError) as error:
+            run(params, town, out)
+        refused.append(str(error.value))
+        assert contents(tmp_path) == before
+        run(params, town, tmp_path / "other" / "d.npy")  # another file is another matter
+
+    monkeypatch.setattr(partial, "write_sealed", meanwhile)
+    run(params, town, out)
+    assert refused == [
+        f"{out}.partial: found another process that writes here (process {os.getpid()} on "
+        f"{os.uname().nodename}), expected to be the only one"
+    ]
+    assert contents(tmp_path) == whole | {f"other/{name}": data for name, data in whole.items()}
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".h5"])
+def test_nothing_but_the_set_is_left(params, town, described, tmp_path, suffix):
+    run(params, town, tmp_path / f"d{suffix}")
+    names = {"d.names.txt"} if suffix == ".npy" else set()
+    assert set(os.listdir(tmp_path)) == {f"d{suffix}", f"d{suffix}.json", *names}
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_failure_before_anything_is_done_leaves_nothing(params, town, tmp_path, there):
+    images, out = tmp_path / "town", tmp_path / "new" / "deep" / "d.npy"
+    shutil.copytree(town, images)
+    list_images(images)[0].write_bytes(b"no image")
+    if there:
+        write_descriptors(out, np.eye(2, dtype=np.float32), ["a", "b"])
+    before = contents(tmp_path)
+    with pytest.raises(InputError) as error:
+        run(params, images, out)
+    assert "is kept" not in str(error.value)
+    assert contents(tmp_path) == before
+    assert (tmp_path / "new").exists() == there
+    if there:
+        assert "d.npy.partial" not in os.listdir(out.parent)
+
+
+def test_a_failure_to_write_keeps_the_work(params, town, whole, described, tmp_path, monkeypatch):
+    out = tmp_path / "d.npy"
+
+    def full(*_: object) -> None:
+        raise InputError("d.npy: cannot be written: No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(extract_module, "write_descriptors", full)
+        with pytest.raises(InputError, match=r"No space left on device \(what is done is kept in"):
+            run(params, town, out)
+    described.clear()
+    run(params, town, out)
+    assert described == []
+    assert contents(tmp_path) == whole
+
+
+# The files of a set
+
+
+@pytest.mark.parametrize(("suffix", "renames"), [(".npy", 3), (".h5", 2)])
+def test_a_set_that_is_killed_between_its_renames_is_whole_or_refused(
+    params, town, whole, described, tmp_path, suffix, renames
+):
+    """And the same extraction mends it, with nothing of the old set left."""
+    renames += 1  # of the record under its temporary name
+    names = whole["d.names.txt"].decode().splitlines()
+    (tmp_path / "new.npy").write_bytes(whole["d.npy"])
+    new = np.load(tmp_path / "new.npy")
+    old = np.roll(new, 1, axis=0)
+    np.save(tmp_path / "old.npy", old)
+    (tmp_path / "names.txt").write_bytes(whole["d.names.txt"])
+    program = [sys.executable, "-c", KILLED_WRITES, str(tmp_path), suffix]
+    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"{renames}\n"), done.stderr
+
+    def rows(step: int) -> np.ndarray:
+        listed, found = read_descriptors(tmp_path / str(step) / f"d{suffix}")
+        by_name = dict(zip(listed, found, strict=True))
+        assert by_name.keys() == set(names)
+        return np.stack([by_name[name] for name in names])
+
+    for step in (0, 1):
+        np.testing.assert_array_equal(rows(step), old)
+    for step in range(2, renames):
+        with pytest.raises(InputError) as error:
+            rows(step)
+        words = f"found other bytes than d{suffix}.json says, expected those that were written tog"
+        assert words in str(error.value)
+        assert "\n" not in str(error.value)
+    np.testing.assert_array_equal(rows(renames), new)
+    for step in range(renames):
+        run(params, town, tmp_path / str(step) / f"d{suffix}")
+        np.testing.assert_array_equal(rows(step), new)
+        if suffix == ".npy":
+            files = contents(tmp_path / str(step))
+            assert {name: files[name] for name in whole} == whole
+
+
+def test_the_record_comes_first_and_names_what_follows(tmp_path, monkeypatch):
+    """A set that is read while it is written is refused too, never half old."""
+    out, order = tmp_path / "d.npy", []
+    write_descriptors(out, np.eye(2, dtype=np.float32), ["a", "b"])
+    real = os.replace
+
+    def spied(source, target):
+        real(source, target)
+        order.append(pathlib.Path(target).name)
+        if order[-1] in ("d.npy.json", "d.names.txt"):
+            with pytest.raises(InputError, match=r"found other bytes than d\.npy\.json says"):
+                read_descriptors(out)
+
+    monkeypatch.setattr(os, "replace", spied)
+    write_descriptors(out, np.eye(3, dtype=np.float32), ["a", "b", "c"])
+    # write_json gives the record its temporary name by a rename of its own.
+    assert order[-3:] == ["d.npy.json", "d.names.txt", "d.npy"]
+    assert read_descriptors(out)[0] == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".h5"])
+def test_the_record_holds_the_digests_of_the_files(tmp_path, suffix):
+    out = tmp_path / f"d{suffix}"
+    write_descriptors(out, np.eye(2, dtype=np.float32), ["a", "b"], {"seed": 3})
+    record = json.loads((tmp_path / f"d{suffix}.json").read_text())
+    files = {"descriptors": out} | ({"names": tmp_path / "d.names.txt"} if suffix == ".npy" else {})
+    assert record["files"] == {
+        role: hashlib.sha256(path.read_bytes()).hexdigest() for role, path in files.items()
+    }
+    assert record["seed"] == 3
+    for path in files.values():
+        data = bytearray(path.read_bytes())
+        for place in (0, len(data) // 2, len(data) - 1):
+            path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+            with pytest.raises(InputError, match=f"^{path}: found other bytes than d"):
+                read_descriptors(out)
+        path.write_bytes(data)
+    assert sorted(read_descriptors(out)[0]) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("record", "words"),
+    [
+        ({"seed": 3}, "found no digests of descriptors, names, expected them"),
+        ({"files": {"descriptors": "0" * 64}}, "found no digests of descriptors, names"),
+        ({"files": []}, "found no digests of descriptors, names"),
+    ],
+)
+def test_a_record_of_something_else_is_refused(tmp_path, record, words):
+    out = tmp_path / "d.npy"
+    write_descriptors(out, np.eye(2, dtype=np.float32), ["a", "b"])
+    partial.write_json(tmp_path / "d.npy.json", record)
+    with pytest.raises(InputError, match=rf"d\.npy\.json: {words}"):
+        read_descriptors(out)
+    assert read_descriptors(out, verify=False)[0] == ["a", "b"]
+
+
+def test_a_set_without_a_record_is_read_with_a_note(tmp_path):
+    """As of earlier versions, of numpy and of hloc."""
+    np.save(tmp_path / "d.npy", np.eye(2, dtype=np.float32))
+    (tmp_path / "d.names.txt").write_text("a\nb\n")
+    with h5py.File(tmp_path / "d.h5", "w") as file:
+        for name, row in zip(("a", "b"), np.eye(2), strict=True):
+            file.create_dataset(f"{name}/global_descriptor", data=row)
+    for name in ("d.npy", "d.h5"):
+        with pytest.warns(Note, match=rf"{name}: found no .*checksum") as told:
+            names, found = read_descriptors(tmp_path / name)
+        assert len(told) == 1
+        assert names == ["a", "b"]
+        np.testing.assert_array_equal(found, np.eye(2))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read_descriptors(tmp_path / name, verify=False)

@@ -1,0 +1,227 @@
+"""Locks of folders: one process at a time, whatever becomes of the one before it."""
+
+import contextlib
+import fcntl
+import os
+import pathlib
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.locks import one_writer
+
+LOCK = ".crisalad-lock"
+REFUSED = "found another process that writes here"
+
+HOLDER = """
+import sys
+from crisalad_jax.utils.locks import one_writer
+with one_writer(sys.argv[1]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+# Four children that take turns. Who finds another one inside fails by O_EXCL.
+CONTENDERS = """
+import os, sys, time
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.locks import one_writer
+folder, inside = sys.argv[1:]
+children = []
+for _ in range(4):
+    if child := os.fork():
+        children.append(child)
+        continue
+    taken, end = 0, time.monotonic() + 1
+    try:
+        while time.monotonic() < end:
+            try:
+                with one_writer(folder):
+                    os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
+                    os.unlink(inside)
+                    taken += 1
+            except InputError as error:
+                assert "another process that writes here" in str(error), error
+        os._exit(0 if taken else 3)
+    except BaseException as error:
+        print(repr(error), flush=True)
+        os._exit(1)
+print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+"""
+
+
+@contextlib.contextmanager
+def held(folder: pathlib.Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that holds the lock of the folder until its stdin ends."""
+    program = [sys.executable, "-c", HOLDER, str(folder)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(program, stdin=pipe, stdout=pipe, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "held\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def is_free(folder: pathlib.Path) -> bool:
+    try:
+        with one_writer(folder):
+            return True
+    except InputError as error:
+        if REFUSED not in str(error):
+            raise
+        return False
+
+
+def contents(folder: pathlib.Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def fails_in(folder: pathlib.Path, work: Callable[[], object] = lambda: None) -> None:
+    """An error while the lock is held."""
+
+    def fail() -> None:
+        with one_writer(folder):
+            work()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+
+
+def test_a_second_process_is_refused_and_told_of_the_first(tmp_path):
+    folder = tmp_path / "out"
+    with held(folder) as process:
+        before = contents(folder)
+        with pytest.raises(InputError) as error, one_writer(folder):
+            pass
+        assert str(error.value) == (
+            f"{folder}: {REFUSED} (process {process.pid} on {socket.gethostname()}), "
+            "expected to be the only one"
+        )
+        assert contents(folder) == before
+        assert not is_free(folder)  # to be refused changes nothing
+        process.communicate()  # ends its stdin
+        assert process.returncode == 0
+        assert os.listdir(folder) == []
+        assert is_free(folder)
+
+
+def test_a_process_is_refused_its_own_folder(tmp_path):
+    with one_writer(tmp_path):
+        with pytest.raises(InputError, match=rf"{REFUSED} \(process {os.getpid()} on "):
+            one_writer(tmp_path).__enter__()
+        assert (tmp_path / LOCK).exists()
+    assert is_free(tmp_path)
+
+
+def test_two_folders_have_two_locks(tmp_path):
+    with one_writer(tmp_path / "a"), one_writer(tmp_path / "b"), one_writer(tmp_path / "a" / "c"):
+        assert not is_free(tmp_path / "b")
+
+
+def test_the_lock_of_a_killed_process_is_free(tmp_path):
+    with held(tmp_path) as process:
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        # Its file is left, with its words.
+        assert f"process {process.pid} on " in (tmp_path / LOCK).read_text()
+        with one_writer(tmp_path):
+            words = f"process {os.getpid()} on {socket.gethostname()}\n"
+            assert (tmp_path / LOCK).read_text() == words
+            assert not is_free(tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_error_frees_the_lock_and_removes_what_was_made_for_it(tmp_path):
+    folder = tmp_path / "new" / "deep"
+    fails_in(folder)
+    assert os.listdir(tmp_path) == []
+    fails_in(folder, lambda: (folder / "work").write_text("half"))
+    assert contents(tmp_path) == {"new/deep/work": b"half"}
+    assert is_free(folder)
+
+
+def test_a_folder_that_was_there_stays(tmp_path):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    fails_in(folder)
+    assert os.listdir(tmp_path) == ["empty"]
+    assert os.listdir(folder) == []
+
+
+def test_a_users_files_are_untouched(tmp_path):
+    for name in ("notes.txt", ".lock", ".crisalad-notes", "crisalad-lock", ".env"):
+        (tmp_path / name).write_text(f"theirs: {name}")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / LOCK).write_text("of another folder")
+    before = contents(tmp_path)
+    assert len(before) == 6
+    with one_writer(tmp_path):
+        assert contents(tmp_path).items() > before.items()
+    assert contents(tmp_path) == before
+    fails_in(tmp_path)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("again", ["nothing", "free", "held"])
+def test_a_holder_that_removes_its_file_meanwhile_does_not_give_two_locks(
+    tmp_path, monkeypatch, again
+):
+    """Between opening and locking: then a third process may make another file of that name."""
+    path, real, calls = tmp_path / LOCK, fcntl.flock, []
+    with contextlib.ExitStack() as stack:
+
+        def meanwhile(file, how):
+            calls.append(how)
+            if len(calls) == 1:
+                path.unlink()
+                if again != "nothing":
+                    other = stack.enter_context(path.open("w"))
+                    other.write("process 1 on elsewhere\n")
+                    other.flush()
+                    if again == "held":
+                        real(other, fcntl.LOCK_EX)
+            return real(file, how)
+
+        monkeypatch.setattr(fcntl, "flock", meanwhile)
+        if again == "held":
+            with pytest.raises(InputError, match=rf"{REFUSED} \(process 1 on elsewhere\)"):
+                one_writer(tmp_path).__enter__()
+            assert path.exists()
+        else:
+            with one_writer(tmp_path):
+                monkeypatch.setattr(fcntl, "flock", real)
+                assert path.read_text().startswith(f"process {os.getpid()} on ")
+                assert not is_free(tmp_path)
+        assert len(calls) == 2
+    path.unlink(missing_ok=True)
+    assert is_free(tmp_path)
+
+
+def test_processes_that_race_are_never_two_inside(tmp_path):
+    program = [sys.executable, "-c", CONTENDERS, str(tmp_path / "out"), str(tmp_path / "inside")]
+    done = subprocess.run(program, capture_output=True, text=True)
+    assert (done.stdout, done.returncode) == ("[0, 0, 0, 0]\n", 0), done.stdout + done.stderr
+    assert os.listdir(tmp_path) == ["out"]
+    assert os.listdir(tmp_path / "out") == []
+
+
+def test_a_folder_that_cannot_be_locked_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "out" / LOCK).mkdir(parents=True)
+    for name, words in (
+        ("file", "cannot make this folder: File exists"),
+        ("file/deep", "cannot make this folder: Not a directory"),
+        ("out", "cannot be written to: Is a directory"),
+    ):
+        with pytest.raises(InputError) as error, one_writer(tmp_path / name):
+            pass
+        assert str(error.value) == f"{tmp_path / name}: {words}"
+    assert sorted(os.listdir(tmp_path)) == ["file", "out"]
