@@ -155,9 +155,12 @@ VERBS: Mapping[str, Callable[[World, pathlib.Path], Arguments]] = {
 """A command of each verb that writes files, by what it writes into a folder."""
 
 
-def make_products(world: World) -> None:
+PRODUCTS = ("extract .npy", "extract .h5", "index", "pca", "export", "train")
+
+
+def make_products(world: World, verbs: Sequence[str] = PRODUCTS) -> None:
     """Run the verbs whose products other verbs read or attacks change: into products/."""
-    for verb in ("extract .npy", "extract .h5", "index", "pca", "export", "train"):
+    for verb in verbs:
         arguments = VERBS[verb](world, world.root / "products")
         done = run(arguments, cwd=world.root)
         assert done.code == 0, (verb, done.err)
@@ -230,7 +233,7 @@ def forked(
         os.close(writing)
     watcher = os.pidfd_open(process)
     texts = {reading: b"" for reading, _ in pipes}
-    code = None
+    code, peak = None, 0
     try:
         if during is not None:
             during(process)
@@ -242,7 +245,8 @@ def forked(
                 if code is not None:
                     break  # a grandchild holds the pipes
                 os.kill(process, signal.SIGKILL)
-                code = HUNG
+                code, limit = HUNG, limit + 5  # until the kernel has ended it
+                continue
             for each in open_pipes & set(ready):
                 data = os.read(each, 2**16)
                 texts[each] += data
