@@ -180,7 +180,11 @@ class StateStore:
 
 
 def _hashes(folder: pathlib.Path) -> dict[str, str]:
-    """Compute the SHA-256 of all files of a state's arrays and record."""
+    """Compute the SHA-256 of all files of a state's arrays and record.
+
+    The files beside these folders are orbax's bookkeeping: it changes them later, and nothing that
+    is loaded depends on what is in them.
+    """
     files = (path for path in folder.glob("*/**/*") if path.is_file())
     return {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
 
