@@ -190,19 +190,20 @@ def import_everything() -> None:
 
 def run(arguments: Sequence[str], *, cwd: pathlib.Path, **options: object) -> Done:
     """Run a command of the command line in a forked process, as `forked` does."""
+    return forked(lambda: command(arguments), cwd=cwd, **options)  # pyright: ignore
 
-    def work() -> int:
-        from crisalad_jax.cli import main
-        from crisalad_jax.utils.output import keep_on_without_reader
-        from crisalad_jax.utils.signals import end_at_signals
 
-        end_at_signals()
-        keep_on_without_reader()
-        code = main(list(arguments))
-        sys.stdout.flush()
-        return code
+def command(arguments: Sequence[str]) -> int:
+    """Run a command in this process, as the program `crisalad` does; return its exit code."""
+    from crisalad_jax.cli import main
+    from crisalad_jax.utils.output import keep_on_without_reader
+    from crisalad_jax.utils.signals import end_at_signals
 
-    return forked(work, cwd=cwd, **options)  # pyright: ignore
+    end_at_signals()
+    keep_on_without_reader()
+    code = main(list(arguments))
+    sys.stdout.flush()
+    return code
 
 
 def forked(
