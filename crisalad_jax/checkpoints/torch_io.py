@@ -61,6 +61,7 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
     Args:
         path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
             DINO-SALAD, CricaVPR or another layout in `docs/methods.md`; torch files need torch.
+        verify: whether to check the bytes of a file of this package against its checksum.
 
     Returns:
         (params, config).

@@ -66,6 +66,7 @@ def load_model(
     seed: int = 0,
     image_size: tuple[int, int] | None = None,
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
+    verify: bool = True,
 ) -> tuple[Crisalad, ModelConfig, str]:
     """Load a model from a file, or initialise an untrained preset without one.
 
@@ -75,6 +76,7 @@ def load_model(
         seed: draws the parameters of the untrained model.
         image_size: height and width in pixels; None is the model's.
         compute_dtype: type of the matrix products; None is the model's.
+        verify: whether to check the file's bytes against its checksum.
 
     Returns:
         (params, config, name); the name stands in tables and titles.
@@ -87,7 +89,7 @@ def load_model(
         params = init_crisalad(jax.random.key(seed), config)
         name = f"untrained {preset}, seed {seed}"
     else:
-        params, config = load_weights(weights)
+        params, config = load_weights(weights, verify=verify)
         name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
     if compute_dtype is not None:
         config = dataclasses.replace(config, compute_dtype=compute_dtype)

@@ -83,6 +83,8 @@ class Evaluate:
     its pictures."""
     json: pathlib.Path | None = None
     """File for the table as JSON."""
+    verify: bool = True
+    """Check weights and components against their checksums; --no-verify skips that, where files are huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
@@ -106,9 +108,10 @@ def run(arguments: Evaluate) -> None:
         seed=arguments.seed,
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
+        verify=arguments.verify,
     )
     rerank = _reranking(arguments, config)
-    pca = None if arguments.pca is None else load_pca(arguments.pca)
+    pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
     benchmark = open_benchmark(
         arguments.data,
         arguments.split,

@@ -42,6 +42,8 @@ class Extract:
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
+    verify: bool = True
+    """Check weights, components and --database against their checksums; --no-verify skips that, where files are huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
@@ -65,6 +67,7 @@ def run(arguments: Extract) -> None:
         arguments.weights,
         image_size=arguments.image_size,
         compute_dtype=arguments.compute_dtype,
+        verify=arguments.verify,
     )
     result = extract(
         params,
@@ -81,6 +84,7 @@ def run(arguments: Extract) -> None:
         k=arguments.k,
         pca=arguments.pca,
         on_bad_image=arguments.on_bad_image,
+        verify=arguments.verify,
         quiet=arguments.quiet,
     )
     if result.pairs is not None:

@@ -27,6 +27,8 @@ class Pca:
     """Fit at most so many descriptors, drawn at random."""
     seed: int = 0
     """Draws them."""
+    verify: bool = True
+    """Check descriptors against their checksums; --no-verify skips that, where files are huge."""
     quiet: bool = False
     """No progress bar."""
 
@@ -34,7 +36,7 @@ class Pca:
 def run(arguments: Pca) -> None:
     """Fit components, write them, and print their share of the variance."""
     check_target(arguments.out, ".safetensors")
-    descriptors = open_npy(arguments.descriptors)
+    descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
     pca = fit_pca(
         descriptors,
         arguments.dim,

@@ -41,6 +41,8 @@ class Query:
     """Folder of the map's images, for the gallery, if they are not where they were."""
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
+    verify: bool = True
+    """Check the map's descriptors against their checksums; --no-verify skips that, where files are huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
@@ -54,7 +56,7 @@ def run(arguments: Query) -> None:
     file = None if arguments.json == STDOUT else arguments.json
     talk_beside(arguments.json)
     _check_files(file, arguments)
-    with Map.open(arguments.map) as places:
+    with Map.open(arguments.map, verify=arguments.verify) as places:
         answers = query(
             places,
             places.load_params(arguments.weights),
