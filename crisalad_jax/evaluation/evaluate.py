@@ -97,7 +97,6 @@ def evaluate(
         >>> result.recalls[1]
         1.0
     """
-    check_params(params, config)
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
     if pca is not None:
@@ -109,6 +108,7 @@ def evaluate(
             )
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
+    check_params(params, config)
     positives = benchmark.ground_truth()
     images = max(len(benchmark.database), len(benchmark.queries))
     batch_size = useful_batch_size(batch_size, images)
