@@ -11,6 +11,7 @@ import jax
 import rich.console
 
 from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.config.checks import check_seed
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training.recipes import recipe
@@ -86,6 +87,7 @@ def load_model(
     """
     if weights is None:
         config = recipe(preset).model
+        check_seed("seed", seed)
         params = init_crisalad(jax.random.key(seed), config)
         name = f"untrained {preset}, seed {seed}"
     else:

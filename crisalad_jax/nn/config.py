@@ -14,6 +14,9 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 
+MOST_PIXELS = 4096
+"""Largest side of an image that models describe: attention grows by its fourth power."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
@@ -114,9 +117,14 @@ class ModelConfig:
         """Check that this model can describe images of this height and width.
 
         Raises:
-            InputError: a side is no multiple of the patch size, there are too few patches for the
+            InputError: a side is above `MOST_PIXELS` or no multiple of the patch size, there are too few patches for the
                 aggregator, or its parameters are for another size.
         """
+        if max(image_size) > MOST_PIXELS:
+            raise InputError(
+                f"image size: found {' x '.join(map(str, image_size))}, expected at most "
+                f"{MOST_PIXELS} pixels a side"
+            )
         if self.aggregator.fixed_grid and tuple(image_size) != tuple(self.image_size):
             given, expected = (f"{h} x {w}" for h, w in (image_size, self.image_size))
             raise InputError(

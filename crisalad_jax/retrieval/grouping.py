@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import check_seed, choose
 from crisalad_jax.utils.errors import InputError
 
 GROUPINGS = {
@@ -97,12 +97,12 @@ def check_grouping(groupings: Sequence[str], batch_size: int, seed: int, seeds: 
     """Check a side's groupings and the numbers that go with them, before images are described.
 
     Raises:
-        InputError: one that is not among `GROUPINGS`, a batch of none, a negative seed, or no seed.
+        InputError: one that is not among `GROUPINGS`, a batch of none, a seed out of range, or none.
     """
     for grouping in groupings:
         choose("grouping", grouping, GROUPINGS)
-    numbers = (("batch size", batch_size, 1), ("seed", seed, 0), ("seeds", seeds, 1))
-    for name, value, least in numbers:
+    check_seed("seed", seed)
+    for name, value, least in (("batch size", batch_size, 1), ("seeds", seeds, 1)):
         if value < least:
             raise InputError(f"{name}: found {value}, expected at least {least}")
 

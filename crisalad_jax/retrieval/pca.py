@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
+from crisalad_jax.config.checks import check_seed
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.chunks import as_rows, pieces, sample
 from crisalad_jax.utils.checksums import checked_safetensors
@@ -134,8 +135,7 @@ def fit_pca(
         >>> fit_pca(descriptors, 3).apply(descriptors).shape
         (50, 3)
     """
-    if seed < 0:
-        raise InputError(f"seed: found {seed}, expected at least 0")
+    check_seed("seed", seed)
     descriptors = as_rows(descriptors, "descriptors")
     total, length = descriptors.shape
     count = total if samples is None else min(samples, total)

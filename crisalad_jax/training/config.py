@@ -4,7 +4,13 @@ import dataclasses
 import re
 from typing import Literal
 
-from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
+from crisalad_jax.config.checks import (
+    check_seed,
+    check_types,
+    require,
+    require_fraction,
+    require_positive,
+)
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.losses import LossConfig
@@ -135,7 +141,7 @@ class TrainConfig:
             self.patience is None or self.patience > 0,
             f"TrainConfig.patience: found {self.patience}, expected more than 0, or None",
         )
-        require(self.seed >= 0, f"TrainConfig.seed: found {self.seed}, expected at least 0")
+        check_seed("TrainConfig.seed", self.seed)
 
     @property
     def min_images_of_place(self) -> int:

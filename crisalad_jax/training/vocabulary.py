@@ -18,6 +18,7 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.config.checks import check_seed
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.loader import OnBadImage, image_batches
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
@@ -254,8 +255,7 @@ def _check_counts(
     config: ModelConfig, clusters: int, available: int, images: int | None, seed: int
 ) -> None:
     """Check the numbers of images and features before an image is read."""
-    if seed < 0:
-        raise InputError(f"seed: found {seed}, expected at least 0")
+    check_seed("seed", seed)
     if images is not None and images < 1:
         raise InputError(f"images: found {images}, expected at least 1")
     used = available if images is None else min(images, available)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from crisalad_jax.config.checks import check_seed
 from crisalad_jax.experiments.synthetic.camera import PITCH
 from crisalad_jax.experiments.synthetic.mesh import EYE
 from crisalad_jax.experiments.synthetic.picture import render
@@ -64,13 +65,13 @@ class SyntheticCityConfig:
             ("test_places", 1),
             ("database_per_place", 1),
             ("queries_per_place", 1),
-            ("seed", 0),
         ):
             value = getattr(self, name)
             if value < least:
                 raise InputError(
                     f"SyntheticCityConfig.{name}: found {value}, expected at least {least}"
                 )
+        check_seed("SyntheticCityConfig.seed", self.seed)
         check_size("SyntheticCityConfig.image_size", self.image_size)
 
 
