@@ -117,8 +117,8 @@ class ModelConfig:
         """Check that this model can describe images of this height and width.
 
         Raises:
-            InputError: a side is above `MOST_PIXELS` or no multiple of the patch size, there are too few patches for the
-                aggregator, or its parameters are for another size.
+            InputError: a side is above `MOST_PIXELS` or no multiple of the patch size, there are
+                too few patches for the aggregator, or its parameters are for another size.
         """
         if max(image_size) > MOST_PIXELS:
             raise InputError(

@@ -97,7 +97,7 @@ def check_grouping(groupings: Sequence[str], batch_size: int, seed: int, seeds: 
     """Check a side's groupings and the numbers that go with them, before images are described.
 
     Raises:
-        InputError: one that is not among `GROUPINGS`, a batch of none, a seed out of range, or none.
+        InputError: one not among `GROUPINGS`, a batch of none, a seed out of range, or none.
     """
     for grouping in groupings:
         choose("grouping", grouping, GROUPINGS)
