@@ -5,8 +5,10 @@ detected none, and 39 changed the loaded numbers. The SHA-256 of every file is t
 """
 
 import contextlib
+import logging
 import os
 import pathlib
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -24,6 +26,8 @@ from crisalad_jax.utils.pytree import named_leaves
 
 _DROPPED = "dropped"
 _SEAL = "sha256.json"
+# What orbax logs of an error, a page of each of its threads, it raises too.
+logging.getLogger("absl").addFilter(lambda record: f"{os.sep}orbax{os.sep}" not in record.pathname)
 
 
 class SavedState(NamedTuple):
@@ -171,12 +175,17 @@ class StateStore:
         try:
             yield
         except (OSError, ValueError) as error:  # ValueError comes from tensorstore
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"{self._folder}: cannot write this state: {reason}") from error
+            raise InputError(f"{self._folder}: cannot write this state: {_words(error)}") from error
 
     def _clear(self) -> None:
         # Dropped states are renamed before removal, so that a kill leaves no partial state.
         shutil.rmtree(self._dropped, ignore_errors=True)
+
+
+def _words(error: Exception) -> str:
+    """Return what the system said; tensorstore's message has its number after long names."""
+    number = re.search(r"os_error_code='(\d+)'", str(error))
+    return os.strerror(int(number[1])) if number else " ".join(str(error).split())[:200]
 
 
 def _hashes(folder: pathlib.Path) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """`crisalad evaluate`."""
 
+import contextlib
 import dataclasses
 import pathlib
 from typing import Literal
@@ -155,29 +156,31 @@ def run(arguments: Evaluate) -> None:
     console.print(grouping_table(results))
     for note in table_notes(results, settings):
         say(note)
-    if arguments.json is not None:
-        values = results_json(results, settings, model_name=model_name)
-        write_or_print_json(arguments.json, values)
-    if arguments.out is not None:
-        from crisalad_jax.experiments.report import write_galleries
+    with contextlib.ExitStack() as staged:  # so that all files appear, or none
+        if arguments.out is not None:
+            from crisalad_jax.experiments.report import write_galleries
 
-        with staged_folder(arguments.out) as folder:
+            folder = staged.enter_context(staged_folder(arguments.out))
             write_galleries(folder, benchmark, results, model_name=model_name)
             write_json(folder / "config.json", settings)
-    if arguments.report is not None:
-        from crisalad_jax.experiments.report import write_report
+        if arguments.report is not None:
+            from crisalad_jax.experiments.report import write_report
 
-        page = write_report(
-            arguments.report,
-            benchmark,
-            results,
-            params=params,
-            config=config,
-            model_name=model_name,
-            settings=settings,
-            similarities=similarities.map,
-        )
-        say(f"report: {page}")
+            write_report(
+                staged.enter_context(staged_folder(arguments.report)),
+                benchmark,
+                results,
+                params=params,
+                config=config,
+                model_name=model_name,
+                settings=settings,
+                similarities=similarities.map,
+            )
+        if arguments.json is not None:
+            values = results_json(results, settings, model_name=model_name)
+            write_or_print_json(arguments.json, values)
+    if arguments.report is not None:
+        say(f"report: {arguments.report / 'index.html'}")
 
 
 def _check_files(arguments: Evaluate) -> None:

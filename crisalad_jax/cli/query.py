@@ -1,5 +1,6 @@
 """`crisalad query`."""
 
+import contextlib
 import dataclasses
 import pathlib
 from typing import Annotated
@@ -11,7 +12,7 @@ from crisalad_jax.cli.tables import answers_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, real_path
+from crisalad_jax.utils.files import atomic_path, check_target, real_path
 
 _ROWS = 24
 """Largest number of queries in a gallery."""
@@ -72,21 +73,24 @@ def run(arguments: Query) -> None:
     elif file is None and arguments.json is not None:
         for line in json_lines(answers):
             print(line)
-    if arguments.gallery is not None:
-        from crisalad_jax.experiments.report import answers_gallery
+    with contextlib.ExitStack() as staged:  # so that both files appear, or none
+        if arguments.gallery is not None:
+            from crisalad_jax.experiments.report import answers_gallery
 
-        answers_gallery(
-            arguments.gallery,
-            answers,
-            root=arguments.map_images,
-            rows=_ROWS,
-            columns=_COLUMNS,
-            title=str(arguments.map),
-        )
+            answers_gallery(
+                staged.enter_context(atomic_path(arguments.gallery)),
+                answers,
+                root=arguments.map_images,
+                rows=_ROWS,
+                columns=_COLUMNS,
+                title=str(arguments.map),
+            )
+        if file is not None:
+            write_answers(file, answers)
+    if arguments.gallery is not None:
         shown = f"{_ROWS} of " if len(answers.queries) > _ROWS else ""
         say(f"{arguments.gallery}: {shown}{len(answers.queries)} queries {of}")
     if file is not None:
-        write_answers(file, answers)
         say(f"{file}: {len(answers.queries)} queries {of}")
 
 

@@ -26,7 +26,7 @@ from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_
 from crisalad_jax.retrieval.partial import partial_folder, read_tokens_partly
 from crisalad_jax.retrieval.pca import Pca, load_pca
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, real_path
+from crisalad_jax.utils.files import atomic_path, check_target, real_path
 
 StrPath = str | os.PathLike[str]
 
@@ -144,22 +144,24 @@ def extract(
             descriptors = components.apply(descriptors)
         readable = [name for name, ok in zip(names, tokens.readable, strict=True) if ok]
         skipped = [name for name, ok in zip(names, tokens.readable, strict=True) if not ok]
-        if out is not None:
-            record = {
-                "weights": None if weights is None else str(weights),
-                "images": _source(images),
-                "grouping": grouping,
-                "batch_size": batch_size,
-                "seed": seed,
-                "pca": _words(pca),
-                "skipped": skipped,
-                "model": to_plain(config),
-            }
-            write_descriptors(out, descriptors, readable, record)
-    nearest = None
-    if pairs is not None:
-        nearest = nearest_pairs(readable, descriptors, *(others or (readable, descriptors)), k=k)
-        write_pairs(pairs, nearest)
+        record = {
+            "weights": None if weights is None else str(weights),
+            "images": _source(images),
+            "grouping": grouping,
+            "batch_size": batch_size,
+            "seed": seed,
+            "pca": _words(pca),
+            "skipped": skipped,
+            "model": to_plain(config),
+        }
+        nearest = None
+        with contextlib.ExitStack() as staged:  # so that pairs and descriptors appear, or none
+            if pairs is not None:
+                between = others or (readable, descriptors)
+                nearest = nearest_pairs(readable, descriptors, *between, k=k)
+                write_pairs(staged.enter_context(atomic_path(pairs)), nearest)
+            if out is not None:
+                write_descriptors(out, descriptors, readable, record)
     return Extracted(readable, descriptors, skipped, nearest)
 
 

@@ -47,13 +47,11 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
                 # The last holder may have removed the file between the two calls.
                 if _is_still(path, file.fileno()):
                     break
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-            file.flush()
         except OSError as error:
             raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
-        with in_use(path):
-            yield
+        stack.enter_context(in_use(path))
+        _sign(file.fileno())
+        yield
 
 
 @contextlib.contextmanager
@@ -72,6 +70,13 @@ def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
             yield temporary
             for path in sorted(temporary.iterdir(), key=lambda path: path.suffix == ".html"):
                 os.replace(path, out / path.name)
+
+
+def _sign(descriptor: int) -> None:
+    """Write who holds a lock into its file, for messages; a full disk has no room for that."""
+    with contextlib.suppress(OSError):
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
 
 
 def _holder(path: pathlib.Path) -> str:
