@@ -43,7 +43,8 @@ class Query:
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
     verify: bool = True
-    """Check the map's descriptors against their checksums; --no-verify skips that, where files are huge."""
+    """Check the map's descriptors against their checksums; --no-verify skips that, where files are
+    huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()

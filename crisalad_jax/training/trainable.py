@@ -8,7 +8,7 @@ import jax
 from jaxtyping import PyTree
 
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
@@ -47,7 +47,8 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         (trainable, frozen): two trees of the model's structure, None for the other's leaves.
 
     Raises:
-        InputError: an unknown name, more blocks than there are, or a backbone without blocks.
+        InputError: parameters of another model, an unknown name, more blocks than there are, or a
+            backbone without blocks.
 
     Example:
         >>> import jax
@@ -57,6 +58,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         >>> trainable.backbone.cls_token is None, frozen.aggregator.dust_bin is None
         (True, True)
     """
+    check_params(params, config)
     head = ("aggregator.", "cross_image.")
     match = _LAST_BLOCKS.fullmatch(trainable)
     if trainable == ALL:

@@ -223,9 +223,9 @@ def test_no_image(tmp_path, data):
 
 
 def test_no_file(tmp_path):
-    with pytest.raises(InputError, match=r"nothing\.jpg: found no such file, expected an image file"):
+    with pytest.raises(InputError, match=r"nothing\.jpg: found no such file, expected an image"):
         read_image(tmp_path / "nothing.jpg")
-    with pytest.raises(InputError, match=f"{tmp_path.name}: found a folder, expected an image file"):
+    with pytest.raises(InputError, match=f"{tmp_path.name}: found a folder, expected an image"):
         read_image(tmp_path)
 
 

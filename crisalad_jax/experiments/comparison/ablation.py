@@ -180,7 +180,7 @@ def adapter_costs_once(out: pathlib.Path) -> list[AdapterCost]:
     if not path.exists():
         write_json(path, {"costs": [cost._asdict() for cost in adapter_costs()]})
     value = read_json(path, "costs of adapters")
-    rows = value.get("costs") if isinstance(value, dict) else value
+    rows: Any = value.get("costs") if isinstance(value, dict) else value
     try:
         return [AdapterCost(**row) for row in rows]
     except TypeError as error:
