@@ -199,9 +199,15 @@ def test_what_a_kill_leaves_within_the_folder_does_no_harm(
     cut_short(monkeypatch, params, town, out, after=1)
     folder = tmp_path / "d.npy.partial"
     (folder / ".crisalad-lock").write_text("process 1 on elsewhere\n")
-    (folder / ".crisalad-0123456789ab.safetensors").write_bytes(b"half")
+    half = folder / ".crisalad-0123456789ab.safetensors"
+    half.write_bytes(b"half")
     described.clear()
+    real, there = partial.write_sealed, []
+    monkeypatch.setattr(
+        partial, "write_sealed", lambda *given: (there.append(half.exists()), real(*given))
+    )
     run(params, town, out)
+    assert there == [False] * (PARTS - 1)  # its space is needed
     assert described == names_from(town, BATCH)
     assert contents(tmp_path) == whole
 
@@ -299,7 +305,7 @@ def test_what_is_damaged_is_described_again(
     path = folder / f"{BATCH:010d}.safetensors"
     data = bytearray(path.read_bytes())
     if how == "flipped":
-        data[-1] ^= 1
+        data[len(data) // 2] ^= 1  # in the numbers: at the end is whether images could be read
         path.write_bytes(data)
     elif how == "removed":
         path.unlink()
