@@ -188,6 +188,24 @@ def import_everything() -> None:
         importlib.import_module(name)
 
 
+def keep_programs(folder: pathlib.Path) -> dict[str, str]:
+    """Keep all compiled programs of this process' children in a folder: a child starts sooner.
+
+    Returns:
+        The environment that makes other processes do the same.
+    """
+    import jax
+
+    values = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_num_cpu_devices": 1,
+    }
+    for name, value in values.items():
+        jax.config.update(name, value)
+    return {name.upper(): str(value) for name, value in values.items()}
+
+
 def run(arguments: Sequence[str], *, cwd: pathlib.Path, **options: object) -> Done:
     """Run a command of the command line in a forked process, as `forked` does."""
     return forked(lambda: command(arguments), cwd=cwd, **options)  # pyright: ignore
