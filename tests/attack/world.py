@@ -250,39 +250,36 @@ def forked(
         _child(work, cwd, memory, environment, [writing for _, writing in pipes])
     for _, writing in pipes:
         os.close(writing)
-    watcher = os.pidfd_open(process)
+    watchers = [os.pidfd_open(process)]
     texts = {reading: b"" for reading, _ in pipes}
     code, peak = None, 0
     try:
         if during is not None:
             during(process)
         open_pipes = set(texts)
-        while code is None or open_pipes:
+        while watchers or open_pipes:
             left = limit - (time.monotonic() - started)
-            ready, _, _ = select.select([*open_pipes, watcher], [], [], max(left, 0))
+            ready, _, _ = select.select([*open_pipes, *watchers], [], [], max(left, 0))
             if not ready:
-                if code is not None:
+                if not watchers:
                     break  # a grandchild holds the pipes
                 os.kill(process, signal.SIGKILL)
-                code, limit = HUNG, limit + 5  # until the kernel has ended it
-                continue
+                code, limit = HUNG, limit + 60
             for each in open_pipes & set(ready):
                 data = os.read(each, 2**16)
                 texts[each] += data
                 if not data:
                     open_pipes.discard(each)
-            if watcher in ready:
+            if watchers and watchers[0] in ready:
                 _, status, usage = os.wait4(process, 0)
                 code = os.waitstatus_to_exitcode(status) if code is None else code
                 peak = usage.ru_maxrss * 1024
-                os.close(watcher)
-                watcher = next(iter(open_pipes), None)
-                if watcher is None:
-                    break
+                os.close(watchers.pop())
                 limit = time.monotonic() - started + 1
     finally:
-        for reading, _ in pipes:
-            os.close(reading)
+        for each in (*texts, *watchers):
+            os.close(each)
+    assert code is not None
     out, err = (text.decode(errors="replace") for text in texts.values())
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return Done(code, out, err, time.monotonic() - started, max(0, peak - base))
