@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Int, Int32, Int64
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.files import LARGEST, check_source
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
 IDS_PER_CITY = 10**5
@@ -171,7 +171,7 @@ def _read_city(
 
 def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, tuple[str, ...]]]:
     """Yield the line number and the fields, in the order of COLUMNS, of every nonblank row."""
-    check_source(table, "a table of UTF-8 CSV")
+    check_source(table, "a table of UTF-8 CSV", largest=LARGEST)
     try:
         # utf-8-sig: a spreadsheet's byte order mark would spoil the first column's name.
         with table.open(newline="", encoding="utf-8-sig") as file:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.files import LARGEST, check_source
 
 AXES = (("east", "north"), ("lat", "lon"))
 """Names of a position's two numbers: metres of UTM, or degrees."""
@@ -51,7 +51,7 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
     """
     path = pathlib.Path(path)
     positions: dict[str, tuple[float, float]] = {}
-    check_source(path, "a table of UTF-8 CSV")
+    check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)

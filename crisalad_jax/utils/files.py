@@ -18,8 +18,20 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 
-def check_source(path: str | os.PathLike[str], expected: str) -> None:
-    """Check that there is a regular file at `path`; `expected` says of what kind.
+LARGEST = 2**30
+"""Most bytes of a file that is read whole, such as a text or an image: a file that takes no room on
+the disk may claim any number."""
+
+
+def check_source(
+    path: str | os.PathLike[str], expected: str, *, largest: int | None = None
+) -> None:
+    """Check that there is a regular file at `path`.
+
+    Args:
+        path: the file.
+        expected: what kind of file, for messages.
+        largest: most bytes that it may have; None is any number.
 
     Raises:
         InputError: there is none, or something that is no file: a folder, a pipe, a device. Opening
@@ -33,6 +45,8 @@ def check_source(path: str | os.PathLike[str], expected: str) -> None:
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
+    if found is None and largest is not None and (size := os.stat(path).st_size) > largest:
+        found, expected = f"{size} bytes", f"{expected}, of at most {largest}"
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
     (stat.S_ISSOCK, "a socket"),
@@ -44,8 +58,11 @@ def _no_file(path: str | os.PathLike[str]) -> str | None:
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
-        return "no such file"
+        return _NOTHING
     except OSError as error:
+_NOTHING = "no such file"
+
+
         looped = error.errno == errno.ELOOP
         return "links in a circle" if looped else f"a file that cannot be read ({error.strerror})"
     except ValueError as error:
@@ -54,7 +71,7 @@ def _no_file(path: str | os.PathLike[str]) -> str | None:
 
 
 def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
-    """Read a regular file.
+    """Read a regular file of at most `LARGEST` bytes.
 
     Args:
         path: the file.
@@ -63,7 +80,7 @@ def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
     Raises:
         InputError: as `check_source`, or the file cannot be read.
     """
-    check_source(path, expected)
+    check_source(path, expected, largest=LARGEST)
     try:
         return pathlib.Path(path).read_bytes()
     except OSError as error:
@@ -151,8 +168,9 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         suffix: what its name has to end with, as in ".safetensors"; None is anything.
 
     Raises:
-        InputError: `path` is a folder itself, no file can have such a name, or its folder cannot be
-            made or written to; or it has another suffix.
+        InputError: `path` is a folder itself, or a pipe or a device, whose place a file would take;
+            no file can have such a name, or its folder cannot be made or written to; or it has
+            another suffix.
     """
     path = pathlib.Path(path)
     if path.name in ("", "-"):
@@ -160,14 +178,14 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
     if suffix is not None and path.suffix != suffix:
         raise InputError(f"{path}: found the suffix {path.suffix!r}, expected {suffix}")
     try:
-        is_folder = path.is_dir()
+        there = _no_file(path) or "a file"
         nearest = next(folder for folder in path.parents if folder.exists())
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be made: {error}") from error
     if "\0" in str(path):  # pathlib treats such a name as a missing file
         raise InputError(f"{path}: cannot be made: found a NUL in the name")
-    if is_folder:
-        raise InputError(f"{path}: found a folder, expected a file or nothing yet")
+    if there not in ("a file", _NOTHING):
+        raise InputError(f"{path}: found {there}, expected a file or nothing yet")
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
         raise InputError(
             f"{path}: cannot be made: found {nearest}, expected a folder that can be written to"
@@ -257,9 +275,9 @@ def around(page: pathlib.Path, name: str) -> tuple[str, str]:
     Raises:
         InputError: there is no such page, or it has no place of this name.
     """
-    check_source(page, "a page with a place for the table")
+    text = read_text(page, "a page with a place for the table").replace("\r\n", "\n")
     start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-    before, opened, rest = page.read_text(encoding="utf-8").partition(start)
+    before, opened, rest = text.partition(start)
     _, closed, after = rest.partition(end)
     if not opened or not closed:
         raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
