@@ -10,6 +10,7 @@ import os
 import pathlib
 import re
 import shutil
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -28,6 +29,21 @@ _DROPPED = "dropped"
 _SEAL = "sha256.json"
 # What orbax logs of an error, a page of each of its threads, it raises too.
 logging.getLogger("absl").addFilter(lambda record: f"{os.sep}orbax{os.sep}" not in record.pathname)
+_show_unraisable = sys.unraisablehook
+
+
+def _show_but_late(unraisable: Any) -> None:
+    """Show an error that no caller gets, but for results that come after the first error.
+
+    tensorstore then still tells of its other files to a loop of orbax, which the error has ended.
+    """
+    if not isinstance(unraisable.exc_value, RuntimeError) or (
+        str(unraisable.exc_value) != "Event loop is closed"
+    ):
+        _show_unraisable(unraisable)
+
+
+sys.unraisablehook = _show_but_late
 
 
 class SavedState(NamedTuple):
