@@ -30,8 +30,12 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 
 def sealed_json(value: Mapping[str, Any], indent: int | None = None) -> bytes:
-    """Return an object as the bytes of a JSON file, with its checksum ahead of all other keys."""
-    data = (json.dumps({CHECKSUM: BLANK} | dict(value), indent=indent) + "\n").encode()
+    """Return an object as the bytes of a JSON file, with its checksum ahead of all other keys.
+
+    A checksum that the object has already, as of another file, is left out.
+    """
+    rest = {key: each for key, each in value.items() if key != CHECKSUM}
+    data = (json.dumps({CHECKSUM: BLANK} | rest, indent=indent) + "\n").encode()
     return data.replace(BLANK.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
 
 
@@ -67,6 +71,12 @@ class ChangedFileError(InputError):
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
     """Tell that a file, as of an earlier version or another program, has no checksum."""
     tell(f"{path}: found {missing}, as of earlier versions or other programs; not checked")
+
+
+def has_damaged_key(value: Mapping[str, Any]) -> bool:
+    """Return whether an object begins with a digest whose key has other letters than `CHECKSUM`."""
+    key = next(iter(value), "")
+    return key != CHECKSUM and len(key) == len(CHECKSUM) and _is_digest(value[key])
 
 
 def _is_digest(value: Any) -> bool:

@@ -13,10 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.lib.format import dtype_to_descr, write_array_header_1_0
 
-from crisalad_jax.utils.checksums import CHECKSUM, check_sealed, sealed_json, tell_unchecked
+from crisalad_jax.utils.checksums import (
+    CHECKSUM,
+    ChangedFileError,
+    check_sealed,
+    has_damaged_key,
+    sealed_json,
+    tell_unchecked,
+)
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
-
 
 LARGEST = 2**30
 """Most bytes of a file that is read whole, such as a text or an image: a file that takes no room on
@@ -34,10 +40,12 @@ def check_source(
         largest: most bytes that it may have; None is any number.
 
     Raises:
-        InputError: there is none, or something that is no file: a folder, a pipe, a device. Opening
-            a pipe may wait for ever, and a device may never end.
+        InputError: there is none, one that is larger, or something that is no file: a folder, a
+            pipe, a device. Opening a pipe may wait for ever, and a device may never end.
     """
     found = _no_file(path)
+    if found is None and largest is not None and (size := os.stat(path).st_size) > largest:
+        found, expected = f"{size} bytes", f"{expected}, of at most {largest}"
     if found is not None:
         raise InputError(f"{path}: found {found}, expected {expected}")
 
@@ -45,12 +53,13 @@ def check_source(
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
-    if found is None and largest is not None and (size := os.stat(path).st_size) > largest:
-        found, expected = f"{size} bytes", f"{expected}, of at most {largest}"
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
     (stat.S_ISSOCK, "a socket"),
 )
+
+
+_NOTHING = "no such file"
 
 
 def _no_file(path: str | os.PathLike[str]) -> str | None:
@@ -60,9 +69,6 @@ def _no_file(path: str | os.PathLike[str]) -> str | None:
     except (FileNotFoundError, NotADirectoryError):
         return _NOTHING
     except OSError as error:
-_NOTHING = "no such file"
-
-
         looped = error.errno == errno.ELOOP
         return "links in a circle" if looped else f"a file that cannot be read ({error.strerror})"
     except ValueError as error:
@@ -146,6 +152,8 @@ def read_json(
     value = parse_json(data, str(path), expected)
     if isinstance(value, dict) and CHECKSUM in value:
         check_sealed(data, value.pop(CHECKSUM), path)
+    elif isinstance(value, dict) and has_damaged_key(value):
+        raise ChangedFileError(path)
     elif must(value):
         raise InputError(f"{path}: found no checksum, expected {expected}")
     elif not quiet:
@@ -207,11 +215,18 @@ def told_of(path: pathlib.Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+def atomic_path(
+    path: str | os.PathLike[str], within: pathlib.Path | None = None
+) -> Iterator[pathlib.Path]:
     """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any error.
 
     The temporary name keeps the suffix, for writers that choose a format by it. Parent folders are
     made as needed.
+
+    Args:
+        path: the file.
+        within: a folder on the same disk for the temporary file, which its owner clears; None is
+            the folder of `path`.
 
     Raises:
         InputError: what `check_target` raises; or the disk is full, or fails.
@@ -219,7 +234,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     path = pathlib.Path(path)
     check_target(path)
     with made_folder(path.parent), told_of(path):
-        temporary = temporary_beside(path)
+        temporary = temporary_beside(path if within is None else within / path.name)
         with in_use(temporary):
             yield temporary
             os.replace(temporary, path)
@@ -258,7 +273,7 @@ def write_npy(path: pathlib.Path, array: np.ndarray) -> None:
     array = np.ascontiguousarray(array)
     with path.open("wb") as file:
         file.write(npy_header(array.dtype, array.shape))
-        file.write(array.data)
+        file.write(array.reshape(-1).view(np.uint8).data)
 
 
 def npy_header(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
