@@ -138,16 +138,18 @@ def at_every_step(folder: pathlib.Path, _store: str, _kills: int, _longest: floa
 
             setattr(module, name, call)
 
-        def half_array(path: pathlib.Path, array: np.ndarray) -> None:
-            path.write_bytes(array.tobytes()[: array.nbytes // 2])
+        real_bytes = pathlib.Path.write_bytes
 
-        def half_text(path: pathlib.Path, text: str, **_: object) -> None:
-            path.write_bytes(text.encode()[: len(text) // 2])
+        def half_array(path: pathlib.Path, array: np.ndarray) -> None:
+            real_bytes(path, array.tobytes()[: array.nbytes // 2])
+
+        def half_bytes(path: pathlib.Path, data: bytes) -> None:
+            real_bytes(path, data[: len(data) // 2])
 
         for name in ("replace", "fsync", "mkdir", "unlink"):
             instead(os, name, lambda *_, **__: None)
         instead(crisalad_jax.retrieval.maps.file_store, "write_npy", half_array)
-        instead(pathlib.Path, "write_text", half_text)
+        instead(pathlib.Path, "write_bytes", half_bytes)
         append_until(target, 7)
 
     for start in (0, 3):

@@ -85,7 +85,8 @@ class Evaluate:
     json: pathlib.Path | None = None
     """File for the table as JSON."""
     verify: bool = True
-    """Check weights and components against their checksums; --no-verify skips that, where files are huge."""
+    """Check weights and components against their checksums; --no-verify skips that, where files are
+    huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()

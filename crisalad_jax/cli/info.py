@@ -81,7 +81,7 @@ def _map(folder: pathlib.Path, arguments: Info) -> dict[str, Any]:
             raise InputError(
                 f"--{field.name.replace('_', '-')}: found beside --map, expected it for a model"
             )
-    with Map.open(folder) as places:
+    with Map.open(folder, verify=False) as places:
         summary = places.summary(verify=arguments.verify)
     width = max(map(len, summary))
     say("\n".join(f"{name:<{width}}  {value}" for name, value in summary.items()))

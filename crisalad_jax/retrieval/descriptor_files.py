@@ -68,6 +68,8 @@ def write_descriptors(
     descriptors: Descriptors,
     names: Sequence[str],
     record: Mapping[str, Any] | None = None,
+    *,
+    within: pathlib.Path | None = None,
 ) -> None:
     """Write descriptors, their images' names and a record of both.
 
@@ -80,6 +82,7 @@ def write_descriptors(
         descriptors: a row for each image.
         names: of the images.
         record: how they were made, as JSON values.
+        within: a folder for temporary files, see `files.atomic_path`.
 
     Raises:
         InputError: another suffix, a name twice in a .h5, or a file that cannot be written.
@@ -87,17 +90,21 @@ def write_descriptors(
     check_suffix(path)
     path = pathlib.Path(path)
     write = {".npy": _write_npy, ".h5": _write_h5}[path.suffix]
-    write(path, descriptors, names, dict(record or {}))
+    write(path, descriptors, names, dict(record or {}), within)
 
 
 def _write_npy(
-    path: pathlib.Path, descriptors: Descriptors, names: Sequence[str], record: dict[str, Any]
+    path: pathlib.Path,
+    descriptors: Descriptors,
+    names: Sequence[str],
+    record: dict[str, Any],
+    within: pathlib.Path | None,
 ) -> None:
     # The files that are entered last are renamed first.
     with (
-        atomic_path(path) as array,
-        atomic_path(_names_of(path)) as listed,
-        atomic_path(record_of(path)) as written,
+        atomic_path(path, within) as array,
+        atomic_path(_names_of(path), within) as listed,
+        atomic_path(record_of(path), within) as written,
     ):
         with told_of(path):
             write_npy(array, descriptors)
@@ -107,12 +114,16 @@ def _write_npy(
 
 
 def _write_h5(
-    path: pathlib.Path, descriptors: Descriptors, names: Sequence[str], record: dict[str, Any]
+    path: pathlib.Path,
+    descriptors: Descriptors,
+    names: Sequence[str],
+    record: dict[str, Any],
+    within: pathlib.Path | None,
 ) -> None:
     """Write a group for each image, with a dataset `global_descriptor`, as hloc does."""
     import h5py
 
-    with atomic_path(path) as array, atomic_path(record_of(path)) as written:
+    with atomic_path(path, within) as array, atomic_path(record_of(path), within) as written:
         with array.open("w+b", buffering=0) as raw:
             target = _NeverFull(raw)
             with h5py.File(target, "w") as file:

@@ -119,6 +119,7 @@ def extract(
     length = config.descriptor_dim if components is None else len(components.components)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
     batch_size = useful_batch_size(batch_size, len(paths))
+    folder = None
     with contextlib.ExitStack() as stack:
         if out is None:
             read = functools.partial(read_tokens, label="images")
@@ -161,7 +162,7 @@ def extract(
                 nearest = nearest_pairs(readable, descriptors, *between, k=k)
                 write_pairs(staged.enter_context(atomic_path(pairs)), nearest)
             if out is not None:
-                write_descriptors(out, descriptors, readable, record)
+                write_descriptors(out, descriptors, readable, record, within=folder)
     return Extracted(readable, descriptors, skipped, nearest)
 
 

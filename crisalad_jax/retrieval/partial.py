@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import pathlib
-import shutil
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -43,16 +42,21 @@ def partial_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
     """
     folder = out.with_name(f"{out.name}.partial")
     with one_writer(folder):
+        remove_temporaries(folder)
         try:
             yield folder
-        except InputError as error:
-            if _segments(folder):
+        except BaseException as error:
+            if not _segments(folder):
+                (folder / _PLAN).unlink(missing_ok=True)
+            elif isinstance(error, InputError):
                 raise InputError(
                     f"{error} (what is done is kept in {folder}, and the same command goes on)"
                 ) from error
-            (folder / _PLAN).unlink(missing_ok=True)
             raise
-        shutil.rmtree(folder)
+        for path in (*_segments(folder), folder / _PLAN):
+            path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # another process has begun here, or a user's file is there
+        folder.rmdir()
 
 
 def _segments(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -76,11 +80,10 @@ def read_tokens_partly(
     Raises:
         InputError: an image cannot be read, and `on_bad_image` is "stop"; or a full disk.
     """
-    remove_temporaries(folder)
-    _begin(folder, _plan(params, config, paths, batch_size))
+    _begin(folder, _plan(params, config, batch_size))
     # Whole batches, so that the same images are computed together after a kill.
     size = -(-SEGMENT // batch_size) * batch_size
-    parts = list(_read(folder, len(paths), size, on_bad_image))
+    parts = list(_read(folder, paths, size, on_bad_image))
     done = sum(len(part.readable) for part in parts)
     with progress_bar("images", len(paths), "images", quiet=quiet, done=done) as bar:
         while done < len(paths):
@@ -98,7 +101,8 @@ def read_tokens_partly(
             part = _joined(batches)
             if part.readable.any():
                 arrays = {name: np.ascontiguousarray(leaf) for name, leaf in part._asdict().items()}
-                write_sealed(_path(folder, done), arrays, FORMAT, {})
+                value = {"images": _digest(paths[done : done + size])}
+                write_sealed(_path(folder, done), arrays, FORMAT, value)
             parts.append(part)
             done += len(part.readable)
     return _joined(parts)
@@ -112,26 +116,29 @@ def _path(folder: pathlib.Path, first: int) -> pathlib.Path:
     return folder / f"{first:010d}.safetensors"
 
 
-def _plan(
-    params: Crisalad, config: ModelConfig, paths: Sequence[pathlib.Path], batch_size: int
-) -> dict[str, Any]:
-    """Return what tokens depend on: the model, the images and how they are batched."""
+def _plan(params: Crisalad, config: ModelConfig, batch_size: int) -> dict[str, Any]:
+    """Return what all tokens depend on: the model, and how many images are computed together."""
+    plan = {
+        "model": model_hash(params, config),
+        "config": to_plain(config),
+        "batch_size": batch_size,
+    }
+    return json.loads(json.dumps(plan))
+
+
+def _digest(paths: Sequence[pathlib.Path]) -> str:
+    """Compute a digest of the names, sizes and times of image files."""
     files = hashlib.sha256()
     for path in paths:
         with contextlib.suppress(OSError):  # told when it is read
             there = path.stat()
             line = f"{os.fspath(path)} {there.st_size} {there.st_mtime_ns}\n"
             files.update(line.encode(errors="surrogateescape"))
-    return {
-        "model": model_hash(params, config),
-        "config": to_plain(config),
-        "images": files.hexdigest(),
-        "batch_size": batch_size,
-    }
+    return files.hexdigest()
 
 
 def _begin(folder: pathlib.Path, plan: dict[str, Any]) -> None:
-    """Remove what is left of other work in the folder."""
+    """Remove what is left of work by another model in the folder."""
     left = _segments(folder)
     try:
         if left and read_json(folder / _PLAN, "the plan of an extraction") == plan:
@@ -139,25 +146,28 @@ def _begin(folder: pathlib.Path, plan: dict[str, Any]) -> None:
     except InputError:
         pass
     if left:
-        tell(f"{folder}: found work on other images or of another model; it is begun anew")
+        tell(f"{folder}: found work of another model or batch size; it is begun anew")
     for path in left:
         path.unlink()
-    write_json(folder / _PLAN, json.loads(json.dumps(plan)))
+    write_json(folder / _PLAN, plan)
 
 
 def _read(
-    folder: pathlib.Path, count: int, size: int, on_bad_image: OnBadImage
+    folder: pathlib.Path, paths: Sequence[pathlib.Path], size: int, on_bad_image: OnBadImage
 ) -> Iterator[FolderTokens]:
-    """Yield the tokens that are there, up to the first file that is damaged or missing."""
-    for first in range(0, count, size):
+    """Yield the tokens that are there, up to a file that is damaged, missing or of other images."""
+    for first in range(0, len(paths), size):
         path = _path(folder, first)
         if not path.exists():
             return
         try:
             with checked_safetensors(path, verify=True):
-                arrays = read_sealed(path, (FORMAT,), "tokens of images").arrays
+                _, value, arrays = read_sealed(path, (FORMAT,), "tokens of images")
             part = FolderTokens(**arrays)
         except (InputError, TypeError):
+            return
+        if value.get("images") != _digest(paths[first : first + size]):
+            tell(f"{path}: found work on other images; from there on it is begun anew")
             return
         if on_bad_image == "stop" and not part.readable.all():
             return  # to be read again, for the error

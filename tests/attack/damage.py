@@ -33,7 +33,7 @@ def readers(world: World) -> Mapping[str, tuple[str, str, Reader]]:
     from crisalad_jax.checkpoints.train_state import StateStore
     from crisalad_jax.checkpoints.weights import load_weights
     from crisalad_jax.config.io import read_config
-    from crisalad_jax.experiments.comparison.runner import read_result
+    from crisalad_jax.experiments.comparison.records import read_result
     from crisalad_jax.retrieval.descriptor_files import read_descriptors
     from crisalad_jax.retrieval.faiss_index import load_index
     from crisalad_jax.retrieval.maps.map import Map

@@ -253,7 +253,7 @@ def test_an_image_that_is_skipped_is_skipped_again(params, town, described, tmp_
 @pytest.mark.parametrize(
     "other",
     [
-        *("picture", "fewer", "order", "model"),
+        "model",
         # Programs of their own are compiled.
         *(pytest.param(other, marks=pytest.mark.slow) for other in ("config", "batch size")),
     ],
@@ -266,13 +266,7 @@ def test_other_work_is_begun_anew_with_a_note(
     listed = list_images(images)
     cut_short(monkeypatch, params, listed, out, after=2)
     options = {}
-    if other == "picture":
-        write_picture(listed[-1], seed=99)
-    elif other == "fewer":
-        listed = listed[:-1]
-    elif other == "order":
-        listed = listed[::-1]
-    elif other == "model":
+    if other == "model":
         params = jax.tree.map(lambda leaf: leaf * 0.9, params)
     elif other == "config":
         options["config"] = MODEL.resized((56, 56))
@@ -285,7 +279,7 @@ def test_other_work_is_begun_anew_with_a_note(
         size = options.get("batch_size", BATCH)
         return extract(params, config, listed, out, batch_size=size, quiet=True)
 
-    words = r"d\.npy\.partial: found work on other images or of another model; it is begun anew"
+    words = r"d\.npy\.partial: found work of another model or batch size; it is begun anew"
     with pytest.warns(Note, match=words) as told:
         found = again(out)
     assert len(told) == 1
@@ -375,10 +369,43 @@ def test_a_failure_before_anything_is_done_leaves_nothing(params, town, tmp_path
         assert "d.npy.partial" not in os.listdir(out.parent)
 
 
+@pytest.mark.parametrize(
+    ("other", "kept"),
+    [
+        ("first picture", 0),
+        ("second batch", BATCH),
+        ("order", 0),
+        ("last picture", 2 * BATCH),
+        ("fewer", 2 * BATCH),
+    ],
+)
+def test_batches_of_the_same_images_are_kept(
+    params, town, described, tmp_path, monkeypatch, other, kept
+):
+    """Two batches are done; those before the first that has changed are not described again."""
+    images, out = tmp_path / "town", tmp_path / "d.npy"
+    shutil.copytree(town, images)
+    listed = list_images(images)
+    cut_short(monkeypatch, params, listed, out, after=2)
+    place = {"first picture": 0, "second batch": BATCH, "last picture": -1}.get(other)
+    if place is not None:
+        write_picture(listed[place], seed=99)
+    listed = {"fewer": listed[:-1], "order": listed[::-1]}.get(other, listed)
+    described.clear()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", Note)
+        found = run(params, listed, out)
+    assert described == [path.name for path in listed[kept:]]
+    assert len(told) == (kept < 2 * BATCH)
+    assert all("found work on other images" in str(note.message) for note in told)
+    alone = run(params, listed, tmp_path / "alone.npy")
+    np.testing.assert_array_equal(found.descriptors, alone.descriptors)
+
+
 def test_a_failure_to_write_keeps_the_work(params, town, whole, described, tmp_path, monkeypatch):
     out = tmp_path / "d.npy"
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise InputError("d.npy: cannot be written: No space left on device")
 
     with monkeypatch.context() as patch:

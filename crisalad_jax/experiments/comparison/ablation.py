@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from crisalad_jax.config.parts import Part
 from crisalad_jax.experiments.comparison.methods import training_with
+from crisalad_jax.experiments.comparison.records import advised
 from crisalad_jax.experiments.comparison.timing import Race, race
 from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -179,15 +180,13 @@ def adapter_costs_once(out: pathlib.Path) -> list[AdapterCost]:
     path = out / "adapters.json"
     if not path.exists():
         write_json(path, {"costs": [cost._asdict() for cost in adapter_costs()]})
-    value = read_json(path, "costs of adapters")
-    rows: Any = value.get("costs") if isinstance(value, dict) else value
-    try:
-        return [AdapterCost(**row) for row in rows]
-    except TypeError as error:
-        raise InputError(
-            f"{path}: found no costs of adapters ({error}), expected them; delete it, and the same "
-            "command makes it anew"
-        ) from error
+    with advised():
+        value = read_json(path, "costs of adapters")
+        rows: Any = value.get("costs") if isinstance(value, dict) else value
+        try:
+            return [AdapterCost(**row) for row in rows]
+        except TypeError as error:
+            raise InputError(f"{path}: found {error}, expected costs of adapters") from error
 
 
 def _model(kind: AdapterKind) -> ModelConfig:

@@ -34,6 +34,7 @@ from crisalad_jax.experiments.comparison.plan import (
     Variant,
     file_name,
 )
+from crisalad_jax.experiments.comparison.records import advised, read_result
 from crisalad_jax.experiments.comparison.timing import Race, describing, is_absolute, machine, race
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
@@ -285,8 +286,13 @@ def _count_sitting(folder: pathlib.Path) -> None:
 
 def _sittings(path: pathlib.Path) -> int:
     """Read the number of sittings; the first version of the file held the number alone."""
-    value = read_json(path, "a number of sittings")
-    return value if isinstance(value, int) else read_result(path, sittings=int)["sittings"]
+    with advised():
+        value = read_json(path, "a number of sittings")
+        if isinstance(value, dict):
+            value = value.get("sittings")
+        if not isinstance(value, int):
+            raise InputError(f"{path}: found {value!r}, expected a number of sittings")
+    return value
 
 
 def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) -> dict[str, Any]:
@@ -329,23 +335,3 @@ def read_race(out: pathlib.Path) -> tuple[Race, dict[str, Any]]:
     """Read the times that `carry_out` measured, and the rest of their record."""
     record = read_result(out / "speed.json", rounds=dict, device=str, absolute=bool, batch_size=int)
     return Race(record["rounds"]), record
-
-
-def read_result(path: pathlib.Path, **kinds: type) -> dict[str, Any]:
-    """Read a file of results.
-
-    Args:
-        path: the file.
-        kinds: the type of each value that the caller needs, by key.
-
-    Raises:
-        InputError: it cannot be read, was changed, or lacks one of these values.
-    """
-    try:
-        value = read_json(path, "a result of a comparison")
-        for key, kind in kinds.items():
-            if not isinstance(value, dict) or not isinstance(value.get(key), kind):
-                raise InputError(f"{path}: found no {key!r} of {kind.__name__}, expected it")
-    except InputError as error:
-        raise InputError(f"{error}; delete it, and the same command makes it anew") from error
-    return value

@@ -13,12 +13,8 @@ from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY
 from crisalad_jax.experiments.comparison.ablation import NOTES, AdapterCost
 from crisalad_jax.experiments.comparison.plan import Prepared, Variant, labels_of, short_names
-from crisalad_jax.experiments.comparison.runner import (
-    folder_of,
-    read_race,
-    read_result,
-    result_path,
-)
+from crisalad_jax.experiments.comparison.records import read_result
+from crisalad_jax.experiments.comparison.runner import folder_of, read_race, result_path
 from crisalad_jax.experiments.comparison.timing import Race
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.training.trainable import count_trainable

@@ -87,7 +87,7 @@ def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
     """
     folder = pathlib.Path(folder)
     path = folder / DESCRIPTION
-    if not path.is_file():
+    if not path.exists():
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: found a file, expected a map's folder")
         # A process killed before it has made the map leaves its lock and temporary files behind.

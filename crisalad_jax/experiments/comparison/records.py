@@ -1,0 +1,42 @@
+"""Read the files of results in the folder of a comparison."""
+
+import contextlib
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json
+
+
+def read_result(path: pathlib.Path, **kinds: type) -> dict[str, Any]:
+    """Read a file of results.
+
+    Args:
+        path: the file.
+        kinds: the type of each value that the caller needs, by key.
+
+    Raises:
+        InputError: it cannot be read, was changed, or lacks one of these values.
+    """
+    with advised():
+        value = read_json(path, "a result of a comparison")
+        if not isinstance(value, dict):
+            raise InputError(f"{path}: found no object, expected a result of a comparison")
+        for key, kind in kinds.items():
+            if not isinstance(value.get(key), kind):
+                raise InputError(f"{path}: found no {key!r} of {kind.__name__}, expected it")
+    return value
+
+
+@contextlib.contextmanager
+def advised() -> Iterator[None]:
+    """Add to an error of reading a result what to do.
+
+    Raises:
+        InputError: in place of one of the block.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{error}; delete it, and the same command makes it anew") from error

@@ -1,0 +1,92 @@
+"""Measure what checksums cost: loading weights, and extracting descriptors into files.
+
+    python scripts/bench/bench_checksums.py [--preset b14] [--images 5000] [--rounds 7]
+
+Each round takes both ways in turns; ratios are medians over rounds. Weights: with and without
+`verify`. Descriptors: `extract` into a .npy, which keeps its work in files, hashes all and can be
+resumed, beside the same call in memory and numpy's own writing.
+"""
+
+import argparse
+import pathlib
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+
+import cv2
+import jax
+import numpy as np
+
+from crisalad_jax import PRESETS, extract, init_crisalad, load, save_weights
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--preset", default="b14")
+    parser.add_argument("--images", type=int, default=5000)
+    parser.add_argument("--rounds", type=int, default=7)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name)
+        weights = folder / "weights.safetensors"
+        config = PRESETS[given.preset]
+        save_weights(weights, init_crisalad(jax.random.key(0), config), config)
+        ratio(
+            f"load {given.preset}, {weights.stat().st_size / 1e6:.0f} MB",
+            lambda: load(weights),
+            lambda: load(weights, verify=False),
+            3 * given.rounds,
+        )
+        if given.images:
+            extraction(folder, given.images, given.rounds)
+
+
+def extraction(folder: pathlib.Path, count: int, rounds: int) -> None:
+    """The model `tiny`: beside a larger one checksums would cost less."""
+    images = folder / "images"
+    images.mkdir()
+    generator = np.random.default_rng(0)
+    for number in range(count):
+        coarse = generator.uniform(0, 255, (6, 8, 3)).astype(np.float32)
+        picture = cv2.resize(coarse, (320, 240), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(images / f"{number:05d}.jpg"), np.clip(picture, 0, 255).astype(np.uint8))
+    config = PRESETS["tiny"]
+    params = init_crisalad(jax.random.key(0), config)
+
+    def plain() -> None:
+        done = extract(params, config, images, quiet=True)
+        np.save(folder / "plain.npy", done.descriptors)
+        (folder / "plain.txt").write_text("\n".join(done.names))
+
+    ratio(
+        f"extract {count} images",
+        lambda: extract(params, config, images, folder / "d.npy", quiet=True),
+        plain,
+        rounds,
+    )
+
+
+def ratio(what: str, checked: Callable[[], object], plain: Callable[[], object], rounds: int):
+    """Print the median, least and most of the ratio of two times, each pair taken in turns."""
+    for call in (checked, plain):
+        call()  # compiles, and fills the cache of the disk
+    pairs = []
+    for number in range(rounds):
+        calls = (checked, plain) if number % 2 else (plain, checked)
+        times = {}
+        for call in calls:
+            start = time.perf_counter()
+            call()
+            times[call] = time.perf_counter() - start
+        pairs.append((times[checked], times[plain]))
+    ratios = sorted(a / b for a, b in pairs)
+    median = statistics.median(ratios)
+    print(
+        f"{what}: {median:.3f} times as long with checksums ({ratios[0]:.3f} to {ratios[-1]:.3f}), "
+        f"{statistics.median(b for _, b in pairs):.3f} s without"
+    )
+
+
+if __name__ == "__main__":
+    main()
