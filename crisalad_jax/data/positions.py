@@ -45,9 +45,9 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
     """Read a table with the header `name,east,north` or `name,lat,lon`; other columns are ignored.
 
     Raises:
-        InputError: the file cannot be read, has another header or one with both pairs, a row with
-            more fields than that, a name twice, or a value that is no finite number, or no
-            latitude or longitude.
+        InputError: the file cannot be read, has another header, one with both pairs or with a
+            column twice, a row with more fields than that, a name twice, or a value that is no
+            finite number, or no latitude or longitude.
     """
     path = pathlib.Path(path)
     positions: dict[str, tuple[float, float]] = {}
@@ -77,6 +77,9 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
 
 def _axes(path: pathlib.Path, header: Sequence[str]) -> tuple[str, str]:
     matching = [axes for axes in AXES if {"name", *axes} <= set(header)]
+    twice = [name for name in header if header.count(name) > 1 and name in ("name", *sum(AXES, ()))]
+    if twice:
+        raise InputError(f"{path}: found the column {twice[0]} twice, expected it once")
     if len(matching) != 1:
         both = ", not both" if matching else ""
         raise InputError(

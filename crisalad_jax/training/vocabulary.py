@@ -26,6 +26,7 @@ from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
+from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
@@ -282,6 +283,7 @@ def _read_features(
     on_bad_image: OnBadImage,
     quiet: bool,
 ) -> Float32[np.ndarray, "feature dim"]:
+    batch_size = useful_batch_size(batch_size, len(paths))
     batches = image_batches(
         paths, image_size=config.image_size, batch_size=batch_size, on_bad_image=on_bad_image
     )

@@ -12,7 +12,7 @@ from jaxtyping import Int64
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_split, list_part
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.files import LARGEST, check_source
 
 TRUTH = "ground_truth.csv"
 _HEADER = ["query", "database"]
@@ -132,7 +132,7 @@ def _by_table(
 
 def _rows(table: pathlib.Path) -> Iterator[tuple[int, str, str]]:
     """Yield the line number, query and match of every row that is not blank."""
-    check_source(table, "a table of UTF-8 CSV")
+    check_source(table, "a table of UTF-8 CSV", largest=LARGEST)
     try:
         # utf-8-sig: a spreadsheet's byte order mark would spoil the first name.
         with table.open(newline="", encoding="utf-8-sig") as file:

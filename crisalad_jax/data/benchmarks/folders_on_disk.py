@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from crisalad_jax.data.images import list_images
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import real_path
 
 SPLITS = ("test", "val", "train")
 
@@ -68,7 +69,7 @@ def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str
         InputError: there is none.
     """
     # resolve: a root of "." still has a name to print
-    resolved = root.resolve()
+    resolved = real_path(root)
     if split is None and has_sides(root):
         if resolved.parent.name == "images":
             return root, f"{resolved.parent.parent.name}/{resolved.name}"

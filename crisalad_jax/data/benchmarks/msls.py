@@ -18,7 +18,7 @@ from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, listing, shown
 from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.files import LARGEST, check_source, real_path
 
 MSLS_CITIES = {
     "val": ("cph", "sf"),
@@ -170,7 +170,7 @@ def heading_difference(
 
 def is_msls(root: pathlib.Path) -> bool:
     """Return whether a folder is raw MSLS: it holds train_val/ or is itself train_val/."""
-    return (root / "train_val").is_dir() or root.resolve().name == "train_val"
+    return (root / "train_val").is_dir() or real_path(root).name == "train_val"
 
 
 def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
@@ -230,7 +230,7 @@ _Table = list[dict[str, str]]
 
 
 def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> _Table:
-    check_source(path, "a table of UTF-8 CSV")
+    check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, restval="")

@@ -16,7 +16,7 @@ from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.files import LARGEST, check_source
 
 _FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
 _DATABASE_FOLDERS = (".", "images")
@@ -80,7 +80,7 @@ def _read_struct(path: pathlib.Path) -> np.void:
     # Import here: scipy takes half a second, and no other layout needs it.
     import scipy.io
 
-    check_source(path, "a .mat file with dbStruct")
+    check_source(path, "a .mat file with dbStruct", largest=LARGEST)
     try:
         contents = scipy.io.loadmat(path)
     except NotImplementedError as error:

@@ -17,6 +17,7 @@ from crisalad_jax.data.benchmarks.ground_truth import indices, is_nordland_star,
 from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import real_path
 
 _FILE = re.compile(r"(?P<prefix>(?:.*_)?)(?P<kind>dbImages|qImages|gt|qIdx|pIdx)\.npy")
 _MSLS_IMAGE = re.compile(r"train_val/([^/]+)/(?:database|query)/images/[^/]+")
@@ -72,7 +73,7 @@ def read_salad_lists(
     elif cities is not None:
         name = f"{msls_title(cities)}, {len(query_names)} queries (SALAD's list)"
     else:
-        name = f"{prefix.strip('_') or files['dbImages'].resolve().parent.name} (SALAD's lists)"
+        name = f"{prefix.strip('_') or real_path(files['dbImages']).parent.name} (SALAD's lists)"
     return Benchmark(name, root, images_of["dbImages"], images_of["qImages"], positives, rule)
 
 

@@ -11,6 +11,7 @@ from crisalad_jax.data.benchmarks.folders_on_disk import list_part
 from crisalad_jax.data.benchmarks.ground_truth import indices, is_nordland_star, matches
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import real_path
 
 TRUTH = "ground_truth_new.npy"
 
@@ -31,7 +32,7 @@ def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
     database, queries = (_numbered(list_part(root / part)) for part in ("ref", "query"))
     path = root / TRUTH
     positives = _match(path, read_npy(path), len(database), len(queries))
-    name, rule = f"{root.resolve().name} (VPR-Bench)", f"the reference images that {TRUTH} lists"
+    name, rule = f"{real_path(root).name} (VPR-Bench)", f"the reference images that {TRUTH} lists"
     if is_nordland_star(positives, len(database)):
         name = "Nordland*, winter database, summer queries (VPR-Bench)"
         rule += ", which are 10i - 1, 10i and 10i + 1 for query i: by that it is Nordland*"
