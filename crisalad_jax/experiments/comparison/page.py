@@ -11,7 +11,7 @@ from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison import tables
 from crisalad_jax.experiments.comparison.summary import KS, Recall, Summary
 from crisalad_jax.experiments.report.embedding import Drawing, drawing
-from crisalad_jax.experiments.report.page import PAGE, render
+from crisalad_jax.experiments.report.page import ESCAPED, PAGE, render
 from crisalad_jax.experiments.report.style import (
     COLOURS,
     GREY,
@@ -66,7 +66,8 @@ def write_page(summary: Summary, out: pathlib.Path) -> pathlib.Path:
     }
     path = out / PAGE
     with atomic_path(path) as temporary:
-        temporary.write_text(render(context, "comparison.html"), encoding="utf-8")
+        text = render(context, "comparison.html")
+        temporary.write_text(text, encoding="utf-8", errors=ESCAPED)
     return path
 
 

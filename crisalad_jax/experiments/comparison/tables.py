@@ -12,6 +12,7 @@ from rich.text import Text
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.ablation import AdapterCost
 from crisalad_jax.experiments.comparison.summary import KS, Recall, Row, Summary
+from crisalad_jax.experiments.report.page import ESCAPED
 from crisalad_jax.utils.files import around, atomic_path, write_json
 
 NOTHING = "-"
@@ -170,8 +171,14 @@ def comma_separated(summary: Summary) -> str:
         for name, recalls in row.recalls.items():
             for k, recall in recalls.items():
                 values = (recall.mean, recall.spread, *recall.interval, len(recall.by_seed))
-                writer.writerow([*row.labels, row.name, row.grouping, name, k, *values, *costs])
+                texts = map(_no_formula, (*row.labels, row.name, row.grouping, name))
+                writer.writerow([*texts, k, *values, *costs])
     return text.getvalue()
+
+
+def _no_formula(text: str) -> str:
+    """Put a quote before a text that a spreadsheet would take for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 def _absolute(row: Row) -> float | None:
@@ -208,7 +215,7 @@ def write_tables(summary: Summary, out: pathlib.Path) -> None:
     """Write table.md, table.csv and results.json."""
     for name, text in (("table.md", markdown(summary)), ("table.csv", comma_separated(summary))):
         with atomic_path(out / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_text(text, encoding="utf-8", errors=ESCAPED)
     write_json(out / "results.json", as_json(summary))
 
 
@@ -216,4 +223,5 @@ def put_in_page(page: pathlib.Path, name: str, text: str) -> None:
     """Put a text between its marks in a page; raises as `files.around`."""
     before, after = around(page, name)
     with atomic_path(page) as temporary:
-        temporary.write_text(f"{before}\n{text}\n{after}", encoding="utf-8")
+        whole = f"{before}\n{text}\n{after}"
+        temporary.write_text(whole, encoding="utf-8", errors=ESCAPED)

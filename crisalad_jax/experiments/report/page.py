@@ -23,6 +23,8 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import staged_folder
 
 PAGE = "index.html"
+ESCAPED = "backslashreplace"
+"""How pages and tables are encoded: bytes of names that are no UTF-8 become escapes."""
 
 
 def write_report(
@@ -94,7 +96,7 @@ def _write(
         "matrix": sections.matrix(subject, similarities),
         "settings": json.dumps(settings, indent=2),
     }
-    (folder / PAGE).write_text(render(context), encoding="utf-8")
+    (folder / PAGE).write_text(render(context), encoding="utf-8", errors=ESCAPED)
 
 
 def render(context: Mapping[str, Any], template: str = "page.html") -> str:

@@ -160,5 +160,9 @@ def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
     Raises:
         InputError: the file cannot be made.
     """
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with (
+        atomic_path(path) as temporary,
+        # Bytes of names that are no UTF-8 become escapes, as JSON has them.
+        temporary.open("w", encoding="utf-8", errors="backslashreplace") as file,
+    ):
         file.writelines(f"{line}\n" for line in json_lines(answers))
