@@ -4,9 +4,11 @@ An export is a folder. `describe.jax_export` is the program, and `manifest.json`
 inputs and outputs. `weights.safetensors` lies beside them unless the program holds the weights.
 """
 
+import contextlib
 import dataclasses
 import os
 import pathlib
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import jax
@@ -33,6 +35,8 @@ GROUPINGS = {
     "single": "every image is described alone",
     "batch": "the images of a call look at each other",
 }
+_SOURCES = "jax_traceback_in_locations_limit"
+"""JAX's setting: how many lines of source a program has beside each operation."""
 _LARGEST = 2**31
 """Largest size of a program in bytes: a flatbuffer's offsets have 31 bits."""
 
@@ -92,7 +96,7 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
 
     `images` are 8-bit RGB (batch, height, width, 3) of `config.image_size`; the result is their
     unit descriptors (batch, descriptor). `weights` is a dictionary of the arrays by their dotted
-    names. Nothing in the program depends on the platform that exports it.
+    names. Nothing in the program depends on the platform that exports it, nor on who calls this.
 
     Raises:
         InputError: as `check_exportable`.
@@ -112,12 +116,23 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     if batch is None:
         (batch,) = export.symbolic_shape("batch")
     images = jax.ShapeDtypeStruct((batch, *config.image_size, 3), jnp.uint8)
-    with compiler.portable():
+    with compiler.portable(), _without_sources():
         if how.weights_inside:
             whole = jax.jit(lambda images: run(weights, images))
             return export.export(whole, platforms=how.platforms)(images)
         shapes = {n: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for n, leaf in weights.items()}
         return export.export(jax.jit(run), platforms=how.platforms)(shapes, images)
+
+
+@contextlib.contextmanager
+def _without_sources() -> Iterator[None]:
+    """Keep names and lines of source files out of programs: they differ by disk and by caller."""
+    before = jax.config.values[_SOURCES]
+    jax.config.update(_SOURCES, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(_SOURCES, before)
 
 
 def write_export(
