@@ -5,6 +5,7 @@ SIGTERM, 129 by SIGHUP, 1 anything else.
 """
 
 import contextlib
+import dataclasses
 import importlib
 import io
 import itertools
@@ -134,8 +135,30 @@ def _run(name: str, given: list[str]) -> None:
     arguments = renamed.today(given, lambda line: print(f"crisalad: note: {line}", file=sys.stderr))
     module = importlib.import_module(f"{__name__}.{name}")
     chosen = _parse(name, module, arguments)
+    _check_numbers(chosen)
     compiler.set_up()
     module.run(chosen)
+
+
+_LARGEST = 2**40
+"""Largest whole number of a flag: no count or size that any of them sets comes near."""
+
+
+def _check_numbers(value: Any, flag: str = "--") -> None:
+    """Check that no flag has a whole number beyond `_LARGEST`, which arrays would not take."""
+    if dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            # The fields of a configuration are flags without a prefix.
+            name = "" if field.name == "settings" else field.name.replace("_", "-")
+            dot = "." if name and not flag.endswith("--") else ""
+            _check_numbers(getattr(value, field.name), f"{flag}{dot}{name}")
+    elif isinstance(value, tuple):
+        for each in value:
+            _check_numbers(each, flag)
+    elif isinstance(value, int):
+        require(
+            abs(value) <= _LARGEST, f"{flag}: found {value}, expected a number of at most 2**40"
+        )
 
 
 def _show_note(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:

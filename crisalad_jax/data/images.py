@@ -6,6 +6,7 @@ JPEG markers are from ITU-T T.81 annex B, PNG chunks from the W3C PNG specificat
 import os
 import pathlib
 import re
+import zlib
 from collections.abc import Iterator, Sequence
 
 import cv2
@@ -87,7 +88,8 @@ def read_image(
         data.startswith(_PNG_SIGNATURE) and not _png_is_whole(data)
     ):
         raise InputError(
-            f"{path}: found an image cut short after {len(data)} bytes, expected a whole one"
+            f"{path}: found an image cut short after {len(data)} bytes, or damaged, expected a "
+            "whole one"
         )
     try:
         with QUIET:
@@ -138,15 +140,25 @@ def _reduction(data: bytes, enough: tuple[int, int] | None) -> int:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Return whether a PNG's chunks reach IEND; bytes after it do not matter."""
+    """Return whether a PNG's chunks reach IEND with right checksums; later bytes do not matter.
+
+    Chunks whose name begins with a small letter are not needed for the pixels.
+    """
     position = len(_PNG_SIGNATURE)
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")
         kind = data[position + 4 : position + 8]
-        position += 12 + length
+        end = position + 8 + length
+        if kind[:1].isupper() and data[end : end + 4] != _crc(data[position + 4 : end]):
+            return False
+        position = end + 4
         if kind == b"IEND":
             return True
     return False
+
+
+def _crc(data: bytes) -> bytes:
+    return zlib.crc32(data).to_bytes(4, "big")
 
 
 def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:

@@ -103,6 +103,11 @@ class Run:
                 "not share a step where all trains"
             )
         self.steps = self.steps_per_epoch * config.epochs
+        if self.steps >= 2**31:
+            raise InputError(
+                f"epochs: found {config.epochs}, which is {self.steps} steps, expected fewer than "
+                "2**31, by which JAX counts"
+            )
         self.classes = (
             tuple(len(group.place_id) for group in self._groups)
             if config.loss.kind.grouping is not None

@@ -1457,6 +1457,11 @@ def cases(seed: int) -> list[Case]:
 
 def judge(case: Case, done: Done, before: set[str], folder: pathlib.Path) -> str | None:
     """Return what is wrong with how a command ended; None where nothing is."""
+    if case.attack == "pictures":
+        # libpng's own line of a file that was made to be wrong, with right checksums.
+        lines = done.err.splitlines(keepends=True)
+        err = "".join(line for line in lines if not line.startswith("libpng error: "))
+        done = done._replace(err=err)
     wrong = []
     if done.code == HUNG:
         return f"hung: {done.err[-200:]!r}"

@@ -236,7 +236,7 @@ def test_tables_of_other_lengths_and_missing_files(tmp_path):
     with pytest.raises(InputError, match=r"postprocessed.csv: found 1 rows, expected the same 2"):
         read_msls(root)
     table.unlink()
-    with pytest.raises(InputError, match=r"postprocessed.csv: cannot be read"):
+    with pytest.raises(InputError, match=r"postprocessed.csv: found no such file"):
         read_msls(root)
 
 
