@@ -126,16 +126,22 @@ def _train(run: Run, rest_of_epoch: _Epoch, quiet: bool) -> None:
                         bar.say(run.validate(signals))
                         distributed.raise_together(run.save)
                     _train_epoch(run, rest_of_epoch, signals, bar)
+                _stop_together(signals)  # one that came while the last validation was saved
             except InputError:
                 # A signal to the process group also ends the workers that read images.
-                (number,) = distributed.all_max(signals.number)
-                if number:
-                    raise Stopped(number) from None
+                _stop_together(signals)
                 raise
         except Stopped as stopped:
             run.save()
             where = f"after step {run.step}; the same command goes on"
             raise Stopped(stopped.number, where) from None
+
+
+def _stop_together(signals: SignalState) -> None:
+    """Raise `Stopped` in all processes if one of them was signalled."""
+    (number,) = distributed.all_max(signals.number)
+    if number:
+        raise Stopped(number)
 
 
 def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar) -> None:

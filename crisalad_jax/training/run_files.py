@@ -22,7 +22,7 @@ from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.locks import one_writer
-from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
+from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
 
 
 @dataclasses.dataclass
@@ -63,6 +63,8 @@ class RunFiles:
             for folder in (out, out / "best"):
                 remove_temporaries(folder)
             self._out, self._config = out, config
+            # A signal, or an error, before the first state leaves no empty folder.
+            opened.enter_context(made_folder(out / "state"))
             self._states = StateStore(out / "state")
             self._log: MetricsLog | None = None
             self._saved: tuple[int, RunRecord] | None = None

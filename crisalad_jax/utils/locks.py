@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import told_of
+from crisalad_jax.utils.signals import held_signals
 from crisalad_jax.utils.temporaries import (
     LOCK,
     in_use,
@@ -28,30 +29,36 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
         InputError: another process holds it; the message says which, on which host. Or the folder
             cannot be made or written to.
     """
-    import fcntl
-
     folder = pathlib.Path(folder)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(made_folder(folder))
-        path = folder / LOCK
-        try:
-            while True:
-                file = stack.enter_context(path.open("a+", encoding="utf-8"))
-                try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError as error:
-                    raise InputError(
-                        f"{folder}: found another process that writes here{_holder(path)}, "
-                        "expected to be the only one"
-                    ) from error
-                # The last holder may have removed the file between the two calls.
-                if _is_still(path, file.fileno()):
-                    break
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
-        stack.enter_context(in_use(path))
-        _sign(file.fileno())
+        with held_signals():
+            stack.enter_context(made_folder(folder))
+            descriptor = _locked(folder, stack)
+            stack.enter_context(in_use(folder / LOCK))
+        _sign(descriptor)
         yield
+
+
+def _locked(folder: pathlib.Path, stack: contextlib.ExitStack) -> int:
+    """Lock a folder until the stack is closed; return the descriptor of its lock."""
+    import fcntl
+
+    path = folder / LOCK
+    try:
+        while True:
+            file = stack.enter_context(path.open("a+", encoding="utf-8"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise InputError(
+                    f"{folder}: found another process that writes here{_holder(path)}, "
+                    "expected to be the only one"
+                ) from error
+            # The last holder may have removed the file between the two calls.
+            if _is_still(path, file.fileno()):
+                return file.fileno()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
 
 
 @contextlib.contextmanager

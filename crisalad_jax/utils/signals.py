@@ -33,7 +33,32 @@ def end_at_signals() -> None:
             signal.signal(number, _end)
 
 
+_holding = _waiting = 0
+"""How many blocks hold signals back, and the number of a signal that waits for their end."""
+
+
+@contextlib.contextmanager
+def held_signals() -> Iterator[None]:
+    """Let a signal end this process after the block: for a few calls that belong together.
+
+    An example is to make a file, and to note that it has to be removed.
+    """
+    global _holding, _waiting
+    _holding += 1
+    try:
+        yield
+    finally:
+        _holding -= 1
+        if _waiting and not _holding:
+            number, _waiting = _waiting, 0
+            signal.raise_signal(number)
+
+
 def _end(number: int, frame: FrameType | None) -> None:
+    global _waiting
+    if _holding:
+        _waiting = number
+        return
     for each in _SIGNALS:
         signal.signal(each, signal.SIG_IGN)
     remove_all_in_use()
@@ -95,7 +120,8 @@ class SignalState:
 def defer_signals() -> Iterator[SignalState]:
     """Defer SIGTERM, SIGHUP and SIGINT (Ctrl-C) to `SignalState.check` while the block runs.
 
-    Python sets handlers in the main thread alone: in other threads this changes nothing.
+    One that came after the last check has its usual effect after the block. Python sets handlers in
+    the main thread alone: in other threads this changes nothing.
     """
     stop = SignalState()
     if threading.current_thread() is not threading.main_thread():
@@ -106,3 +132,5 @@ def defer_signals() -> Iterator[SignalState]:
         yield stop
     finally:
         stop.restore()
+    if stop.number:
+        signal.raise_signal(stop.number)

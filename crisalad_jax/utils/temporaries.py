@@ -94,7 +94,7 @@ def made_folder(folder: pathlib.Path) -> Iterator[None]:
 
 
 def _remove_empty(folders: Sequence[pathlib.Path]) -> None:
-    """Remove folders that are empty; the innermost stand first."""
-    with contextlib.suppress(OSError):
-        for folder in folders:
+    """Remove those of the folders that are empty; the innermost stand first."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
             folder.rmdir()

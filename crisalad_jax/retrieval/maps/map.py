@@ -37,7 +37,7 @@ from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.locks import one_writer
-from crisalad_jax.utils.temporaries import remove_temporaries
+from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 
 class MapImage(NamedTuple):
@@ -397,10 +397,7 @@ def open_for_appending(
     folder = pathlib.Path(folder)
     read_description(folder)  # raises where something else is there, before anything is made
     with contextlib.ExitStack() as stack:
-        try:
-            (folder / SEGMENTS).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+        stack.enter_context(made_folder(folder / SEGMENTS))
         stack.enter_context(one_writer(folder))
         existing = read_description(folder)
         remove_temporaries(folder / SEGMENTS)
