@@ -1,0 +1,401 @@
+"""Signal commands at random moments: one line, an exit code, nothing left, and no work lost.
+
+    python -m tests.attack.interruptions --out rows.json [--scale 1] [--seed 0] [--only NAME ...]
+
+Most commands are forks of a process that has imported everything; some are programs of their own,
+signalled while they import. No program can handle a signal before the interpreter runs its first
+line: such tries are counted apart, and that time is measured.
+"""
+
+import functools
+import os
+import pathlib
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from tests.attack.kills import (
+    Bench,
+    Marks,
+    Moment,
+    carry_out,
+    command,
+    differences,
+    part_of,
+    recipe_of_chains,
+    train_arguments,
+)
+from tests.attack.world import VERBS, Done, Row, files_in, forked, has_temporaries, make_products
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LONGEST = 10.0
+"""Seconds from a signal to the end of the program."""
+CALLS = Marks(
+    {
+        "making a folder": "os:mkdir",
+        "locking": "fcntl:flock",
+        "renaming": "os:replace",
+        "removing": "os:unlink",
+        "the loop of training": "crisalad_jax.training.loop:_train",
+        "saving": "crisalad_jax.training.run_files:RunFiles.save",
+        "validating": "crisalad_jax.training.run:Run._validate",
+        "keeping the best": "crisalad_jax.training.run_files:RunFiles.keep_if_best",
+    }
+)
+TRAINING_CALLS = ("the loop of training", "saving", "validating", "keeping the best")
+_OF_ONE_RUN = ("/state/", "/tensorboard/")
+"""What other programs name by time, and what is not the end of a run."""
+
+
+class Verb:
+    """A command, and what it writes if nothing interrupts it."""
+
+    def __init__(self, bench: Bench, name: str) -> None:
+        """Run it twice: what both write alike, an interrupted one has to write too."""
+        self.name, self._bench = name, bench
+        self._recipe = recipe_of_chains(bench.folder) if name == "train" else None
+        folders = [bench.folder / "whole" / f"{name} {n}" for n in range(2)]
+        for folder in folders:
+            done = self.go(folder)
+            assert done.code == 0, (name, done.err)
+            self.seconds = done.seconds
+        first, second = map(_files, folders)
+        assert first.keys() == second.keys(), (name, first.keys() ^ second.keys())
+        self.names = first.keys()
+        self.stable = {path: data for path, data in first.items() if second[path] == data}
+        assert self.stable, name
+
+    def arguments(self, out: pathlib.Path) -> list[str]:
+        """Return the command that writes into a folder."""
+        if self._recipe is not None:
+            return train_arguments(self._bench.world, self._recipe, out / "run")
+        return VERBS[self.name](self._bench.world, out)
+
+    def go(
+        self,
+        out: pathlib.Path,
+        during: Callable[[int], None] | None = None,
+        *,
+        before: Callable[[], None] = lambda: None,
+    ) -> Done:
+        """Run it in a fork, with smaller settings where the command has none."""
+        import crisalad_jax.experiments.demo
+        import crisalad_jax.retrieval.maps.build
+        import crisalad_jax.retrieval.partial
+        import crisalad_jax.training.run
+
+        of_demo = crisalad_jax.experiments.demo.DemoConfig
+        small = functools.partial(of_demo, train_places=48, test_places=12, epochs=2)
+        settings = [
+            (crisalad_jax.experiments.demo, "DemoConfig", small),
+            (crisalad_jax.retrieval.maps.build, "SEGMENT", 4),
+            (crisalad_jax.retrieval.partial, "SEGMENT", 4),
+        ]
+        out.mkdir(parents=True, exist_ok=True)
+        CALLS.clear()
+        work = command(self.arguments(out), CALLS, *settings)
+
+        def whole_work() -> int:
+            before()
+            return work()
+
+        return forked(whole_work, cwd=self._bench.folder, during=during, limit=600)
+
+    def wrong_with(self, out: pathlib.Path) -> list[str]:
+        """List what a finished command did not write as an uninterrupted one."""
+        found = _files(out)
+        wrong = [f"{name}: in one only" for name in sorted(found.keys() ^ self.names)]
+        wrong += [
+            f"{name}: other bytes"
+            for name, data in self.stable.items()
+            if name in found and found[name] != data
+        ]
+        if self.name == "train" and not wrong:
+            whole = self._bench.folder / "whole" / "train 0" / "run"
+            wrong += differences(out / "run", whole)
+        return wrong + left_in(out)
+
+
+def _files(folder: pathlib.Path) -> dict[str, bytes]:
+    return {
+        name: (folder / name).read_bytes()
+        for name in files_in(folder)
+        if not any(part in f"/{name}" for part in _OF_ONE_RUN) and (folder / name).is_file()
+    }
+
+
+def left_in(folder: pathlib.Path) -> list[str]:
+    """List temporary files, locks and empty folders; orbax clears its own at the next start."""
+    empty = [name for name in files_in(folder) if (folder / name).is_dir()]
+    return sorted({*has_temporaries(folder), *empty})
+
+
+def wrong_end(number: int, code: int, err: str, seconds: float) -> list[str]:
+    """List what is wrong with the end of a program at a signal."""
+    notes = "crisalad: note: "
+    lines = [line for line in err.splitlines() if not line.startswith(notes)]
+    wrong = []
+    if code != 128 + number:
+        wrong.append(f"exit code {code}")
+    if len(lines) != 1 or not lines[0].startswith("crisalad: "):
+        wrong.append(f"{len(lines)} lines: {err[-300:]!r}")
+    if seconds > LONGEST:
+        wrong.append(f"{seconds:.1f} s after the signal")
+    return wrong
+
+
+class Tries(NamedTuple):
+    """The rows of an attack by signals."""
+
+    ends: Row
+    nothing_left: Row
+    resumed: Row
+
+
+def tries_of(what: str) -> Tries:
+    """Make empty rows."""
+    return Tries(
+        Row(f"signals, {what}: the end", "one line, code 130, 143 or 129, within 10 s"),
+        Row(f"signals, {what}: what is left", "no temporary file, no lock, no empty folder"),
+        Row(f"signals, {what}: the same command", "it finishes with the bits of a whole one"),
+    )
+
+
+def attack_forks(bench: Bench, tries: int, verbs: Sequence[str]) -> list[Row]:
+    """Signal forks at moments spread over their work, or just after a call that changes files."""
+    rows = tries_of(", ".join(verbs) if len(verbs) < len(QUICK) else "all verbs but the long ones")
+    for position, name in enumerate(verbs):
+        verb = Verb(bench, name)
+        share = tries // len(verbs) + (position < tries % len(verbs))
+        for turn in range(share):
+            _one_fork(bench, verb, position + turn, rows)
+        failures = sum(len(row.failures) for row in rows)
+        bench.say(f"signals: {name}, {verb.seconds:.1f} s a run, {failures} failures so far")
+    return list(rows)
+
+
+def _one_fork(bench: Bench, verb: Verb, turn: int, rows: Tries) -> None:
+    """Signal a command until a signal meets it at work, then run the same command."""
+    number = SIGNALS[turn % len(SIGNALS)]
+    for attempt in range(20):
+        out = bench.folder / "signalled" / f"{verb.name} {turn} {attempt}"
+        moment = _moment(bench, verb, number)
+        done = verb.go(out, moment)
+        if moment.during and CALLS.times("the end") == 0:
+            break
+        # It had ended: nothing may be missing then either.
+        words = f"seed {bench.seed}, {verb.name}, {moment}, at its end: {done.err[-300:]}"
+        rows.resumed.note(done.code in (0, 128 + number) and not left_in(out), words)
+    words = f"seed {bench.seed}, {verb.name}, signal {number}, {moment} ({moment.during})"
+    wrong = wrong_end(number, done.code, done.err, time.monotonic() - moment.sent)
+    if moment.during in TRAINING_CALLS and verb.name == "train" and "goes on" not in done.err:
+        wrong.append(f"no word of the saved state: {done.err}")
+    rows.ends.note(not wrong, f"{words}: {wrong}")
+    left = left_in(out)
+    rows.nothing_left.note(not left, f"{words}: {left}")
+    done = verb.go(out)
+    wrong = [done.err[-300:]] if done.code else verb.wrong_with(out)
+    rows.resumed.note(not wrong, f"{words}: {wrong}")
+
+
+def _moment(bench: Bench, verb: Verb, number: int) -> Moment:
+    chance = bench.random.random()
+    if chance < 0.5:
+        after, work, nth = bench.random.uniform(0, 0.95 * verb.seconds), "start", 1
+    else:
+        calls = CALLS.works[:4]
+        if verb.name in ("train", "compare", "demo") and chance < 0.8:
+            calls = list(TRAINING_CALLS)
+        work, nth = bench.random.choice(calls), bench.random.randint(1, 3)
+        after = bench.random.uniform(0, bench.random.choice([0.0005, 0.005, 0.1]))
+    return Moment(CALLS, number, after=after, work=work, nth=nth)
+
+
+def handles(process: int) -> bool:
+    """Return whether a process handles SIGHUP, the last of the signals that it begins to handle."""
+    try:
+        status = pathlib.Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return False
+    (caught,) = (line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(caught, 16) & 1 << (signal.SIGHUP - 1))
+
+
+def attack_programs(bench: Bench, tries: int) -> list[Row]:
+    """Signal programs of their own, from their first moment to the end of their imports."""
+    rows = tries_of("programs that start")
+    early = Row(
+        "signals before the first line of Python",
+        "counted apart: the interpreter's own start, which no program can handle",
+    )
+    verbs = [Verb(bench, name) for name in ("info", "train", "index", "query", "extract .h5")]
+    windows, startups = [], []
+    for _ in range(3):
+        begun = time.monotonic()
+        program = bench.program(["info", "--preset", "tiny"])
+        while not handles(program.pid):
+            time.sleep(0.0005)
+        windows.append(time.monotonic() - begun)
+        program.communicate()
+        startups.append(time.monotonic() - begun)
+    window, startup = statistics.median(windows), statistics.median(startups)
+    early.promise += f" (here {1000 * window:.0f} ms of {1000 * startup:.0f} ms of a start)"
+    for turn in range(tries):
+        verb, number = verbs[turn % len(verbs)], SIGNALS[turn % len(SIGNALS)]
+        out = bench.folder / "programs started" / f"{turn}"
+        out.mkdir(parents=True)
+        after = bench.random.uniform(0, startup)
+        program = bench.program(verb.arguments(out))
+        time.sleep(after)
+        handled, sent = handles(program.pid), time.monotonic()
+        program.send_signal(number)
+        _, err = program.communicate()
+        seconds, code = time.monotonic() - sent, program.returncode
+        words = f"seed {bench.seed}, {verb.name}, signal {number}, {after:.3f} s after its start"
+        if handled:
+            wrong = wrong_end(number, code, err.decode(errors="replace"), seconds)
+            rows.ends.note(not wrong, f"{words}: {wrong}")
+        else:
+            early.note(code != 0, f"{words}: it went on")
+        left = left_in(out)
+        rows.nothing_left.note(not left, f"{words}: {left}")
+        done = verb.go(out)
+        wrong = [done.err[-300:]] if done.code else verb.wrong_with(out)
+        rows.resumed.note(not wrong, f"{words}: {wrong}")
+        bench.say(f"programs: {turn + 1} of {tries}, {early.tries} before Python")
+    return [*rows, early]
+
+
+def attack_closed_output(bench: Bench, _: float) -> list[Row]:
+    """Close standard output after one line, as `| head -1`, for each verb."""
+    row = Row("standard output closed (| head -1)", "exit code 0, nothing on standard error")
+    verbs = {name: make(bench.world, bench.folder / "piped" / name) for name, make in VERBS.items()}
+    del verbs["compare"], verbs["demo"]  # they print as the others, after minutes
+    verbs["query --json -"] = [
+        *("query", f"{bench.world.images}", "--map", f"{bench.world.path('map')}", "--quiet"),
+        *("--json", "-"),
+    ]
+    verbs["info --json -"] = ["info", "--preset", "tiny", "--json", "-"]
+    for name, arguments in verbs.items():
+        (bench.folder / "piped" / name).mkdir(parents=True)
+
+        def work(arguments: Sequence[str] = arguments) -> int:
+            head = subprocess.Popen(["head", "-1"], stdin=subprocess.PIPE)
+            assert head.stdin is not None
+            os.dup2(head.stdin.fileno(), 1)
+            head.stdin.close()
+            return command(arguments, CALLS)()
+
+        CALLS.clear()
+        done = forked(work, cwd=bench.folder)
+        beside = name.endswith("--json -")  # all but the JSON is told on standard error
+        right = done.code == 0 and (not done.err or beside) and "Traceback" not in done.err
+        row.note(right, f"{name}: {done.code} {done.err[-300:]}")
+        bench.say(f"closed output: {name}")
+    return [row]
+
+
+def attack_training(bench: Bench, scale: float) -> list[Row]:
+    """Interrupt training twice, signal it while another process asks for its folder, and nohup."""
+    verb = Verb(bench, "train")
+    twice = Row("Ctrl-C twice in training", "it ends at once, and the same command finishes alike")
+    waiting = Row(
+        "a signal while a second process wants the same run",
+        "the second is refused in one line, the first saves, the same command finishes alike",
+    )
+    ignored = Row("SIGHUP under nohup", "it goes on, and finishes alike")
+
+    def finish(out: pathlib.Path, wrong: list[str]) -> str:
+        done = verb.go(out)
+        wrong += [done.err[-300:]] if done.code else verb.wrong_with(out)
+        return f"seed {bench.seed}, {out.name}: {wrong}" if wrong else ""
+
+    for turn in range(part_of(5, scale)):
+        out = bench.folder / "twice" / f"{turn}"
+        pause = bench.random.choice([0.0, 0.001, 0.01, 0.1])
+        first = _moment(bench, verb, signal.SIGINT)
+        sent = time.monotonic()
+
+        def both(process: int, first: Moment = first, pause: float = pause) -> None:
+            first(process)
+            time.sleep(pause)
+            if first.during:
+                os.kill(process, signal.SIGINT)  # not waited for yet, so the number is its own
+
+        done = verb.go(out, both)
+        wrong = []
+        if CALLS.times("the end") == 0:
+            wrong = wrong_end(signal.SIGINT, done.code, done.err, time.monotonic() - first.sent)
+        words = finish(out, wrong)
+        twice.note(not words, f"{first}, {pause} s between: {words}")
+        bench.say(f"Ctrl-C twice: {turn + 1}, {time.monotonic() - sent:.1f} s")
+    for turn in range(part_of(3, scale)):
+        out = bench.folder / "waiting" / f"{turn}"
+        second: list[Done] = []
+        number = SIGNALS[turn % len(SIGNALS)]
+
+        def ask(process: int, out=out, second=second, number=number) -> None:
+            begun = time.monotonic()
+            while CALLS.times("the loop of training") == 0 and time.monotonic() - begun < 60:
+                time.sleep(0.001)
+            os.kill(process, signal.SIGSTOP)
+            marks = Marks({})
+            second.append(forked(command(verb.arguments(out), marks), cwd=bench.folder))
+            os.kill(process, number)
+            os.kill(process, signal.SIGCONT)
+
+        done = verb.go(out, ask)
+        wrong = wrong_end(number, done.code, done.err, 0)
+        if not second[0].told_in_one_line() or "another process" not in second[0].err:
+            wrong.append(f"the second: {second[0].code} {second[0].err[-300:]}")
+        words = finish(out, [*wrong, *left_in(out)])
+        waiting.note(not words, words)
+        bench.say(f"a second process: {turn + 1}")
+    for turn in range(part_of(3, scale)):
+        out = bench.folder / "nohup" / f"{turn}"
+        moment = _moment(bench, verb, signal.SIGHUP)
+        done = verb.go(out, moment, before=lambda: _ignore(signal.SIGHUP))
+        wrong = [f"code {done.code}: {done.err[-300:]}"] if done.code else verb.wrong_with(out)
+        ignored.note(not wrong, f"seed {bench.seed}, {moment}: {wrong}")
+    return [twice, waiting, ignored]
+
+
+def _ignore(number: int) -> None:
+    signal.signal(number, signal.SIG_IGN)
+
+
+def attack_some(bench: Bench, _: float) -> list[Row]:
+    """Signal two quick verbs, which need none of the products."""
+    return attack_forks(bench, 6, ["extract .npy", "convert"])
+
+
+def prepared(attack: Callable[[Bench, float], list[Row]]) -> Callable[[Bench, float], list[Row]]:
+    """Return an attack whose world has the products that commands read."""
+
+    def run(bench: Bench, scale: float) -> list[Row]:
+        if not (bench.world.root / "products").exists():
+            make_products(bench.world)
+        return attack(bench, scale)
+
+    return run
+
+
+QUICK = [name for name in VERBS if name not in ("compare", "demo")]
+ATTACKS: Mapping[str, Callable[[Bench, float], list[Row]]] = {
+    "some": attack_some,
+    "forks": prepared(lambda bench, scale: attack_forks(bench, part_of(64, scale), QUICK)),
+    "programs": prepared(lambda bench, scale: attack_programs(bench, part_of(30, scale))),
+    "training": prepared(attack_training),
+    "closed output": prepared(attack_closed_output),
+    "long": prepared(
+        lambda bench, scale: attack_forks(bench, part_of(8, scale), ["compare", "demo"])
+    ),
+}
+
+
+if __name__ == "__main__":
+    sys.exit(carry_out(ATTACKS, (__doc__ or "").splitlines()[0]))

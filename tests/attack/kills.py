@@ -1,0 +1,761 @@
+"""Kill commands at random moments: what they leave is whole, and the same command ends alike.
+
+    python -m tests.attack.kills --out rows.json [--scale 1] [--seed 0] [--only training maps ...]
+
+A chain is one folder, in which a command is killed several times and then finishes. Most commands
+are forks of this process, which has imported everything; some are programs of their own, killed
+while they import. Moments are of two kinds: at any time of a whole run, and soon after a certain
+work has begun, so that saves and commits, which are short, are met too.
+"""
+
+import argparse
+import dataclasses
+import importlib
+import json
+import mmap
+import os
+import pathlib
+import random
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
+from tests.attack.world import (
+    ROOT,
+    VERBS,
+    Done,
+    Row,
+    World,
+    files_in,
+    forked,
+    has_temporaries,
+    import_everything,
+    keep_programs,
+    make_world,
+    write_rows,
+)
+
+TIMES = ("images_per_second", "waited_for_images", "seconds", "step_seconds", "seconds_of_steps")
+"""What a log or a result tells of the clock; all else is equal in two runs."""
+
+
+class Marks:
+    """What a forked child is doing, in memory that it shares with this process.
+
+    A mark is the number of some work. The child sets it at the work's beginning, and the mark of
+    the work around it at the end.
+    """
+
+    def __init__(self, works: Mapping[str, str]) -> None:
+        """Take the functions that are marked, as module:name or module:class.name."""
+        self.names = ["start", *works, "the end"]
+        self.works = list(works)
+        self._paths = works
+        self._memory = mmap.mmap(-1, 1 + 4 * len(self.names))
+
+    def clear(self) -> None:
+        """Begin again, before a child starts."""
+        self._memory[:] = bytes(len(self._memory))
+
+    @property
+    def now(self) -> str:
+        """What the child is doing, or did when it was killed."""
+        return self.names[self._memory[0]]
+
+    def times(self, name: str) -> int:
+        """Return how often the child has begun this work."""
+        place = 1 + 4 * self.names.index(name)
+        return int.from_bytes(self._memory[place : place + 4], "little")
+
+    def say(self, name: str) -> None:
+        """Say in the child that it handles signals (start), or has done all (the end)."""
+        place = 1 + 4 * self.names.index(name)
+        self._memory[place : place + 4] = (1).to_bytes(4, "little")
+
+    def install(self) -> None:
+        """Mark the functions, in the child."""
+        for number, path in enumerate(self._paths.values(), start=1):
+            self._wrap(number, path)
+
+    def _wrap(self, number: int, path: str) -> None:
+        module, _, name = path.partition(":")
+        *classes, name = name.split(".")
+        holder: Any = importlib.import_module(module)
+        for each in classes:
+            holder = getattr(holder, each)
+        real = getattr(holder, name)
+        place = 1 + 4 * number
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            before, self._memory[0] = self._memory[0], number
+            count = int.from_bytes(self._memory[place : place + 4], "little") + 1
+            self._memory[place : place + 4] = count.to_bytes(4, "little")
+            try:
+                return real(*arguments, **options)
+            finally:
+                self._memory[0] = before
+
+        setattr(holder, name, call)
+
+
+class Moment:
+    """When a child gets its signal."""
+
+    def __init__(
+        self, marks: Marks, number: int, *, after: float, work: str | None = None, nth: int = 1
+    ) -> None:
+        """Take the signal, and the time: seconds after the start, or after some work's beginning.
+
+        Args:
+            marks: of the child.
+            number: of the signal.
+            after: seconds.
+            work: its name; None is the start of the process.
+            nth: which time that this work begins.
+        """
+        self._marks, self.number, self._after = marks, number, after
+        self._work, self._nth = work, nth
+        self.during = ""
+        """What the child was doing then; empty if it had ended."""
+        self.sent = 0.0
+
+    def __call__(self, process: int) -> None:
+        """Wait for the moment, and send the signal."""
+        watcher = os.pidfd_open(process)
+
+        def ends_in(seconds: float) -> bool:
+            return bool(select.select([watcher], [], [], seconds)[0])
+
+        try:
+            if self._work is not None:
+                while self._marks.times(self._work) < self._nth:
+                    if ends_in(0.001):
+                        return
+            if ends_in(self._after):
+                return
+            self.during, self.sent = self._marks.now, time.monotonic()
+            os.kill(process, self.number)
+        finally:
+            os.close(watcher)
+
+    def __str__(self) -> str:
+        """Return words for a report."""
+        of = "the start" if self._work is None else f"{self._work} {self._nth}"
+        return f"{self._after:.3f} s after {of}"
+
+
+def command(arguments: Sequence[str], marks: Marks, *settings: tuple[Any, str, Any]) -> Callable:
+    """Return the work of a child: a command, with its marks, and attributes set to other values."""
+
+    def work() -> int:
+        from crisalad_jax.cli import main
+        from crisalad_jax.utils.output import keep_on_without_reader
+        from crisalad_jax.utils.signals import end_at_signals
+
+        for holder, name, value in settings:
+            setattr(holder, name, value)
+        marks.install()
+        end_at_signals()
+        keep_on_without_reader()
+        marks.say("start")
+        code = main(list(arguments))
+        sys.stdout.flush()
+        marks.say("the end")
+        return code
+
+    return work
+
+
+@dataclasses.dataclass
+class Bench:
+    """What all attacks share."""
+
+    world: World
+    folder: pathlib.Path
+    random: random.Random
+    seed: int
+    environment: Mapping[str, str]
+    """Of programs of their own."""
+    say: Callable[[str], None]
+
+    def program(self, arguments: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+        """Start the command line as users do."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "crisalad_jax", *arguments],
+            cwd=ROOT,
+            env={**os.environ, **self.environment},
+            stdin=subprocess.DEVNULL,
+            stdout=options.pop("stdout", subprocess.PIPE),
+            stderr=subprocess.PIPE,
+            **options,
+        )
+
+
+def without_times(value: Any) -> Any:
+    """Leave out of JSON values what depends on the clock."""
+    if isinstance(value, dict):
+        return {k: without_times(v) for k, v in value.items() if k not in (*TIMES, "checksum")}
+    return [without_times(each) for each in value] if isinstance(value, list) else value
+
+
+def differences(found: pathlib.Path, expected: pathlib.Path) -> list[str]:
+    """List in which files two runs of training differ: weights in bytes, the log but for times."""
+    wrong = []
+    weights = {path.relative_to(expected) for path in expected.rglob("*.safetensors")}
+    there = {path.relative_to(found) for path in found.rglob("*.safetensors")}
+    wrong += [f"{name}: in one only" for name in sorted(weights ^ there)]
+    for name in sorted(weights & there):
+        if (found / name).read_bytes() != (expected / name).read_bytes():
+            wrong.append(f"{name}: other bytes")
+    if log_of(found) != log_of(expected):
+        wrong.append("metrics.jsonl")
+    return wrong + has_temporaries(found)
+
+
+def log_of(run: pathlib.Path) -> list[Any]:
+    """Read the log of a run but for its times."""
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    return [without_times(json.loads(line)) for line in lines]
+
+
+TRAINING = Marks(
+    {
+        "opening the run": "crisalad_jax.training.run:Run.__init__",
+        "loading a state": "crisalad_jax.checkpoints.train_state:StateStore.load",
+        "steps": "crisalad_jax.training.loop:_train_epoch",
+        "saving": "crisalad_jax.training.run_files:RunFiles.save",
+        "validating": "crisalad_jax.training.run:Run._validate",
+        "keeping the best": "crisalad_jax.training.run_files:RunFiles.keep_if_best",
+        "closing": "crisalad_jax.training.run_files:RunFiles.close",
+    }
+)
+WEIGHT_OF_WORK = {"opening the run": 1, "loading a state": 1, "steps": 4, "saving": 5}
+WEIGHT_OF_WORK |= {"validating": 2, "keeping the best": 2, "closing": 1}
+EPOCHS = 6
+
+
+def recipe_of_chains(folder: pathlib.Path) -> pathlib.Path:
+    """Write a configuration whose steps, of a small model with dropout, are traced in a second."""
+    from crisalad_jax.config.io import to_plain
+    from crisalad_jax.nn.aggregators.gem import GemConfig
+    from crisalad_jax.nn.backbones.vit import ViTConfig
+    from crisalad_jax.nn.config import ModelConfig
+    from crisalad_jax.nn.cross_image import CrossImageConfig
+    from tests.conftest import RECIPE
+
+    model = ModelConfig(
+        image_size=(42, 56),
+        backbone=ViTConfig(dim=32, depth=1, heads=2, position_grid=3),
+        aggregator=GemConfig(),
+        cross_image=CrossImageConfig(heads=2, feedforward=16),
+    )
+    path = folder / "recipe.json"
+    config = dataclasses.replace(RECIPE, model=model, epochs=EPOCHS, patience=None, keep_best=2)
+    write_json(path, to_plain(config))
+    return path
+
+
+def train_arguments(world: World, recipe: pathlib.Path, out: pathlib.Path) -> list[str]:
+    """Return a command that trains by this configuration."""
+    return [
+        *("train", "--data", f"{world.city}", "--out", f"{out}", "--config", f"{recipe}"),
+        *("--val", f"{world.town}", "--quiet"),
+    ]
+
+
+def attack_training(bench: Bench, kills: int, chains: int, programs: int) -> list[Row]:
+    """Kill runs of training, some as programs of their own while they start."""
+    import crisalad_jax.training.run
+
+    folder = bench.folder / "training"
+    folder.mkdir()
+    recipe = recipe_of_chains(folder)
+    often = (crisalad_jax.training.run, "SAVE_SECONDS", -1.0)
+
+    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
+        TRAINING.clear()
+        work = command(train_arguments(bench.world, recipe, out), TRAINING, often)
+        return forked(work, cwd=folder, during=during)
+
+    whole = folder / "whole"
+    done = go(whole)
+    assert done.code == 0, done.err
+    seconds, startup = done.seconds, 0.0
+    if programs:
+        again = [folder / f"whole{n}" for n in range(2)]
+        seconds, begun = go(again[0]).seconds, time.monotonic()
+        program = bench.program(train_arguments(bench.world, recipe, again[1]))
+        program.communicate()
+        startup = time.monotonic() - begun
+        wrong = [line for each in again for line in differences(each, whole)]
+        assert not wrong, wrong
+
+    of_chains = Row(
+        "kills of training, chains", "killed runs end with the bits of an uninterrupted run"
+    )
+    of_kills = {
+        name: Row(f"kills of training: {name}", "the same command goes on")
+        for name in ("a program as it starts", "a state is written", *TRAINING.names)
+    }
+
+    def kill(out: pathlib.Path, as_program: bool) -> tuple[str, int]:
+        if as_program:
+            after = bench.random.uniform(0, startup)
+            program = bench.program(train_arguments(bench.world, recipe, out))
+            try:
+                program.wait(after)
+                name = ""
+            except subprocess.TimeoutExpired:
+                program.kill()
+                name = "a program as it starts"
+            program.communicate()
+            return name, program.returncode
+        if bench.random.random() < 0.4:
+            moment = Moment(TRAINING, signal.SIGKILL, after=bench.random.uniform(0, seconds))
+        else:
+            (work,) = bench.random.choices(*zip(*WEIGHT_OF_WORK.items(), strict=True))
+            nth = bench.random.randint(1, 4) if work not in ("opening the run", "closing") else 1
+            after = bench.random.uniform(0, bench.random.choice([0.002, 0.02, 0.2]))
+            moment = Moment(TRAINING, signal.SIGKILL, after=after, work=work, nth=nth)
+        done = go(out, moment)
+        writing = any("tmp" in path.name for path in (out / "state").glob("*"))
+        return moment.during and ("a state is written" if writing else moment.during), done.code
+
+    killed = 0
+    for chain in range(10 * chains):
+        left = kills - killed
+        if not left and chain >= chains:
+            break
+        out, begun = folder / f"chain{chain}", time.monotonic()
+        number = min(left, -(-left // max(chains - chain, 1)))
+        met, bad = [], ""
+        with_program = programs > 0 and chain % max(chains // programs, 1) == 0
+        while len(met) < number and not bad:
+            as_program = with_program and not met
+            name, code = kill(out, as_program)
+            if name and code == -signal.SIGKILL:
+                met.append(name)
+            elif code == 0:
+                break  # it had finished
+            else:
+                bad = f"exit code {code} at {name or 'its end'}"
+        killed += len(met)
+        if not bad:
+            done = go(out)
+            wrong = differences(out, whole) if done.code == 0 else [done.err[-300:]]
+            bad = "; ".join(wrong)
+        words = f"seed {bench.seed}, chain {chain} ({', '.join(met)}): {bad}"
+        of_chains.note(not bad, words)
+        for name in met:
+            of_kills[name].note(not bad, words)
+        if not bad:
+            shutil.rmtree(out)
+        bench.say(
+            f"training: {killed} of {kills} kills, chain {chain}, "
+            f"{time.monotonic() - begun:.1f} s, {len(of_chains.failures)} failures"
+        )
+    return [of_chains, *(row for row in of_kills.values() if row.tries)]
+
+
+def is_told(error: Exception) -> bool:
+    """Return whether an error is one of ours, in one line."""
+    return isinstance(error, InputError) and "\n" not in str(error)
+
+
+INDEXING = Marks(
+    {
+        "opening the map": "crisalad_jax.retrieval.maps.build:open_for_appending",
+        "appending": "crisalad_jax.retrieval.maps.map:Map.append",
+        "a descriptors' file": "crisalad_jax.retrieval.maps.file_store:FileStore.add",
+        "a record": "crisalad_jax.retrieval.maps.map:write_record",
+    }
+)
+IMAGES, TOGETHER = 24, 2
+"""Images of a map, and how many of them are appended together."""
+
+
+def write_images(folder: pathlib.Path, first: int, count: int) -> None:
+    """Write pictures with a position in their names."""
+    from tests.conftest import write_picture
+
+    for number in range(first, first + count):
+        write_picture(folder / "sub" / f"@{100 + number}@500@10@S@{number:03d}@.jpg", number)
+
+
+def map_files(folder: pathlib.Path) -> dict[str, bytes]:
+    """Return the bytes of a map's additions, and its description but for its time and its name."""
+    found = {p.name: p.read_bytes() for p in sorted((folder / "segments").iterdir())}
+    description = without_times(json.loads((folder / "map.json").read_text()))
+    del description["created"], description["collection"]
+    return found | {"map.json": json.dumps(description).encode()}
+
+
+def attack_maps(bench: Bench, kills: int) -> list[Row]:
+    """Kill `index`, read maps after each kill, and search a map while it grows."""
+    import crisalad_jax.retrieval.maps.build
+    from crisalad_jax.retrieval.maps.manifest import has_images
+    from crisalad_jax.retrieval.maps.map import Map
+
+    folder = bench.folder / "maps"
+    images = folder / "images"
+    write_images(images, 0, IMAGES)
+    small = (crisalad_jax.retrieval.maps.build, "SEGMENT", TOGETHER)
+
+    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
+        INDEXING.clear()
+        arguments = [
+            *("index", "--weights", f"{bench.world.weights}", "--images", f"{images}"),
+            *("--out", f"{out}", "--batch-size", f"{TOGETHER}", "--quiet"),
+        ]
+        return forked(command(arguments, INDEXING, small), cwd=folder, during=during)
+
+    whole = folder / "whole"
+    done = go(whole)
+    assert done.code == 0, done.err
+    seconds = go(folder / "whole1").seconds
+    expected = map_files(whole)
+    assert map_files(folder / "whole1") == expected
+    with Map.open(whole) as opened:
+        names = [image.name for image in opened.images]
+        rows = np.concatenate(list(opened.descriptors))
+    assert len(names) == IMAGES
+
+    def wrong_with(out: pathlib.Path) -> str:
+        """Return what is wrong with a map; nothing if it has the first images, or none."""
+        if not has_images(out):
+            try:
+                Map.open(out).close()
+                return "a map without images was opened"
+            except InputError as error:
+                return "" if is_told(error) else str(error)
+        with Map.open(out) as opened:
+            count = len(opened)
+            found = [image.name for image in opened.images]
+            same = np.array_equal(np.concatenate(list(opened.descriptors)), rows[:count])
+            prefix = found == names[:count] and same and count % TOGETHER == 0
+        return "" if prefix else f"{count} images, not the first ones"
+
+    at_each = Row("kills of index: each moment", "the map opens with the first images, or has none")
+    of_chains = Row("kills of index: chains", "the map ends with the bits of an uninterrupted one")
+    killed = chain = 0
+    while killed < kills:
+        out, bad, met = folder / f"chain{chain}", "", []
+        while killed < kills:
+            if bench.random.random() < 0.3:
+                moment = Moment(INDEXING, signal.SIGKILL, after=bench.random.uniform(0, seconds))
+            else:
+                work = bench.random.choice(INDEXING.works)
+                nth = 1 if work == INDEXING.works[0] else bench.random.randint(1, 3)
+                after = bench.random.uniform(0, bench.random.choice([0.0005, 0.005, 0.05]))
+                moment = Moment(INDEXING, signal.SIGKILL, after=after, work=work, nth=nth)
+            done = go(out, moment)
+            if done.code == 0:
+                break
+            killed += 1
+            met.append(moment.during)
+            bad = wrong_with(out)
+            bad = bad or (f"exit code {done.code}" if done.code != -signal.SIGKILL else "")
+            at_each.note(not bad, f"seed {bench.seed}, chain {chain}, {moment}: {bad}")
+        if done.code != 0:
+            done = go(out)
+        same = done.code == 0 and map_files(out) == expected and not has_temporaries(out)
+        of_chains.note(same, f"seed {bench.seed}, chain {chain}, {met}: {done.err[-300:]}")
+        bench.say(f"index: {killed} of {kills} kills, chain {chain}")
+        chain += 1
+    return [at_each, of_chains, *attack_readers(bench, folder, go, rows)]
+
+
+def attack_readers(
+    bench: Bench,
+    folder: pathlib.Path,
+    go: Callable[[pathlib.Path], Done],
+    rows: np.ndarray,
+) -> list[Row]:
+    """Search a map in a loop while another process makes it, then move it and ask it again."""
+    from crisalad_jax.retrieval.maps.map import Map
+    from crisalad_jax.retrieval.search import exact_similarities
+
+    out, ended = folder / "growing", folder / "ended"
+    query, place = (each.ravel() for each in np.indices((IMAGES, IMAGES)))
+    all_of = exact_similarities(rows, rows, query, place).reshape(IMAGES, IMAGES)
+
+    def wrong_with(opened: Map) -> str:
+        count = len(opened)
+        indices, similarities = opened.search(rows, 5)
+        order = np.argsort(-all_of[:, :count], axis=1, kind="stable")[:, :5]
+        if not np.array_equal(indices, order):
+            return f"other answers than of the first {count} images"
+        right = np.array_equal(similarities, np.take_along_axis(all_of, order, axis=1))
+        return "" if right else f"other similarities than of the first {count} images"
+
+    def read() -> int:
+        counts, tries, failures = set(), 0, []
+        last = False
+        while not last:
+            last = ended.exists()
+            try:
+                with Map.open(out) as opened:
+                    tries += 1
+                    counts.add(len(opened))
+                    wrong = wrong_with(opened)
+            except InputError as error:
+                wrong = str(error) if counts or last or not is_told(error) else ""
+            except Exception as error:
+                wrong = repr(error)
+            failures += [wrong] if wrong else []
+        print(json.dumps([tries, sorted(counts), failures[:20]]))
+        return 0
+
+    def make(_: int) -> None:
+        try:
+            assert go(out).code == 0
+        finally:
+            ended.touch()
+
+    read_there = Row(
+        "searches of a map while it grows", "each answer is that of the first images, no errors"
+    )
+    done = forked(read, cwd=folder, during=make)
+    if done.code != 0:
+        read_there.note(False, f"the reader ended with code {done.code}: {done.err[-300:]}")
+    else:
+        tries, counts, failures = json.loads(done.out)
+        read_there.tries, read_there.failures = tries, failures
+        bench.say(f"searches while a map grows: {tries}, of maps of {counts} images")
+    moved = Row("a map in another folder", "it answers as before")
+    (folder / "else" / "where").mkdir(parents=True)
+    os.rename(out, folder / "else" / "where" / "map")
+    out = folder / "else" / "where" / "map"
+    ended.touch()
+    done = forked(read, cwd=folder)
+    right = done.code == 0 and json.loads(done.out) == [1, [IMAGES], []]
+    moved.note(right, f"{done.out}{done.err[-300:]}")
+    return [read_there, moved]
+
+
+EXTRACTING = Marks(
+    {
+        "part of the tokens": "crisalad_jax.retrieval.partial:write_sealed",
+        "writing descriptors": "crisalad_jax.retrieval.extract:write_descriptors",
+    }
+)
+
+
+def attack_extract(bench: Bench, suffix: str, kills: int) -> list[Row]:
+    """Kill `extract`, half of the chains over an older set, and read the set after each kill."""
+    import crisalad_jax.retrieval.partial
+    from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
+
+    folder = bench.folder / suffix[1:]
+    images = folder / "images"
+    write_images(images, 0, IMAGES)
+    small = (crisalad_jax.retrieval.partial, "SEGMENT", TOGETHER)
+
+    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
+        EXTRACTING.clear()
+        arguments = [
+            *("extract", "--weights", f"{bench.world.weights}", "--images", f"{images}"),
+            *("--out", f"{out}", "--batch-size", f"{TOGETHER}", "--quiet"),
+        ]
+        return forked(command(arguments, EXTRACTING, small), cwd=folder, during=during)
+
+    def read(path: pathlib.Path) -> tuple[list[str], np.ndarray]:
+        names, descriptors = read_descriptors(path)
+        return names, np.array(descriptors)
+
+    def bytes_of(path: pathlib.Path) -> dict[str, bytes]:
+        return {each.name: each.read_bytes() for each in path.parent.iterdir() if each.is_file()}
+
+    whole = folder / "whole" / f"d{suffix}"
+    whole.parent.mkdir()
+    done = go(whole)
+    assert done.code == 0, done.err
+    again = folder / "again" / f"d{suffix}"
+    again.parent.mkdir()
+    seconds = go(again).seconds
+    expected = bytes_of(whole)
+    assert bytes_of(again) == expected
+    names, new = read(whole)
+    old = np.ascontiguousarray(new[::-1])
+
+    def wrong_with(out: pathlib.Path, had_old: bool) -> str:
+        try:
+            found, descriptors = read(out)
+        except InputError as error:
+            return "" if is_told(error) else f"refused in several lines: {error}"
+        except Exception as error:
+            return f"raised {error!r}"
+        sets = [new, old] if had_old else [new]
+        right = found == names and any(np.array_equal(descriptors, each) for each in sets)
+        return "" if right else "read a mixture"
+
+    at_each = Row(
+        f"kills of extract {suffix}: each moment",
+        "read_descriptors gives the old set, the new one, or refuses in one line",
+    )
+    of_chains = Row(
+        f"kills of extract {suffix}: chains", "the set has the bits of an uninterrupted one"
+    )
+    left_over = 0
+    killed = chain = 0
+    while killed < kills:
+        out, met, had_old = folder / f"chain{chain}" / f"d{suffix}", [], chain % 2 == 1
+        out.parent.mkdir()
+        if had_old:
+            write_descriptors(out, old, names)
+        while killed < kills:
+            if bench.random.random() < 0.3:
+                moment = Moment(EXTRACTING, signal.SIGKILL, after=bench.random.uniform(0, seconds))
+            else:
+                work = bench.random.choice(EXTRACTING.works)
+                nth = bench.random.randint(1, 4) if work == EXTRACTING.works[0] else 1
+                after = bench.random.uniform(0, bench.random.choice([0.002, 0.005, 0.02]))
+                moment = Moment(EXTRACTING, signal.SIGKILL, after=after, work=work, nth=nth)
+            done = go(out, moment)
+            if done.code == 0:
+                break
+            killed += 1
+            met.append(moment.during)
+            bad = wrong_with(out, had_old)
+            bad = bad or (f"exit code {done.code}" if done.code != -signal.SIGKILL else "")
+            at_each.note(not bad, f"seed {bench.seed}, chain {chain}, {moment}: {bad}")
+        if done.code != 0:
+            done = go(out)
+        found = bytes_of(out)
+        temporaries = [name for name in found if name.startswith(".crisalad-")]
+        left_over += len(temporaries)
+        same = {name: data for name, data in found.items() if name not in temporaries} == expected
+        folders = [path.name for path in out.parent.iterdir() if path.is_dir()]
+        words = f"seed {bench.seed}, chain {chain}, {met}: {folders} {done.err[-300:]}"
+        of_chains.note(done.code == 0 and same and not folders, words)
+        bench.say(f"extract {suffix}: {killed} of {kills} kills, {left_over} temporaries left")
+        chain += 1
+    return [at_each, of_chains]
+
+
+COMPARING = Marks(
+    {
+        "training": "crisalad_jax.experiments.comparison.runner:fit",
+        "evaluating": "crisalad_jax.experiments.comparison.runner:evaluate",
+        "timing": "crisalad_jax.experiments.comparison.runner:race",
+    }
+)
+
+
+def attack_compare(bench: Bench, kills: int) -> list[Row]:
+    """Kill a small comparison."""
+    folder = bench.folder / "comparing"
+    folder.mkdir()
+
+    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
+        COMPARING.clear()
+        work = command(VERBS["compare"](bench.world, out), COMPARING)
+        return forked(work, cwd=folder, during=during, limit=600)
+
+    def wrong_with(out: pathlib.Path) -> list[str]:
+        found, expected = out / "comparison", folder / "whole" / "comparison"
+        (run,) = expected.rglob("run")
+        wrong = differences(found / run.relative_to(expected), run)
+        for path in expected.rglob("test-*.json"):
+            other = found / path.relative_to(expected)
+            values = [without_times(json.loads(each.read_text())) for each in (path, other)]
+            wrong += [] if values[0] == values[1] else [path.name]
+        names = [
+            {n for n in files_in(each) if "/tensorboard/" not in n and "/state/" not in n}
+            for each in (found, expected)
+        ]
+        return wrong + sorted(names[0] ^ names[1])
+
+    go(folder / "whole")
+    seconds = go(folder / "again").seconds
+    assert not wrong_with(folder / "again"), wrong_with(folder / "again")
+    row = Row("kills of compare", "the comparison ends with the weights and ranks of a whole one")
+    killed = chain = 0
+    while killed < kills:
+        out, met = folder / f"chain{chain}", []
+        while killed < kills:
+            work = bench.random.choice([None, *COMPARING.works])
+            after = bench.random.uniform(0, seconds if work is None else 0.3 * seconds)
+            moment = Moment(COMPARING, signal.SIGKILL, after=after, work=work)
+            done = go(out, moment)
+            if done.code == 0:
+                break
+            killed += 1
+            met.append(moment.during)
+        if done.code != 0:
+            done = go(out)
+        wrong = wrong_with(out) if done.code == 0 else [done.err[-300:]]
+        for name in met:
+            row.note(not wrong, f"seed {bench.seed}, chain {chain}, {name}: {'; '.join(wrong)}")
+        bench.say(f"compare: {killed} of {kills} kills")
+        chain += 1
+    return [row]
+
+
+ATTACKS: Mapping[str, Callable[[Bench, float], list[Row]]] = {
+    "training": lambda bench, scale: attack_training(
+        bench,
+        kills=part_of(200, scale, least=3),
+        chains=part_of(40, scale),
+        programs=part_of(20, scale, least=0),
+    ),
+    "maps": lambda bench, scale: attack_maps(bench, part_of(50, scale, least=4)),
+    "extract .npy": lambda bench, scale: attack_extract(bench, ".npy", part_of(20, scale, least=3)),
+    "extract .h5": lambda bench, scale: attack_extract(bench, ".h5", part_of(20, scale, least=3)),
+    "compare": lambda bench, scale: attack_compare(bench, part_of(5, scale)),
+}
+
+
+def part_of(count: int, scale: float, least: int = 1) -> int:
+    """Return a part of the full count of tries."""
+    return max(least, round(scale * count))
+
+
+def open_bench(folder: pathlib.Path, seed: int) -> Bench:
+    """Make a bench in an empty folder; the compiled programs are kept beside."""
+    import_everything()
+    environment = keep_programs(folder / "programs") | {"PYTHONPATH": str(ROOT)}
+    begun = time.monotonic()
+
+    def say(line: str) -> None:
+        print(f"[{time.monotonic() - begun:5.0f} s] {line}", file=sys.stderr, flush=True)
+
+    world = make_world(folder / "world")
+    return Bench(world, folder, random.Random(seed), seed, environment, say)
+
+
+def carry_out(attacks: Mapping[str, Callable[[Bench, float], list[Row]]], description: str) -> int:
+    """Run attacks as the arguments say, write their rows, and return the exit code."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--out", type=pathlib.Path, required=True, help="report to add rows to")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="part of the full counts; 0 for a handful"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", choices=attacks, default=list(attacks))
+    given = parser.parse_args()
+    failures = []
+    with tempfile.TemporaryDirectory() as temporary:
+        bench = open_bench(pathlib.Path(temporary), given.seed)
+        for name in given.only:
+            rows = attacks[name](bench, given.scale)
+            write_rows(given.out, rows)
+            for row in rows:
+                bench.say(f"{row.attack}: {row.tries} tries, {len(row.failures)} failures")
+                failures += row.failures
+    print(*failures[:20], sep="\n")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(carry_out(ATTACKS, (__doc__ or "").splitlines()[0]))

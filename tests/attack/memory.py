@@ -1,0 +1,163 @@
+"""What grows: resident memory over steps of training and over queries, and the compile cache.
+
+python -m tests.attack.memory --out rows.json [--scale 1] [--seed 0] [--only training ...]
+"""
+
+import dataclasses
+import gc
+import json
+import pathlib
+import resource
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from tests.attack.kills import Bench, carry_out, part_of, recipe_of_chains
+from tests.attack.world import VERBS, Row, files_in, forked, make_products
+
+MOST = 20
+"""Growth of resident memory in megabytes that passes as none."""
+
+
+def resident() -> float:
+    """Return the resident memory of this process in megabytes."""
+    pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def _row_of_growth(attack: str, first: int, last: int) -> Row:
+    words = f"resident memory after {first:,} and after {last:,} differs by less than {MOST} MB"
+    return Row(attack, words)
+
+
+def attack_training(bench: Bench, scale: float) -> list[Row]:
+    """Take many steps in one process; then save and validate after each epoch."""
+    recipe = recipe_of_chains(bench.folder)
+    rows = []
+    for kind, steps in (("steps", 3000), ("steps with saves and validations", 600)):
+        first, last = part_of(steps // 6, scale), part_of(steps, scale)
+        often = kind != "steps"
+
+        def work(last: int = last, often: bool = often, kind: str = kind) -> int:
+            import crisalad_jax.training.run
+            from crisalad_jax.config.io import read_config
+            from crisalad_jax.data.benchmarks import open_benchmark
+            from crisalad_jax.data.places import read_places
+            from crisalad_jax.training.config import TrainConfig
+            from crisalad_jax.training.loop import fit
+            from crisalad_jax.training.run_files import RunFiles
+
+            if often:
+                crisalad_jax.training.run.SAVE_SECONDS = -1.0
+            config = dataclasses.replace(
+                read_config(TrainConfig, recipe), epochs=-(-last // 2), keep_best=1
+            )
+            sizes: dict[int, float] = {}
+            real = RunFiles.log_step
+
+            def log_step(self: RunFiles, values: Mapping[str, int | float], **more: str) -> None:
+                real(self, values, **more)
+                step = int(values["step"])
+                if step % max(last // 12, 1) == 0:
+                    sizes[step] = resident()
+
+            RunFiles.log_step = log_step
+            fit(
+                config,
+                read_places(bench.world.city, min_images=2),
+                bench.folder / f"run of {kind}",
+                validation=open_benchmark(bench.world.town) if often else None,
+                quiet=True,
+            )
+            print(json.dumps(sizes))
+            return 0
+
+        row = _row_of_growth(f"memory of training: {kind}", first, last)
+        done = forked(work, cwd=bench.folder, limit=3600)
+        _note(bench, row, done.code, done.out, done.err, first)
+        rows.append(row)
+    return rows
+
+
+def _note(bench: Bench, row: Row, code: int, out: str, err: str, first: int) -> None:
+    """Judge sizes by number of steps or queries: the first late enough, and the last."""
+    if code:
+        row.note(False, f"exit code {code}: {err[-300:]}")
+        return
+    sizes = {int(number): size for number, size in json.loads(out).items()}
+    early = min(number for number in sizes if number >= first)
+    growth = sizes[max(sizes)] - sizes[early]
+    told = ", ".join(f"{number}: {size:.1f} MB" for number, size in sorted(sizes.items()))
+    row.promise += f" (here {growth:+.1f} MB)"
+    row.note(growth < MOST, f"{growth:+.1f} MB ({told})")
+    bench.say(f"{row.attack}: {told}")
+
+
+def attack_queries(bench: Bench, scale: float) -> list[Row]:
+    """Search an open map, and describe and search images, many times."""
+    make_products(bench.world)
+    rows = []
+    for kind, count in (("searches", 10_000), ("queries by images", 2_000)):
+        first, last = part_of(count // 10, scale), part_of(count, scale)
+
+        def work(last: int = last, kind: str = kind) -> int:
+            from crisalad_jax.retrieval.maps.map import Map
+            from crisalad_jax.retrieval.maps.query import query
+
+            sizes = {}
+            image = next(path for path in bench.world.images.rglob("*.jpg"))
+            with Map.open(bench.world.path("map")) as places:
+                params = places.load_params()
+                rows = np.concatenate(list(places.descriptors))
+                for number in range(1, last + 1):
+                    if kind == "searches":
+                        places.search(rows[:1], 3)
+                    else:
+                        query(places, params, [image], k=3, quiet=True)
+                    if number % max(last // 10, 1) == 0:
+                        gc.collect()
+                        sizes[number] = resident()
+            print(json.dumps(sizes))
+            return 0
+
+        row = _row_of_growth(f"memory of an open map: {kind}", first, last)
+        done = forked(work, cwd=bench.folder, limit=3600)
+        _note(bench, row, done.code, done.out, done.err, first)
+        rows.append(row)
+    return rows
+
+
+def attack_cache(bench: Bench, _: float) -> list[Row]:
+    """Run commands twice, as users do, with a compile cache of their own."""
+    make_products(bench.world)
+    row = Row("growth of the compile cache", "the second run of a command adds no file to it")
+    cache = bench.folder / "cache"
+    quick = dataclasses.replace(bench, environment={"XDG_CACHE_HOME": str(cache)})
+    for name in ("info", "query", "train"):
+        listed = []
+        for turn in range(2):
+            out = bench.folder / "cached" / f"{name} {turn}"
+            out.mkdir(parents=True)
+            program = quick.program(VERBS[name](bench.world, out))
+            _, err = program.communicate()
+            assert program.returncode == 0, err
+            # The cache keeps the time of the last use of each program in a file beside it.
+            listed.append(files_in(cache) if cache.exists() else set())
+        new = listed[1] - listed[0]
+        size = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
+        row.note(not new, f"{name}: {len(new)} new files")
+        bench.say(f"compile cache after {name}: {len(listed[1])} files, {size / 2**20:.1f} MB")
+    shutil.rmtree(cache, ignore_errors=True)
+    return [row]
+
+
+ATTACKS: Mapping[str, Callable[[Bench, float], list[Row]]] = {
+    "training": attack_training,
+    "queries": attack_queries,
+    "cache": attack_cache,
+}
+
+if __name__ == "__main__":
+    sys.exit(carry_out(ATTACKS, (__doc__ or "").splitlines()[0]))
