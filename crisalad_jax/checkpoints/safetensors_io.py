@@ -10,7 +10,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from crisalad_jax.utils.checksums import BLANK, CHECKSUM, seal_safetensors, tell_unchecked
+from crisalad_jax.utils.checksums import CHECKSUM, seal_safetensors, tell_unchecked, with_blank
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, parse_json
 
@@ -54,7 +54,7 @@ def write_sealed(
     Raises:
         InputError: the file cannot be written.
     """
-    metadata = {form: json.dumps({CHECKSUM: BLANK} | dict(value))}
+    metadata = {form: json.dumps(with_blank(value))}
     with atomic_path(path) as temporary:
         _write(pathlib.Path(path), temporary, arrays, metadata)
         seal_safetensors(temporary)

@@ -29,13 +29,17 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def sealed_json(value: Mapping[str, Any], indent: int | None = None) -> bytes:
-    """Return an object as the bytes of a JSON file, with its checksum ahead of all other keys.
+def with_blank(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an object with zeros for its checksum ahead of all other keys.
 
-    A checksum that the object has already, as of another file, is left out.
+    A checksum that it has already, as of another file, is left out.
     """
-    rest = {key: each for key, each in value.items() if key != CHECKSUM}
-    data = (json.dumps({CHECKSUM: BLANK} | rest, indent=indent) + "\n").encode()
+    return {CHECKSUM: BLANK} | {key: each for key, each in value.items() if key != CHECKSUM}
+
+
+def sealed_json(value: Mapping[str, Any], indent: int | None = None) -> bytes:
+    """Return an object as the bytes of a JSON file, with its checksum ahead of all other keys."""
+    data = (json.dumps(with_blank(value), indent=indent) + "\n").encode()
     return data.replace(BLANK.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
 
 

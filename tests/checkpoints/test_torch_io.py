@@ -473,7 +473,7 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
         ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt for dino"),
         ("x", None, "x: found suffix '', expected .pth"),
         ("x\0.pth", None, "cannot be made"),
-        ("x" * 300 + ".pth", None, "cannot be made: .*too long"),
+        ("x" * 300 + ".pth", None, "too long"),
         ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors for hugging"),
         ("x.safetensors", None, "layout huggingface: found a model of aggregator salad"),
         ("x.safetensors", "reference", "suffix '.safetensors', expected .pth or .pt or .ckpt"),

@@ -1,6 +1,7 @@
 """Vocabularies: fixed points of k-means on features that are read here again; what is refused."""
 
 import dataclasses
+import json
 import pathlib
 
 import jax
@@ -10,7 +11,8 @@ import pytest
 import safetensors
 import safetensors.numpy
 
-from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.checkpoints.safetensors_io import write_sealed
+from crisalad_jax.checkpoints.weights import FORMAT, load_weights, save_weights
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.places import read_places
@@ -148,9 +150,9 @@ def test_a_vocabulary_of_another_backbone_is_refused(capfd, built, shared, tmp_p
     assert_equal(found, built)
     arrays = safetensors.numpy.load_file(path)
     with safetensors.safe_open(path, framework="numpy") as file:
-        metadata = file.metadata()
+        value = json.loads(file.metadata()[FORMAT])
     arrays["backbone.cls_token"] = arrays["backbone.cls_token"] + 1
-    safetensors.numpy.save_file(arrays, path, metadata=metadata)
+    write_sealed(path, arrays, FORMAT, value)
     start = extract(shared, shared / "town", tmp_path / "d.npy")
     start = tuple(path if part == shared / "weights.safetensors" else part for part in start)
     fails(capfd, *start, words=(f"{path}: found a vocabulary of another backbone, expected one",))
