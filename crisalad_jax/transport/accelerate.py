@@ -24,7 +24,8 @@ class Memory(NamedTuple):
 def empty_memory(start: Potentials, size: int) -> Memory:
     """Return an empty memory with room for `size` iterations."""
     images = _flat(start)[..., None, :].repeat(size, axis=-2)
-    return Memory(start, images, images)
+    # Moves of 0: those of a start that is not 0 would count in the weights of the first steps.
+    return Memory(start, images, 0 * images)
 
 
 def accelerate(memory: Memory, moved: Potentials, count: Int[Array, ""]) -> Memory:

@@ -1,5 +1,6 @@
 """Measure a plan's marginal errors, and check the inputs and steps of a problem."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from crisalad_jax.transport.config import SinkhornConfig, Solution
-from crisalad_jax.transport.problem import Potentials, Problem
+from crisalad_jax.transport.problem import NO_MASS, Potentials, Problem
 from crisalad_jax.utils.errors import InputError
 
 
@@ -26,7 +27,8 @@ def marginal_error(
         log_nu: logarithms of the columns' marginals.
 
     Returns:
-        The largest |mass / marginal - 1| of the rows, and of the columns.
+        The largest |mass / marginal - 1| of the rows, and of the columns. Where a marginal is 0,
+        the error is 0 if the mass is, else infinite.
 
     Example:
         >>> import jax.numpy as jnp
@@ -35,9 +37,15 @@ def marginal_error(
         >>> float(rows), float(columns)
         (0.0, 1.0)
     """
-    rows = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-1) - log_mu)
-    columns = jnp.expm1(jax.nn.logsumexp(log_plan, axis=-2) - log_nu)
-    return jnp.abs(rows).max(axis=-1), jnp.abs(columns).max(axis=-1)
+    rows = _relative_error(jax.nn.logsumexp(log_plan, axis=-1), log_mu)
+    columns = _relative_error(jax.nn.logsumexp(log_plan, axis=-2), log_nu)
+    return rows.max(axis=-1), columns.max(axis=-1)
+
+
+def _relative_error(log_mass: Array, log_marginal: Array) -> Array:
+    empty = log_marginal < NO_MASS
+    error = jnp.abs(jnp.expm1(log_mass - jnp.where(empty, 0, log_marginal)))
+    return jnp.where(empty, jnp.where(log_mass < NO_MASS, 0, jnp.inf), error)
 
 
 def wide_dtype(scores: Array) -> jnp.dtype:
@@ -75,9 +83,19 @@ def check_inputs(
     for name, value in (("scores", scores), ("log_mu", log_mu), ("log_nu", log_nu)):
         if jnp.iscomplexobj(value):
             raise InputError(f"sinkhorn: {name} found of {value.dtype}, expected real numbers")
-        if not isinstance(value, Tracer) and not _is_finite(value):
+    if not isinstance(scores, Tracer) and not _all(jnp.isfinite, scores):
+        raise InputError("sinkhorn: scores found with NaN or infinity, expected finite numbers")
+    for name, value in (("log_mu", log_mu), ("log_nu", log_nu)):
+        if isinstance(value, Tracer):
+            continue
+        if not _all(lambda x: x < jnp.inf, value):
             raise InputError(
-                f"sinkhorn: {name} found with NaN or infinity, expected finite numbers"
+                f"sinkhorn: {name} found with NaN or infinity, expected finite numbers, or -inf "
+                "for a mass of 0"
+            )
+        if not _all(lambda x: (x >= NO_MASS).any(axis=-1), value):
+            raise InputError(
+                f"sinkhorn: {name} found with no mass at all in a problem, expected some"
             )
     if not isinstance(epsilon, Tracer):
         _check_epsilon(scores, float(epsilon))
@@ -85,11 +103,12 @@ def check_inputs(
         _check_totals(log_mu, log_nu)
 
 
-def check_init(init: Any, scores: Array) -> Potentials:
+def check_init(init: Any, scores: Array, log_mu: Array, log_nu: Array) -> Potentials:
     """Return the potentials to start from, if they fit the scores.
 
     Raises:
-        InputError: they do not, or where they are known (outside of `jit`) are not finite.
+        InputError: they do not, or where they are known (outside of `jit`) are not finite. They
+            may be -inf where the mass is 0.
     """
     expected = scores.shape[:-1], (*scores.shape[:-2], scores.shape[-1])
     is_pair = isinstance(init, tuple) and len(init) == 2
@@ -100,15 +119,24 @@ def check_init(init: Any, scores: Array) -> Potentials:
             f"shapes {expected[0]} and {expected[1]}"
         )
     start = Potentials(*map(jnp.asarray, init))
-    if not all(isinstance(x, Tracer) or _is_finite(x) for x in start):
-        raise InputError("sinkhorn: init found with NaN or infinity, expected finite potentials")
+    for potential, log_mass in zip(start, (log_mu, log_nu), strict=True):
+        traced = isinstance(log_mass, Tracer)
+
+        def fits(x: Array, mass: Array | None = None if traced else log_mass) -> Array:
+            empty = True if mass is None else mass < NO_MASS
+            return jnp.isfinite(x) | (jnp.isneginf(x) & empty)
+
+        if not isinstance(potential, Tracer) and not _all(fits, potential):
+            raise InputError(
+                "sinkhorn: init found with NaN or infinity, expected finite potentials"
+            )
     return start
 
 
-def _is_finite(value: Array) -> bool:
+def _all(test: Callable[[Array], Array], value: Array) -> bool:
     # Concrete values stay concrete under tracing. Only a flag is copied to the host.
     with jax.ensure_compile_time_eval():
-        return bool(jnp.isfinite(value).all())
+        return bool(test(value).all())
 
 
 def _largest(value: Array) -> float:
@@ -133,8 +161,11 @@ def _check_epsilon(scores: Array, epsilon: float) -> None:
 
 def _check_totals(log_mu: Array, log_nu: Array) -> None:
     totals = [np.exp(np.asarray(x, np.float64)).sum(axis=-1) for x in (log_mu, log_nu)]
-    # The tolerance allows for rounding of float32 logarithms.
-    unlike = ~np.isclose(*totals, rtol=1e-4)
+    with jax.ensure_compile_time_eval():
+        allowed = np.asarray(_rounding(log_mu) + _rounding(log_nu))
+    # At least what sums of float32 logarithms are off by.
+    allowed = np.maximum(allowed, 1e-4)
+    unlike = ~(np.abs(totals[0] - totals[1]) <= allowed * np.abs(totals[1]))
     if unlike.any():
         worst = [np.broadcast_to(total, unlike.shape)[unlike][0] for total in totals]
         sums = " and ".join(f"{total:.6g}" for total in worst)
@@ -142,6 +173,39 @@ def _check_totals(log_mu: Array, log_nu: Array) -> None:
             f"sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to {sums}, expected the "
             "same"
         )
+
+
+def equal_totals(log_mu: Array, log_nu: Array, wide: jnp.dtype) -> tuple[Array, Array]:
+    """Give marginals of a narrower type than `wide` equal totals there.
+
+    The coarser marginal takes the other's total, and of two of one type the columns take the rows'.
+    Totals that differ by more than rounding explains stay as they are.
+    """
+    units = [_unit(x) for x in (log_mu, log_nu)]
+    if max(units) <= float(jnp.finfo(wide).eps):
+        return log_mu, log_nu
+    allowed = (_rounding(log_mu) + _rounding(log_nu))[..., None].astype(wide)
+    log_mu, log_nu = log_mu.astype(wide), log_nu.astype(wide)
+    totals = [jax.nn.logsumexp(x, axis=-1, keepdims=True) for x in (log_mu, log_nu)]
+    # A constant: a plan whose rows are met does not depend on the columns' total.
+    more = jax.lax.stop_gradient(totals[0] - totals[1])
+    more = jnp.where(jnp.abs(more) <= allowed, more, 0)
+    return (log_mu - more, log_nu) if units[0] > units[1] else (log_mu, log_nu + more)
+
+
+def _unit(value: Array) -> float:
+    """Return the relative rounding of numbers of a type; whole numbers have none."""
+    floats = jnp.issubdtype(value.dtype, jnp.floating)
+    return float(jnp.finfo(value.dtype).eps) if floats else 0.0
+
+
+def _rounding(log_masses: Array) -> Array:
+    """Bound the relative error of a total whose masses, then their logarithms, were rounded."""
+    exact = log_masses.astype(wide_dtype(log_masses))
+    exact = jax.lax.stop_gradient(jnp.where(exact < NO_MASS, -jnp.inf, exact))
+    size = 1 + jnp.where(jnp.isfinite(exact), jnp.abs(exact), 0)
+    shares = jax.nn.softmax(exact, axis=-1)
+    return _unit(log_masses) * (shares * size).sum(axis=-1)
 
 
 def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:

@@ -196,23 +196,26 @@ class Optimistix(Gradient):
         def solve_one(problem: Problem, init: Potentials) -> Solution:
             def again(at: Potentials, inputs: tuple[Problem, Any]) -> Potentials:
                 problem, params = inputs
+                at = problem.masked(at)
                 moved, _ = config.step.step(
                     problem, at, config.step.init(problem, params), jnp.zeros((), jnp.int32)
                 )
                 # Centre the potentials to make the fixed point unique.
-                return centred(moved) if problem.balanced else moved
+                moved = centred(problem, moved) if problem.balanced else moved
+                # 0 for what has no mass: a solver may multiply, and the floor would overflow.
+                return problem.masked(moved, 0.0)
 
             fixed_point = optimistix.fixed_point(
                 again,
                 solver,
-                init,
+                problem.masked(init, 0.0),
                 args=(problem, params),
                 max_steps=config.iterations,
                 adjoint=optimistix.ImplicitAdjoint(lineax.AutoLinearSolver(well_posed=True)),
                 throw=False,
             )
             return Solution(
-                fixed_point.value,
+                problem.masked(fixed_point.value),
                 jnp.asarray(fixed_point.stats["num_steps"], jnp.int32),
                 fixed_point.result == optimistix.RESULTS.successful,
             )
@@ -222,7 +225,9 @@ class Optimistix(Gradient):
         return solve_one(problem, init)
 
 
-def centred(potentials: Potentials) -> Potentials:
-    """Shift the potentials to a column mean of 0, which leaves the plan the same."""
-    shift = potentials.column.mean(axis=-1, keepdims=True)
-    return Potentials(potentials.row + shift, potentials.column - shift)
+def centred(problem: Problem, potentials: Potentials) -> Potentials:
+    """Shift the columns with mass to a mean of 0, which leaves the plan the same."""
+    _, empty = problem.empty
+    total = jnp.where(empty, 0, potentials.column).sum(axis=-1, keepdims=True)
+    shift = total / jnp.maximum((~empty).sum(axis=-1, keepdims=True), 1)
+    return problem.masked(Potentials(potentials.row + shift, potentials.column - shift))

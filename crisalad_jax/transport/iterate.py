@@ -8,7 +8,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.transport.accelerate import Memory, accelerate, empty_memory
 from crisalad_jax.transport.config import SinkhornConfig, Solution
-from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem
+from crisalad_jax.transport.problem import (
+    Potentials,
+    Problem,
+    ScalingProblem,
+    zero_potentials,
+)
 
 UNROLLED = 8
 """Largest number of iterations that are unrolled for the compiler; more are a scan."""
@@ -52,8 +57,8 @@ def iterate(
         5
     """
     step, tolerance = config.step, config.tolerance
-    start = problem.zeros() if init is None else init
-    none = problem.zeros().row[..., 0]
+    start = problem.zeros() if init is None else problem.masked(init)
+    none = zero_potentials(problem.kernel).row[..., 0]
     progress = _Progress(
         potentials=start,
         state=step.init(problem, params),
@@ -66,8 +71,12 @@ def iterate(
     def advance(at: _Progress) -> _Progress:
         old = at.potentials if at.memory is None else at.memory.start
         new, state = step.step(problem, old, at.state, at.count)
+        new = problem.masked(new)
         error = step.error(problem, new, old)
-        memory = None if at.memory is None else accelerate(at.memory, new, at.count)
+        memory = None
+        if at.memory is not None:
+            memory = accelerate(at.memory, new, at.count)
+            memory = memory._replace(start=problem.masked(memory.start))
         active = jnp.ones_like(none, bool) if tolerance is None else at.error > tolerance
         if tolerance is not None:
             new = jax.tree.map(lambda a, b: jnp.where(active[..., None], a, b), new, at.potentials)
@@ -77,7 +86,9 @@ def iterate(
     if tolerance is not None:
 
         def unfinished(at: _Progress) -> Bool[Array, ""]:
-            return ((at.error > tolerance) & (at.iterations < config.iterations)).any()
+            active = (at.error > tolerance) & (at.iterations < config.iterations)
+            # Out of its range the scaling domain is not waited for: the log domain solves again.
+            return active.any() & (not isinstance(problem, ScalingProblem) or problem.in_range)
 
         progress = jax.lax.while_loop(unfinished, advance, progress)
     elif isinstance(problem, ScalingProblem) and config.iterations <= UNROLLED:

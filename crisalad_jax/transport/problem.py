@@ -16,6 +16,9 @@ SCALING_RANGE = 60
 Within it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
 exp(-87), is no part of such a sum's last place."""
 
+NO_MASS = -1e5
+"""Logarithm below which a mass is 0: no format of floats holds exp(-1e5)."""
+
 
 class Potentials(NamedTuple):
     """Dual variables over epsilon: the plan is exp(kernel + row + column)."""
@@ -34,8 +37,8 @@ class Problem:
     Attributes:
         clusters: all columns but the last of the scores over epsilon.
         last: the last column.
-        log_mu: logarithms of the rows' masses.
-        log_nu: logarithms of the columns' masses.
+        log_mu: logarithms of the rows' masses; `floor` for a mass of 0.
+        log_nu: logarithms of the columns' masses, alike.
         row_tau: 1 where rows meet their marginals exactly; below 1 a Kullback-Leibler penalty of
             weight epsilon * tau / (1 - tau) draws them there (Chizat et al., Math. Comp. 2018).
         column_tau: the same for columns.
@@ -62,7 +65,11 @@ class Problem:
         row_tau: float = 1.0,
         column_tau: float = 1.0,
     ) -> "Problem":
-        """Make a problem of the scores over epsilon and the logarithms of the masses."""
+        """Make a problem of the scores over epsilon and the logarithms of the masses.
+
+        A mass of 0 has the logarithm -inf, or any below -1e5.
+        """
+        log_mu, log_nu = (jnp.where(x < NO_MASS, floor(x.dtype), x) for x in (log_mu, log_nu))
         # Split, not two slices: their gradients would be two zero-padded matrices to add up.
         clusters, last = jax.lax.split(kernel, (kernel.shape[-1] - 1, 1), axis=kernel.ndim - 1)
         return Problem(clusters, last[..., 0], log_mu, log_nu, row_tau, column_tau)
@@ -76,6 +83,27 @@ class Problem:
     def balanced(self) -> bool:
         """Whether both sides meet their marginals exactly at convergence."""
         return self.row_tau == self.column_tau == 1
+
+    @property
+    def empty(self) -> tuple[Bool[Array, "*batch rows"], Bool[Array, "*batch columns"]]:
+        """Which rows and which columns have no mass; all of them where one side has none."""
+        rows, columns = self.log_mu < NO_MASS, self.log_nu < NO_MASS
+        return (
+            rows | columns.all(axis=-1, keepdims=True),
+            columns | rows.all(axis=-1, keepdims=True),
+        )
+
+    def masked(self, potentials: Potentials, value: float | None = None) -> Potentials:
+        """Set the potentials of rows and columns without mass.
+
+        Args:
+            potentials: of all rows and columns.
+            value: what to set; by default `floor`, with which they are in no sum and no plan.
+        """
+        if value is None:
+            value = floor(self.log_mu.dtype)
+        pairs = zip(self.empty, potentials, strict=True)
+        return Potentials(*(jnp.where(empty, value, x) for empty, x in pairs))
 
     def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
         """Return the logarithm of each row's sum of exp(kernel + column)."""
@@ -92,8 +120,8 @@ class Problem:
         return _joined(clusters, self.last + row + column[..., -1:])
 
     def zeros(self) -> Potentials:
-        """Return zero potentials."""
-        return zero_potentials(self.kernel)
+        """Return zero potentials, but `floor` where there is no mass."""
+        return self.masked(zero_potentials(self.kernel))
 
 
 @pytree_dataclass
@@ -146,6 +174,16 @@ class ScalingProblem(Problem):
 
 # HIGHEST: with the tensor cores' default of 10 bits the iteration does not converge.
 product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+
+
+def floor(dtype: jnp.dtype) -> float:
+    """Return the logarithm that stands for a mass of 0, and the potential of such a row or column.
+
+    It is finite, so that differences and gradients are; and so low that numbers of the size of
+    potentials vanish beside it: the floor plus a potential is the floor.
+    """
+    # An eighth: a plan adds two of them, and a step may add more.
+    return float(jnp.finfo(dtype).min) / 8
 
 
 def zero_potentials(kernel: Float[Array, "*batch rows columns"]) -> Potentials:

@@ -15,6 +15,7 @@ from crisalad_jax.transport.diagnose import (
     check_inputs,
     check_solution,
     check_step,
+    equal_totals,
     marginal_error,
     wide_dtype,
 )
@@ -29,9 +30,13 @@ class SinkhornResult(NamedTuple):
 
     log_plan: Float[Array, "*batch rows columns"]
     potentials: Potentials
-    """Potentials, in balanced transport unique up to a constant: the columns' mean is 0."""
+    """Potentials, in balanced transport unique up to a constant: the columns' mean is 0.
+
+    Pass them as `init` to start the next solve. Rows and columns of mass 0 have very low ones,
+    which are in no mean."""
     row_error: Float[Array, "*batch"]
-    """Largest difference between a row's mass and its marginal, relative to the marginal."""
+    """Largest difference between a row's mass and its marginal, relative to the marginal; a row of
+    marginal 0 has none."""
     column_error: Float[Array, "*batch"]
     """Largest relative error of a column's mass. Rows are updated last, so iterations lower it."""
     iterations: Int[Array, "*batch"]
@@ -64,20 +69,26 @@ def solve(
     float32. For finite scores the result is finite and does not depend on the domain: scores too
     far apart for the scaling domain are solved again in the log domain.
 
+    Rows and columns may have a mass of 0. Their entries of the plan and their gradients are then 0,
+    and the rest is the problem without them. The logarithm of such an entry is finite, and so low
+    that its exponential is 0.
+
     Every gradient but "optimistix" works in forward and reverse mode, and has higher derivatives.
     Under `vmap` every problem is solved in both domains: put a batch in the leading axes instead.
 
     Args:
         scores: finite; the gain of moving mass from a row to a column.
-        log_mu: logarithms of the rows' masses.
+        log_mu: logarithms of the rows' masses; -inf, or any below -1e5, for a mass of 0.
         log_nu: logarithms of the columns' masses; where the step is `entropic` and neither
-            tau below 1 they sum to the same.
+            tau below 1 they sum to the same. Totals of half-precision masses may differ by their
+            rounding: the coarser side takes the other's total, of two alike the columns.
         epsilon: entropic regularisation, above 0. It may be traced or learnt.
         row_tau: 1 for rows that meet their marginals; below 1 a Kullback-Leibler penalty of
             epsilon * row_tau / (1 - row_tau) draws them there. Static.
         column_tau: the same for columns. Static.
         config: step, stopping and gradient. Static.
-        init: potentials to start from, such as an earlier result's; by default zeros.
+        init: potentials to start from, such as an earlier result's; by default zeros. Those of
+            rows and columns of mass 0 are not used.
         step_params: learnt parameters of the step (`Step.init_params`).
         solver: an optimistix solver, where the gradient is "optimistix".
 
@@ -87,10 +98,10 @@ def solve(
     Raises:
         InputError: shapes that do not fit, numbers that are not real, a tau out of range, a solver
             without its gradient, a step that returns anything but such potentials; and where values
-            are known (outside of `jit` and `grad`): scores that are not finite, masses that sum to
-            different totals, an epsilon of 0 or less or too small; or `config.throw`, and a
-            tolerance that was not met. Inside of `jit` the last is a RuntimeError of the compiled
-            program, and only if it uses a value of the result.
+            are known (outside of `jit` and `grad`): scores that are not finite, masses that are NaN
+            or infinite or all 0, masses that sum to different totals, an epsilon of 0 or less or
+            too small; or `config.throw`, and a tolerance that was not met. Inside of `jit` the last
+            is a RuntimeError of the compiled program, and only if it uses a value of the result.
 
     Example:
         >>> import jax.numpy as jnp
@@ -106,7 +117,7 @@ def solve(
     equal = row_tau == column_tau == 1 and config.step.entropic
     check_inputs(scores, log_mu, log_nu, epsilon, equal_totals=equal)
     if init is not None:
-        init = check_init(init, scores)
+        init = check_init(init, scores, log_mu, log_nu)
     if solver is not None and not config.gradient.takes_solver:
         raise InputError(
             f"sinkhorn: found a solver beside gradient {config.gradient.part_name!r}, expected one "
@@ -133,18 +144,20 @@ def _solve(
     wide = wide_dtype(scores)
     kernel = scores.astype(wide) / jnp.asarray(epsilon, wide)
     zeros = zero_potentials(kernel)
+    if row_tau == column_tau == 1 and config.step.entropic:
+        log_mu, log_nu = equal_totals(log_mu, log_nu, wide)
     # Broadcast by the kernel, they vary over devices as it does.
     log_mu, log_nu = log_mu.astype(wide) + zeros.row, log_nu.astype(wide) + zeros.column
     problem = Problem.of(kernel, log_mu, log_nu, row_tau, column_tau)
     check_step(config, problem, step_params)
     problem = config.step.prepare(problem, step_params)
-    start = zeros
+    start = problem.zeros()
     if init is not None:
         start = Potentials(*(a.astype(wide) + b for a, b in zip(init, zeros, strict=True)))
     options = {} if solver is None else {"solver": solver}
     solution = config.gradient.solve(problem, config, step_params, start, **options)
     check_solution(solution, config, problem)
-    potentials, step = solution.potentials, config.step
+    potentials, step = problem.masked(solution.potentials), config.step
     log_plan = step.log_plan(problem, potentials)
     errors = marginal_error(log_plan, problem.log_mu, problem.log_nu)
     finite = jnp.isfinite(potentials.row).all(axis=-1) & jnp.isfinite(potentials.column).all(
@@ -156,7 +169,7 @@ def _solve(
         most = math.expm1(config.tolerance) + 16 * jnp.finfo(wide).eps
         converged &= jnp.maximum(*errors) <= most
     if problem.balanced and step.entropic:
-        potentials = centred(potentials)
+        potentials = centred(problem, potentials)
     return SinkhornResult(log_plan, potentials, *errors, solution.iterations, converged, finite)
 
 

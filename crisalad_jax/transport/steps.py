@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.parts import Part, Registry, count_arguments
-from crisalad_jax.transport.problem import Potentials, Problem, product
+from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem, product
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,23 +155,40 @@ class SinkhornStep(Step):
         return Potentials(row, potentials.column)
 
 
+LONGEST = (8.0, 2.0, 0.5)
+"""Largest changes of a potential that Newton's step tries, in multiples of the temperature."""
+COOLING = 1.5
+"""Factor between temperatures of Newton's step."""
+FAR = 3.0
+"""Largest error of a column's logarithmic mass at the temperature that Newton's step starts at."""
+HOTTEST = 1e12
+"""Where the search for a temperature ends, for scores that are not finite."""
+
+
 @STEPS.register("newton")
 @dataclasses.dataclass(frozen=True)
 class NewtonStep(Step):
     """Newton's method on the semi-dual, a concave function of the column potentials alone.
 
     The rows' marginals are always met (Brauer et al., 2017), and the Hessian is a weighted graph
-    Laplacian between columns. Candidates are full and shortened Newton steps and Sinkhorn's step.
-    The one with the smallest relative marginal error is taken, so that the error never grows.
+    Laplacian between columns. Of Newton's change of the potentials, clipped to several lengths, and
+    Sinkhorn's the one with the largest semi-dual is taken, which therefore never falls.
+
+    Where scores are too sharp to begin with, epsilon is first a multiple of the problem's, the
+    temperature, which falls to 1 as the errors do. It is the state; 0 says that it is to be found.
     Problems must be balanced.
     """
 
     entropic: ClassVar[bool] = True
 
+    def init(self, problem: Problem, params: Any) -> Float[Array, "*batch"]:
+        """Return no temperature: the first step finds it, for the potentials that it is given."""
+        return 0 * problem.log_mu[..., 0]
+
     def step(
         self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
     ) -> tuple[Potentials, Any]:
-        """Take the best of five steps.
+        """Take the best of four steps at the state's temperature.
 
         Raises:
             InputError: the problem's marginals are relaxed.
@@ -180,25 +198,41 @@ class NewtonStep(Step):
             f"step newton: found row_tau {problem.row_tau} and column_tau {problem.column_tau}, "
             "expected 1: it is for balanced problems",
         )
-        column = potentials.column
-        row = problem.log_mu - problem.over_columns(column)
-        log_plan = problem.log_plan(Potentials(row, column))
-        over_rows = problem.over_rows(row)
-        gradient = jnp.exp(problem.log_nu) - jnp.exp(over_rows + column)
+        temperature = jax.lax.stop_gradient(state)
+        temperature = jnp.where(
+            temperature > 0, temperature, _temperature(problem, potentials.column, temperature)
+        )
+        tempered, column = _tempered(problem, potentials.column, temperature)
+        row = problem.log_mu - tempered.over_columns(column)
+        log_plan = tempered.log_plan(Potentials(row, column))
+        log_masses = tempered.over_rows(row) + column
+        gradient = jnp.exp(problem.log_nu) - jnp.exp(log_masses)
         shares = jnp.exp(log_plan - problem.log_mu[..., None])
-        change = solve_columns(jnp.exp(log_plan), shares, gradient, 1.0, 1.0)
-        lengths = jnp.array([1.0, 0.5, 0.25, 0.0625], change.dtype)
-        tries = column + lengths.reshape(-1, *[1] * change.ndim) * change
-        tries = jnp.concatenate([tries, (problem.log_nu - over_rows)[None]])
-
-        def left(column: Array) -> Array:
-            row = problem.log_mu - problem.over_columns(column)
-            return column_error(problem, Potentials(row, column))
-
-        errors = jax.lax.map(left, tries)
-        best = jnp.argmin(jnp.where(jnp.isnan(errors), jnp.inf, errors), axis=0)
-        column = jnp.take_along_axis(tries, best[None, ..., None], axis=0)[0]
-        return Potentials(problem.log_mu - problem.over_columns(column), column), state
+        newton = solve_columns(jnp.exp(log_plan), shares, gradient, 1.0, 1.0)
+        # A constant changes no plan. The median's, for a few columns may have very far to go.
+        newton = newton - jnp.median(newton, axis=-1, keepdims=True)
+        sinkhorn = jnp.clip(problem.log_nu - log_masses, -LONGEST[0], LONGEST[0])
+        # Entry by entry, so that those columns do not hold up the others.
+        clipped = [jnp.clip(newton, -most, most) for most in LONGEST]
+        tries = jnp.stack([*clipped, sinkhorn], axis=-1)
+        weights = jax.nn.softmax(problem.log_nu)[..., None]
+        tries = tries - (weights * tries).sum(axis=-2, keepdims=True)
+        # The semi-dual's gain, from the plan at hand: no new exponentials of matrices.
+        mixed = product("...nk,...kt->...nt", shares, jnp.expm1(tries))
+        least = math.expm1(-2 * LONGEST[0])  # but for rounding
+        gains = product("...k,...kt->...t", jnp.exp(problem.log_nu), tries) - product(
+            "...n,...nt->...t", jnp.exp(problem.log_mu), jnp.log1p(jnp.maximum(mixed, least))
+        )
+        best = jnp.argmax(jnp.where(jnp.isnan(gains), -jnp.inf, gains), axis=-1)
+        change = jnp.take_along_axis(tries, best[..., None, None], axis=-1)[..., 0]
+        column = potentials.column + temperature[..., None] * change
+        error = jnp.abs(log_masses - problem.log_nu).max(axis=-1)
+        short = jnp.abs(newton).max(axis=-1) <= LONGEST[1]
+        # Errors hardly fall by themselves later, when columns share no rows any more.
+        near = (error <= 0.03) | ((error <= 1) & short)
+        lower = jnp.maximum(temperature / COOLING, 1)
+        row = problem.log_mu - problem.over_columns(column)
+        return Potentials(row, column), jnp.where(near, lower, temperature)
 
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
         """Return the remaining marginal error: far from the solution a step may be small."""
@@ -237,6 +271,39 @@ class DualSoftmaxStep(Step):
         return problem.kernel + problem.log_plan(potentials)
 
 
+def _temperature(problem: Problem, column: Array, like: Array) -> Array:
+    """Return the least temperature, of powers of `COOLING`, that leaves errors of `FAR` at most."""
+    problem, column = jax.lax.stop_gradient((problem, column))
+
+    def too_far(temperature: Array) -> Array:
+        tempered, scaled = _tempered(problem, column, temperature)
+        row = problem.log_mu - tempered.over_columns(scaled)
+        return (column_error(tempered, Potentials(row, scaled)) > FAR) & (temperature < HOTTEST)
+
+    def hotter(temperature: Array) -> Array:
+        return jnp.where(too_far(temperature), COOLING * temperature, temperature)
+
+    return jax.lax.while_loop(lambda at: too_far(at).any(), hotter, jnp.ones_like(like))
+
+
+def _tempered(problem: Problem, column: Array, temperature: Array) -> tuple[Problem, Array]:
+    """Return the problem at a multiple of its epsilon, and columns' potentials for it.
+
+    Potentials are measured from the columns' masses: in the limit of an infinite temperature the
+    plan is the product of the marginals, which meets them.
+    """
+    by = temperature[..., None]
+    tempered = Problem(
+        problem.clusters / by[..., None],
+        problem.last / by,
+        problem.log_mu,
+        problem.log_nu,
+    )
+    if isinstance(problem, ScalingProblem):
+        tempered = ScalingProblem.scaled(tempered)
+    return tempered, problem.log_nu + (column - problem.log_nu) / by
+
+
 def column_error(problem: Problem, potentials: Potentials) -> Float[Array, "*batch"]:
     """Return the largest difference of the logarithms of a column's mass and of its marginal."""
     masses = problem.over_rows(potentials.row) + potentials.column
@@ -253,7 +320,8 @@ def solve_columns(
     """Solve the columns' part of the linearised optimality conditions.
 
     The matrix is diag(masses / column_tau) - row_tau * shares^T plan. It is written as a Laplacian,
-    which avoids cancellation. Where both sides are balanced the last column's unknown is 0.
+    which avoids cancellation. Where both sides are balanced the heaviest column's unknown is
+    0: one without mass could not carry the others.
 
     Args:
         plan: masses.
@@ -270,6 +338,7 @@ def solve_columns(
     slack = 1 / column_tau - row_tau + 8 * jnp.finfo(plan.dtype).eps
     diagonal = weights.sum(axis=-1) + masses * slack
     if row_tau == column_tau == 1:
-        diagonal = diagonal.at[..., -1].add(masses[..., -1])
+        heaviest = jnp.arange(masses.shape[-1]) == masses.argmax(axis=-1, keepdims=True)
+        diagonal += jnp.where(heaviest, masses, 0)
     factor = jax.scipy.linalg.cho_factor(diagonal[..., None] * identity - weights)
     return jax.scipy.linalg.cho_solve(factor, target[..., None])[..., 0]

@@ -190,7 +190,8 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
     [
         (jnp.nan, MU, NU, 1.0, "scores found with NaN or infinity"),
         (jnp.inf, MU, NU, 1.0, "scores found with NaN or infinity"),
-        (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "log_mu found with NaN or infinity"),
+        (0.0, MU.at[1].set(jnp.inf), NU, 1.0, "log_mu found with NaN or infinity"),
+        (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
         (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN or infinity"),
         (0.0, MU, NU, 0.0, "epsilon found 0.0, expected more than 0"),
         (0.0, MU, NU, -1.0, "epsilon found -1.0, expected more than 0"),
@@ -225,6 +226,75 @@ def test_totals_of_a_step_of_another_problem_need_not_agree() -> None:
 def test_totals_need_not_agree_to_the_last_digits() -> None:
     """Sums of logarithms in float32 do not."""
     assert solve(jnp.zeros((6, 3)), MU, NU + 1e-5).finite
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+@pytest.mark.parametrize("scores_dtype", [None, jnp.float32], ids=["half", "float32"])
+@pytest.mark.parametrize("coarse", ["both", "rows", "columns"])
+def test_half_precision_marginals_have_the_totals_of_their_rounding(
+    coarse: str, scores_dtype: Any, dtype: Any
+) -> None:
+    """Masses of 256 rows and 65 columns, whose totals differ by up to half a hundredth as given.
+
+    The coarser side takes the other's total, of two of one type the columns take the rows'.
+    """
+    generator = np.random.default_rng(0)
+    # One heavy mass a side, whose rounding no others' makes up for.
+    mu, nu = (np.append(generator.uniform(0.5, 2, size), 150.0) for size in (255, 64))
+    nu *= mu.sum() / nu.sum()
+    rounded = {"rows": coarse != "columns", "columns": coarse != "rows"}
+    log_mu, log_nu = (
+        jnp.log(jnp.asarray(x, jnp.float32)).astype(dtype if rounded[side] else jnp.float32)
+        for side, x in (("rows", mu), ("columns", nu))
+    )
+    given = [np.exp(np.asarray(x.astype(jnp.float32), np.float64)) for x in (log_mu, log_nu)]
+    totals = [x.sum() for x in given]
+    assert abs(totals[0] / totals[1] - 1) > 2e-5
+    scores = jax.random.normal(jax.random.key(0), (256, 65)).astype(scores_dtype or dtype)
+    config = implicit(iterations=300)
+    for call in (solve, jax.jit(solve, static_argnames="config")):
+        result = call(scores, log_mu, log_nu, config=config)
+        assert result.converged
+        plan = np.exp(np.asarray(result.log_plan, np.float64))
+        total = totals[1] if coarse == "rows" else totals[0]
+        # The tolerance of 1e-5, and as much rounding of sums in float32.
+        np.testing.assert_allclose(plan.sum(axis=1), given[0] * total / totals[0], rtol=3e-5)
+        np.testing.assert_allclose(plan.sum(axis=0), given[1] * total / totals[1], rtol=3e-5)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+def test_salads_marginals_in_half_precision(dtype: Any) -> None:
+    """The logarithm of the dustbin's 192 is rounded by a hundredth; published iterations meet it.
+
+    What is more than rounding is refused, and under jit left as it is and told.
+    """
+    log_mu, log_nu = log_marginals(256, 64, dtype=dtype)
+    scores = jax.random.normal(jax.random.key(0), (256, 64)).astype(dtype)
+    full = append_dustbin(scores, 1.0)
+    result = solve(full, log_mu, log_nu, config=SinkhornConfig(iterations=20))
+    # float32 at convergence: nothing is left of the difference of the totals.
+    assert result.column_error < 1e-5
+    exact = solve(full, *log_marginals(256, 64), config=SinkhornConfig(iterations=20))
+    # Of the dustbin's mass: half a unit in the last place of its logarithm of 5.26, times the
+    # share of all mass that it has not.
+    rounding = 4 * float(jnp.finfo(dtype).eps) / 2
+    np.testing.assert_allclose(
+        jnp.exp(result.log_plan)[:, -1].sum(), jnp.exp(exact.log_plan)[:, -1].sum(), rtol=rounding
+    )
+    off = log_nu.at[-1].add(0.5)
+    with pytest.raises(InputError, match="expected the same"):
+        solve(full, log_mu, off)
+    told = jax.jit(lambda x: solve(full, log_mu, x, config=implicit()))(off)
+    assert not told.converged
+    assert told.column_error > 0.1
+
+
+@pytest.mark.usefixtures("_unchecked")
+def test_whole_numbers_are_logarithms_too() -> None:
+    """Which have no rounding."""
+    zeros = jnp.zeros(4, jnp.int32)
+    plan = jnp.exp(solve(jnp.zeros((4, 4)), zeros, zeros).log_plan)
+    np.testing.assert_allclose(plan, 0.25, rtol=1e-6)  # quotients of exponentials
 
 
 def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
