@@ -283,9 +283,11 @@ def _read_h5(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]:
     names: list[str] = []
     rows: list[np.ndarray] = []
 
-    def take(name: str, item: object) -> None:
+    def take(name: str) -> None:
         group, _, last = name.rpartition("/")
-        if last != "global_descriptor" or not isinstance(item, h5py.Dataset):
+        # Other groups are not opened: of a chain of them that takes the square of its length.
+        item = file[name] if last == "global_descriptor" else None
+        if not isinstance(item, h5py.Dataset):
             return
         if item.ndim != 1 or item.dtype.kind != "f" or (rows and item.shape != rows[0].shape):
             raise InputError(
@@ -304,7 +306,7 @@ def _read_h5(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]:
 
     try:
         with h5py.File(path) as file:
-            file.visititems(take)
+            file.visit(take)
     except InputError:
         raise
     except Exception as error:  # damaged files end in errors of many kinds

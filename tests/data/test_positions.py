@@ -57,7 +57,7 @@ def test_a_table_that_is_none_is_one_line(tmp_path, text, words):
 
 
 def test_a_table_that_cannot_be_read_is_one_line(tmp_path):
-    with pytest.raises(InputError, match=r"none\.csv: cannot read these positions: No such file"):
+    with pytest.raises(InputError, match=r"none\.csv: found no such file"):
         read_positions(tmp_path / "none.csv")
     (tmp_path / "bytes.csv").write_bytes(b"name,east,north\n\xff,1,2\n")
     with pytest.raises(InputError, match=r"bytes\.csv: cannot read these positions: 'utf-8'"):

@@ -34,7 +34,7 @@ from crisalad_jax.experiments.comparison.plan import (
     Variant,
     file_name,
 )
-from crisalad_jax.experiments.comparison.records import advised, read_result
+from crisalad_jax.experiments.comparison.records import advised, is_number, read_result
 from crisalad_jax.experiments.comparison.timing import Race, describing, is_absolute, machine, race
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
@@ -331,7 +331,24 @@ def _describing(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Call
     return describing(params, variant.model, prepared.config.batch_size)
 
 
-def read_race(out: pathlib.Path) -> tuple[Race, dict[str, Any]]:
-    """Read the times that `carry_out` measured, and the rest of their record."""
-    record = read_result(out / "speed.json", rounds=dict, device=str, absolute=bool, batch_size=int)
-    return Race(record["rounds"]), record
+def read_race(out: pathlib.Path, names: set[str]) -> tuple[Race, dict[str, Any]]:
+    """Read the times that `carry_out` measured of these models, and the rest of their record.
+
+    Raises:
+        InputError: what `read_result` raises, or there are no times of one of them.
+    """
+    path = out / "speed.json"
+    record = read_result(path, rounds=dict, device=str, absolute=bool, batch_size=int)
+    rounds = record["rounds"]
+    right = rounds.keys() >= names and all(map(_are_times, rounds.values()))
+    with advised():
+        if not right or len({len(times) for times in rounds.values()}) > 1:
+            raise InputError(
+                f"{path}: rounds: found other than as many seconds of each model, expected those "
+                f"of {', '.join(sorted(names))}"
+            )
+    return Race(rounds), record
+
+
+def _are_times(value: Any) -> bool:
+    return isinstance(value, list) and value != [] and all(is_number(v) and v for v in value)

@@ -13,7 +13,7 @@ from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY
 from crisalad_jax.experiments.comparison.ablation import NOTES, AdapterCost
 from crisalad_jax.experiments.comparison.plan import Prepared, Variant, labels_of, short_names
-from crisalad_jax.experiments.comparison.records import read_result
+from crisalad_jax.experiments.comparison.records import advised, read_result
 from crisalad_jax.experiments.comparison.runner import folder_of, read_race, result_path
 from crisalad_jax.experiments.comparison.timing import Race
 from crisalad_jax.nn.costs import part_costs
@@ -84,7 +84,7 @@ def summarise(
         InputError: a result is missing, not whole, or of another set.
     """
     sets = dict(zip(short_names(prepared.benchmarks), prepared.benchmarks, strict=True))
-    raced, measured = read_race(out)
+    raced, measured = read_race(out, {variant.run for variant in prepared.variants})
     names = [variant.name for variant in prepared.variants]
     reference = prepared.variants["crisalad" in names and names.index("crisalad")]
     records = {v.name: _training_records(prepared, out, v) for v in prepared.variants}
@@ -172,6 +172,12 @@ def _recalls(
             result_path(out, variant, seed, number) for seed in variant.seeds(prepared.config.seeds)
         ]
         results = [_checked(path, benchmark) for path in paths]
+        for path, result in zip(paths, results, strict=True):
+            if result.keys() != results[0].keys():
+                raise InputError(
+                    f"{path}: found groupings {', '.join(result)}, expected "
+                    f"{', '.join(results[0])} as of seed 0"
+                )
         for grouping in results[0]:
             ranks = np.array([result[grouping] for result in results])
             recalls = {k: recall_of(ranks, k) for k in KS}
@@ -188,6 +194,16 @@ def _checked(path: pathlib.Path, benchmark: Benchmark) -> dict[str, list[int]]:
             f"{result['database']} database images, expected {expected[0]} with {expected[1]} and "
             f"{expected[2]}; delete it, and the same command makes it anew"
         )
+    with advised():
+        for grouping, ranks in result["groupings"].items():
+            right = isinstance(ranks, list) and len(ranks) == result["queries"]
+            if not right or not all(type(rank) is int and rank >= 0 for rank in ranks):
+                raise InputError(
+                    f"{path}: groupings: found other than a rank from 0 of each query under "
+                    f"{grouping}, expected {result['queries']} of them"
+                )
+        if not result["groupings"]:
+            raise InputError(f"{path}: groupings: found none, expected at least one")
     return result["groupings"]
 
 

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.data.images import list_images
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.build import describe_alone
+from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.errors import InputError
@@ -111,6 +112,10 @@ def query(
     batch_size = useful_batch_size(batch_size, len(paths))
     places.check_params(params)
     config = places.description.config
+    try:
+        check_params(params, config)
+    except InputError as error:
+        raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
     parts: list[Neighbours] = []
     waiting: list[np.ndarray] = []
     described = 0
