@@ -225,9 +225,15 @@ _OUT_OF_MEMORY = (
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Return whether the system or a device had no memory left: XLA and OpenCV say it in words."""
-    words = str(error)
-    return any(each in words for each in ("RESOURCE_EXHAUSTED", "Insufficient memory", "bad_alloc"))
+    """Return whether the system or a device had no memory left: libraries say it in words."""
+    return any(words in str(error) for words in _WORDS_OF_MEMORY)
+
+
+_WORDS_OF_MEMORY = (
+    *("RESOURCE_EXHAUSTED", "Insufficient memory", "bad_alloc", "Cannot allocate memory"),
+    *("failed to map segment", "can't start new thread", "Unable to allocate"),
+)
+"""What XLA, OpenCV, C++, the system, its linker, Python's threads and numpy say."""
 
 
 def _tell_of_plugin(error: BaseException) -> int | None:

@@ -45,12 +45,13 @@ def join_processes(coordinator: str, count: int | None, index: int | None) -> No
         count is None
         or index is None
         or not 0 <= index < count
-        or not re.fullmatch(r".+:\d+", coordinator)
+        or not re.fullmatch(r".+:\d{1,5}", coordinator)
+        or not 0 < int(coordinator.rpartition(":")[2]) < 2**16
     ):
         raise InputError(
             f"processes: found process {index} of {count} with {coordinator}, expected "
-            "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, from 0 and "
-            "below the count"
+            "--coordinator-address HOST:PORT (1 to 65535) --num-processes COUNT --process-id INDEX, "
+            "from 0 and below the count"
         )
     else:
         given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
@@ -79,10 +80,10 @@ def _check_port(address: str) -> None:
         with socket.socket(socket.AF_INET) as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(("", port))
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         raise InputError(
             f"--coordinator-address: found port {port}, which cannot be listened at "
-            f"({getattr(error, 'strerror', None) or error}), expected a free one"
+            f"({error.strerror}), expected a free one"
         ) from error
 
 
