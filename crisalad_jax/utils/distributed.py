@@ -50,8 +50,8 @@ def join_processes(coordinator: str, count: int | None, index: int | None) -> No
     ):
         raise InputError(
             f"processes: found process {index} of {count} with {coordinator}, expected "
-            "--coordinator-address HOST:PORT (1 to 65535) --num-processes COUNT --process-id INDEX, "
-            "from 0 and below the count"
+            "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, with a port "
+            "of 1 to 65535, and an index from 0 and below the count"
         )
     else:
         given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
@@ -74,16 +74,17 @@ def _check_port(address: str) -> None:
     Raises:
         InputError: it cannot.
     """
-    port = int(address.rpartition(":")[2])
+    host, _, port = address.rpartition(":")
     try:
+        socket.getaddrinfo(host.strip("[]"), None)  # JAX would wait for minutes for no such host
         # JAX listens at this port of all interfaces.
         with socket.socket(socket.AF_INET) as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(("", port))
-    except OSError as error:
+            listener.bind(("", int(port)))
+    except (OSError, UnicodeError) as error:
         raise InputError(
-            f"--coordinator-address: found port {port}, which cannot be listened at "
-            f"({error.strerror}), expected a free one"
+            f"--coordinator-address: found {address}, which cannot be listened at "
+            f"({getattr(error, 'strerror', None) or error}), expected this host and a free port"
         ) from error
 
 
