@@ -140,7 +140,7 @@ def _reduction(data: bytes, enough: tuple[int, int] | None) -> int:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Return whether a PNG's chunks reach IEND with right checksums; later bytes do not matter.
+    """Return whether a PNG has a size, and chunks up to IEND with right checksums.
 
     Chunks whose name begins with a small letter are not needed for the pixels.
     """
@@ -153,7 +153,7 @@ def _png_is_whole(data: bytes) -> bool:
             return False
         position = end + 4
         if kind == b"IEND":
-            return True
+            return bytes(4) not in (data[16:20], data[20:24])
     return False
 
 

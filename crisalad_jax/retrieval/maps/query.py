@@ -140,7 +140,10 @@ def _listed(images: Any) -> list[pathlib.Path]:
 
 
 def json_lines(answers: Answers) -> Iterator[str]:
-    """Yield a line of JSON for each query: its name, and its answers' names and positions."""
+    """Yield a line of JSON for each query: its name, and its answers' names and positions.
+
+    Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
+    """
     for path, ranked in answers.rows():
         neighbours = [
             {
@@ -152,7 +155,8 @@ def json_lines(answers: Answers) -> Iterator[str]:
             for answer in ranked
         ]
         line = {"query": path.as_posix(), "neighbours": neighbours}
-        yield json.dumps(line, ensure_ascii=False)
+        text = json.dumps(line, ensure_ascii=False)
+        yield text if text.isprintable() else json.dumps(line)
 
 
 def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
@@ -167,7 +171,6 @@ def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
     """
     with (
         atomic_path(path) as temporary,
-        # Bytes of names that are no UTF-8 become escapes, as JSON has them.
-        temporary.open("w", encoding="utf-8", errors="backslashreplace") as file,
+        temporary.open("w", encoding="utf-8") as file,
     ):
         file.writelines(f"{line}\n" for line in json_lines(answers))
