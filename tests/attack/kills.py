@@ -744,6 +744,9 @@ def carry_out(attacks: Mapping[str, Callable[[Bench, float], list[Row]]], descri
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", choices=attacks, default=list(attacks))
     given = parser.parse_args()
+    for number in (signal.SIGINT, signal.SIGHUP):  # ignored under nohup and in the background
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     failures = []
     with tempfile.TemporaryDirectory() as temporary:
         bench = open_bench(pathlib.Path(temporary), given.seed)
