@@ -8,6 +8,7 @@ from rich.text import Text
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.training.summary import ModelSummary
+from crisalad_jax.utils.output import printable
 
 
 def grouping_table(results: Sequence[GroupingResult]) -> Table:
@@ -53,7 +54,7 @@ def _spread(fraction: float | None) -> str:
 def summary_table(summary: ModelSummary, name: str) -> Table:
     """Make a table of a model's parts for the terminal; `name` is the model's."""
     height, width = summary.image_size
-    table = Table("part", title=f"{name} at {height} x {width}")
+    table = Table("part", title=printable(f"{name} at {height} x {width}"))
     table.add_column("parameters", justify="right")
     table.add_column("multiply-accumulates an image", justify="right")
     for cost in summary.parts:
@@ -66,7 +67,7 @@ def summary_table(summary: ModelSummary, name: str) -> Table:
 
 def answers_table(answers: Answers, title: str = "") -> Table:
     """Make a table of answers for the terminal."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=printable(title), title_justify="left")
     table.add_column("query", overflow="fold")
     table.add_column("rank", justify="right")
     table.add_column("name", overflow="fold")
@@ -83,5 +84,5 @@ def answers_table(answers: Answers, title: str = "") -> Table:
                 "-" if position is None else ", ".join(f"{v:.9g}" for v in position.values()),
             )
             # `Text` keeps square brackets in a name from being markup.
-            table.add_row(*map(Text, cells), end_section=answer.rank == len(ranked))
+            table.add_row(*map(Text, map(printable, cells)), end_section=answer.rank == len(ranked))
     return table
