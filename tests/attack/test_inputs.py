@@ -10,7 +10,7 @@ from tests.attack.scripts import rows_of
 @pytest.mark.parametrize(
     ("chosen", "tries"),
     [
-        (("--quick", "--most", 30), 30),
+        (("--quick", "--most", 16), 16),
         pytest.param((), 1600, marks=pytest.mark.slow),
     ],
 )
