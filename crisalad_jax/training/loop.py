@@ -175,6 +175,7 @@ def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar
                 break
             try:
                 note = run.take_step(batch)
+                signals.has_work = True  # before it, XLA compiles the step
             except Exception as raised:  # told to the others before the next step
                 error, note = raised, None
             if note is not None:

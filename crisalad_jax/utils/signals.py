@@ -8,6 +8,7 @@ import contextlib
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from types import FrameType
 from typing import Any
@@ -23,6 +24,9 @@ _SHOW_CURSOR = "\x1b[?25h\n"
 def end_at_signals() -> None:
     """End this process at a signal with one line, its temporary files removed.
 
+    Python runs handlers in the main thread, and not while a library works there: XLA may compile
+    for minutes. A second thread then ends the process.
+
     Nothing is raised. An exception at any moment may be swallowed: inside of an import, of a
     library's callback or of a destructor. Files with a final name are whole at any moment, so that
     the end of the process loses nothing else.
@@ -31,6 +35,10 @@ def end_at_signals() -> None:
         # Ignored signals, as under nohup, stay ignored.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    threading.Thread(target=_end_late, args=(reading,), daemon=True).start()
 
 
 _holding = _waiting = 0
@@ -61,6 +69,33 @@ def _end(number: int, frame: FrameType | None) -> None:
         return
     for each in _SIGNALS:
         signal.signal(each, signal.SIG_IGN)
+    _leave(number)
+
+
+def _end_late(numbers: int) -> None:
+    """End the process at a signal that the main thread has not handled after some time.
+
+    Args:
+        numbers: a pipe that gets the number of each signal.
+    """
+    while data := os.read(numbers, 1):
+        state, number = SignalState.current, data[0]
+        if number in _SIGNALS:
+            is_first = state is not None and state.is_first()
+            if state is not None and is_first and state.has_work:
+                continue  # what the signal waits for
+            time.sleep(_PATIENCE)
+            if state is None or not is_first or not state.number:
+                _leave(number)
+
+
+_PATIENCE = 2.0
+"""Seconds that the main thread has to handle a signal."""
+_leaving = threading.Lock()
+
+
+def _leave(number: int) -> None:
+    _leaving.acquire()  # for ever: one of the threads ends the process
     remove_all_in_use()
     how = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
     with contextlib.suppress(OSError):
@@ -71,10 +106,16 @@ def _end(number: int, frame: FrameType | None) -> None:
 class SignalState:
     """The state of deferred signals: whether a signal has arrived."""
 
+    current: "SignalState | None" = None
+    """The state while signals are deferred, and after one was."""
+
     def __init__(self) -> None:
         """Start without a signal."""
         self.number = 0
         """Number of the last one; 0 for none."""
+        self.has_work = False
+        """Whether there is work that has to be saved."""
+        self._asked = False
         self._at_once = False
         self._before: dict[int, Any] = {}
 
@@ -104,14 +145,22 @@ class SignalState:
         if self._at_once:
             raise Stopped(number)
 
+    def is_first(self) -> bool:
+        """Return whether this is the first call; there is one at each signal."""
+        before, self._asked = self._asked, True
+        return not before
+
     def defer(self) -> None:
         """Handle all signals that are not ignored."""
+        SignalState.current = self
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self.handle)
 
     def restore(self) -> None:
         """Give the signals back to their handlers."""
+        if not self.number:
+            SignalState.current = None
         for number, handler in self._before.items():
             signal.signal(number, handler)
 

@@ -8,6 +8,7 @@ line: such tries are counted apart, and that time is measured.
 """
 
 import functools
+import hashlib
 import os
 import pathlib
 import signal
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tests.attack.kills import (
     Bench,
@@ -81,6 +82,7 @@ class Verb:
         during: Callable[[int], None] | None = None,
         *,
         before: Callable[[], None] = lambda: None,
+        settings: Sequence[tuple[Any, str, Any]] = (),
     ) -> Done:
         """Run it in a fork, with smaller settings where the command has none."""
         import crisalad_jax.experiments.demo
@@ -90,14 +92,15 @@ class Verb:
 
         of_demo = crisalad_jax.experiments.demo.DemoConfig
         small = functools.partial(of_demo, train_places=48, test_places=12, epochs=2)
-        settings = [
+        all_settings = [
+            *settings,
             (crisalad_jax.experiments.demo, "DemoConfig", small),
             (crisalad_jax.retrieval.maps.build, "SEGMENT", 4),
             (crisalad_jax.retrieval.partial, "SEGMENT", 4),
         ]
         out.mkdir(parents=True, exist_ok=True)
         CALLS.clear()
-        work = command(self.arguments(out), CALLS, *settings)
+        work = command(self.arguments(out), CALLS, *all_settings)
 
         def whole_work() -> int:
             before()
@@ -368,6 +371,53 @@ def _ignore(number: int) -> None:
     signal.signal(number, signal.SIG_IGN)
 
 
+def attack_busy(bench: Bench, _: float) -> list[Row]:
+    """Signal commands whose main thread is in a library, as XLA is for minutes when it compiles."""
+    import crisalad_jax.retrieval.extract
+    import crisalad_jax.training.run
+
+    row = Row(
+        "signals while a library works in the main thread",
+        "it ends within 10 s; if training has work to save, at the second signal",
+    )
+    step, busy_from = crisalad_jax.training.run.train_step, [0]
+
+    def busy(*arguments: Any, **options: Any) -> Any:
+        busy_from[0] -= 1
+        if busy_from[0] < 0:
+            CALLS.say("busy")
+            hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
+        return step(*arguments, **options)
+
+    for name, steps, signals in (
+        ("extract .npy", 0, [signal.SIGINT]),
+        ("train", 0, [signal.SIGTERM]),
+        ("train", 3, [signal.SIGINT, signal.SIGINT]),
+        ("train", 3, [signal.SIGTERM, signal.SIGHUP]),
+    ):
+        verb, out = Verb(bench, name), bench.folder / "busy" / f"{row.tries}"
+        last = Moment(CALLS, signals[0], after=0.5, work="busy")
+
+        def send(process: int, last: Moment = last, more: Sequence[int] = signals[1:]) -> None:
+            last(process)
+            for number in more:
+                time.sleep(4)
+                last.sent = time.monotonic()
+                os.kill(process, number)
+
+        busy_from[0] = steps
+        holder = crisalad_jax.training.run if name == "train" else crisalad_jax.retrieval.extract
+        function = "train_step" if name == "train" else "group"
+        done = verb.go(out, send, settings=[(holder, function, busy)])
+        wrong = wrong_end(signals[-1], done.code, done.err, time.monotonic() - last.sent)
+        wrong += left_in(out)
+        done = verb.go(out)
+        wrong += [done.err[-300:]] if done.code else verb.wrong_with(out)
+        row.note(not wrong, f"{name}, {signals}: {wrong}")
+        bench.say(f"busy: {name}, {len(signals)} signals")
+    return [row]
+
+
 def attack_some(bench: Bench, _: float) -> list[Row]:
     """Signal two quick verbs, which need none of the products."""
     return attack_forks(bench, 6, ["extract .npy", "convert"])
@@ -390,6 +440,7 @@ ATTACKS: Mapping[str, Callable[[Bench, float], list[Row]]] = {
     "forks": prepared(lambda bench, scale: attack_forks(bench, part_of(64, scale), QUICK)),
     "programs": prepared(lambda bench, scale: attack_programs(bench, part_of(30, scale))),
     "training": prepared(attack_training),
+    "busy": attack_busy,
     "closed output": prepared(attack_closed_output),
     "long": prepared(
         lambda bench, scale: attack_forks(bench, part_of(8, scale), ["compare", "demo"])

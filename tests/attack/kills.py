@@ -58,7 +58,7 @@ class Marks:
 
     def __init__(self, works: Mapping[str, str]) -> None:
         """Take the functions that are marked, as module:name or module:class.name."""
-        self.names = ["start", *works, "the end"]
+        self.names = ["start", *works, "busy", "the end"]
         self.works = list(works)
         self._paths = works
         self._memory = mmap.mmap(-1, 1 + 4 * len(self.names))
@@ -78,7 +78,7 @@ class Marks:
         return int.from_bytes(self._memory[place : place + 4], "little")
 
     def say(self, name: str) -> None:
-        """Say in the child that it handles signals (start), or has done all (the end)."""
+        """Say in the child that it handles signals (start), is busy, or has done all (the end)."""
         place = 1 + 4 * self.names.index(name)
         self._memory[place : place + 4] = (1).to_bytes(4, "little")
 

@@ -13,7 +13,7 @@ from tests.attack.scripts import rows_of
         ("interruptions", ["some"], 0),
         *(
             pytest.param("interruptions", [name], 1, marks=pytest.mark.slow)
-            for name in ("forks", "programs", "training", "closed output", "long")
+            for name in ("forks", "programs", "training", "busy", "closed output", "long")
         ),
         *(
             pytest.param("memory", [name], 1, marks=pytest.mark.slow)
