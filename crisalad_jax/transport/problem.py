@@ -86,12 +86,8 @@ class Problem:
 
     @property
     def empty(self) -> tuple[Bool[Array, "*batch rows"], Bool[Array, "*batch columns"]]:
-        """Which rows and which columns have no mass; all of them where one side has none."""
-        rows, columns = self.log_mu < NO_MASS, self.log_nu < NO_MASS
-        return (
-            rows | columns.all(axis=-1, keepdims=True),
-            columns | rows.all(axis=-1, keepdims=True),
-        )
+        """Which rows and which columns have no mass."""
+        return self.log_mu < NO_MASS, self.log_nu < NO_MASS
 
     def masked(self, potentials: Potentials, value: float | None = None) -> Potentials:
         """Set the potentials of rows and columns without mass.
@@ -115,7 +111,9 @@ class Problem:
 
     def log_plan(self, potentials: Potentials) -> Float[Array, "*batch rows columns"]:
         """Return the logarithm of the plan that the potentials make."""
-        row, column = potentials
+        # Where one side has no mass at all, the other's potentials must not make up for its floor.
+        most = -floor(self.log_mu.dtype) / 4
+        row, column = (jnp.where((x > most) & (x < jnp.inf), most, x) for x in potentials)
         clusters = self.clusters + row[..., :, None] + column[..., None, :-1]
         return _joined(clusters, self.last + row + column[..., -1:])
 
