@@ -647,7 +647,7 @@ def test_a_registration_without_a_name_is_refused(register: Any, words: str) -> 
 @pytest.mark.parametrize(
     ("kind", "default", "words"),
     [
-        (int, "three", "found 'three', expected int"),
+        (int, "three", "found 'three', expected a whole number"),
         (tuple, (1, 2), r"found \[1, 2\], expected tuple"),
         (Any, 1, "found 1, expected .*Any"),
         (Any, print, "configuration: found <built-in function print>"),

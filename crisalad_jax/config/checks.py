@@ -107,6 +107,8 @@ def _fits(hint: Any, value: Any) -> bool:
         # A bool is an int to Python, and no number of anything.
         return isinstance(value, _PLAIN[hint][1]) and (hint is bool or type(value) is not bool)
     kind = origin or hint
+    if hint is Any:  # a class to `isinstance`, which refuses it
+        return True
     return not isinstance(kind, type) or isinstance(value, kind)
 
 

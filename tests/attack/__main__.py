@@ -21,17 +21,27 @@ PAGE = ROOT / "docs" / "reliability.md"
 
 
 def table(rows: list[dict]) -> str:
-    """Return the rows as a Markdown table."""
-    lines = ["| attack | promise | tries | failures |", "| --- | --- | ---: | ---: |"]
+    """Return the rows as a Markdown table, a line for each attack: what stands before its colon."""
+    groups: dict[tuple[str, str], list[dict]] = {}
     for row in rows:
-        texts = (row[name].replace("|", "\\|") for name in ("attack", "promise"))
-        lines.append(f"| {' | '.join(texts)} | {row['tries']:,} | {len(row['failures']):,} |")
-    tries, failures = (sum(numbers) for numbers in zip(*map(_numbers, rows), strict=True))
+        groups.setdefault((row["attack"].partition(": ")[0], row["promise"]), []).append(row)
+    lines = ["| attack | promise | tries | failures |", "| --- | --- | ---: | ---: |"]
+    for (attack, promise), group in groups.items():
+        kinds = [row["attack"].partition(": ")[2] for row in group]
+        of = f": {', '.join(map(_code, kinds))}" if all(kinds) else ""
+        tries, failures = _sums(group)
+        lines.append(f"| {attack}{of} | {promise} | {tries:,} | {failures:,} |".replace("\n", " "))
+    tries, failures = _sums(rows)
     return "\n".join([*lines, f"| **all** | | **{tries:,}** | **{failures:,}** |"])
 
 
-def _numbers(row: dict) -> tuple[int, int]:
-    return row["tries"], len(row["failures"])
+def _code(kind: str) -> str:
+    """Return a kind in a form that Markdown takes as it is."""
+    return f"`{kind}`" if kind[0] in "-'/." else kind
+
+
+def _sums(rows: list[dict]) -> tuple[int, int]:
+    return sum(row["tries"] for row in rows), sum(len(row["failures"]) for row in rows)
 
 
 def main() -> int:

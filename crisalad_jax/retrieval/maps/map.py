@@ -400,7 +400,8 @@ def open_for_appending(
         stack.enter_context(made_folder(folder / SEGMENTS))
         stack.enter_context(one_writer(folder))
         existing = read_description(folder)
-        remove_temporaries(folder / SEGMENTS)
+        for each in (folder, folder / SEGMENTS):
+            remove_temporaries(each)
         stack.enter_context(undone_without_images(folder))
         if existing != description:
             if has_images(folder):

@@ -136,7 +136,8 @@ def test_vpr_bench_damaged_ground_truth(tmp_path, damage):
             "another object": content[:128] + pickle.dumps({"a": 1}),
         }
         path.write_bytes(replacement[damage])
-    with pytest.raises(InputError, match=r"ground_truth_new\.npy: cannot be read") as caught:
+    words = "found no such file" if damage == "missing" else "cannot be read"
+    with pytest.raises(InputError, match=rf"ground_truth_new\.npy: {words}") as caught:
         read_vpr_bench(root)
     assert "\n" not in str(caught.value)
 
