@@ -174,6 +174,7 @@ def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar
             if batch is None:
                 break
             try:
+                signals.watch()
                 note = run.take_step(batch)
                 signals.has_work = True  # before it, XLA compiles the step
             except Exception as raised:  # told to the others before the next step

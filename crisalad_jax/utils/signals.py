@@ -35,10 +35,20 @@ def end_at_signals() -> None:
         # Ignored signals, as under nohup, stay ignored.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
-    reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    global _pipe
+    reading, _pipe = os.pipe()
+    os.set_blocking(_pipe, False)
+    _watch()
     threading.Thread(target=_end_late, args=(reading,), daemon=True).start()
+
+
+_pipe = -1
+"""Gets the number of each signal, for the second thread; -1 where there is none."""
+
+
+def _watch() -> None:
+    if _pipe >= 0:
+        signal.set_wakeup_fd(_pipe, warn_on_full_buffer=False)
 
 
 _holding = _waiting = 0
@@ -80,13 +90,12 @@ def _end_late(numbers: int) -> None:
     """
     while data := os.read(numbers, 1):
         state, number = SignalState.current, data[0]
-        if number in _SIGNALS:
-            is_first = state is not None and state.is_first()
-            if state is not None and is_first and state.has_work:
-                continue  # what the signal waits for
+        if number not in _SIGNALS:
+            continue
+        # The first signal waits for work that has to be saved.
+        if state is None or not state.is_first() or not state.has_work:
             time.sleep(_PATIENCE)
-            if state is None or not is_first or not state.number:
-                _leave(number)
+            _leave(number)
 
 
 _PATIENCE = 2.0
@@ -114,7 +123,7 @@ class SignalState:
         self.number = 0
         """Number of the last one; 0 for none."""
         self.has_work = False
-        """Whether there is work that has to be saved."""
+        """Whether there is work that has to be saved; without it a command ends at once."""
         self._asked = False
         self._at_once = False
         self._before: dict[int, Any] = {}
@@ -137,8 +146,10 @@ class SignalState:
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Record a signal, as its handler; the second one means: do not wait."""
         first, self.number = self.number == 0, number
+        earlier = self._before.get(number)
+        if earlier is _end and not self.has_work:
+            _end(number, frame)
         if not first:
-            earlier = self._before.get(number)
             if callable(earlier):
                 earlier(number, frame)
             raise KeyboardInterrupt
@@ -150,8 +161,17 @@ class SignalState:
         before, self._asked = self._asked, True
         return not before
 
+    def watch(self) -> None:
+        """Watch for signals in a second thread again, before a library works in the main thread.
+
+        orbax writes by uvloop, which takes the watching for itself, and does not give it back.
+        """
+        if threading.current_thread() is threading.main_thread():
+            _watch()
+
     def defer(self) -> None:
         """Handle all signals that are not ignored."""
+        self.watch()
         SignalState.current = self
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
@@ -159,6 +179,7 @@ class SignalState:
 
     def restore(self) -> None:
         """Give the signals back to their handlers."""
+        self.watch()
         if not self.number:
             SignalState.current = None
         for number, handler in self._before.items():

@@ -45,6 +45,7 @@ CALLS = Marks(
         "saving": "crisalad_jax.training.run_files:RunFiles.save",
         "validating": "crisalad_jax.training.run:Run._validate",
         "keeping the best": "crisalad_jax.training.run_files:RunFiles.keep_if_best",
+        "logging": "crisalad_jax.training.run_files:RunFiles.log_step",
     }
 )
 TRAINING_CALLS = ("the loop of training", "saving", "validating", "keeping the best")
@@ -195,7 +196,8 @@ def _one_fork(bench: Bench, verb: Verb, turn: int, rows: Tries) -> None:
         rows.resumed.note(done.code in (0, 128 + number) and not left_in(out), words)
     words = f"seed {bench.seed}, {verb.name}, signal {number}, {moment} ({moment.during})"
     wrong = wrong_end(number, done.code, done.err, time.monotonic() - moment.sent)
-    if moment.during in TRAINING_CALLS and verb.name == "train" and "goes on" not in done.err:
+    at_work = moment.during in TRAINING_CALLS and moment.before["logging"]
+    if verb.name == "train" and at_work and "goes on" not in done.err:
         wrong.append(f"no word of the saved state: {done.err}")
     rows.ends.note(not wrong, f"{words}: {wrong}")
     left = left_in(out)

@@ -128,6 +128,8 @@ class Moment:
         self.during = ""
         """What the child was doing then; empty if it had ended."""
         self.sent = 0.0
+        self.before: dict[str, int] = {}
+        """How often each work had begun then."""
 
     def __call__(self, process: int) -> None:
         """Wait for the moment, and send the signal."""
@@ -144,6 +146,7 @@ class Moment:
             if ends_in(self._after):
                 return
             self.during, self.sent = self._marks.now, time.monotonic()
+            self.before = {name: self._marks.times(name) for name in self._marks.names}
             os.kill(process, self.number)
         finally:
             os.close(watcher)
