@@ -259,7 +259,7 @@ def forked(
         open_pipes = set(texts)
         while watchers or open_pipes:
             left = limit - (time.monotonic() - started)
-            ready, _, _ = select.select([*open_pipes, *watchers], [], [], max(left, 0))
+            ready, _, _ = select.select([*open_pipes, *watchers], [], [], max(left, 1))
             if not ready:
                 if not watchers:
                     break  # a grandchild holds the pipes
