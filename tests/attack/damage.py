@@ -8,6 +8,7 @@ otherwise. Files without a checksum, which earlier versions wrote, are told of.
 
 import argparse
 import contextlib
+import functools
 import pathlib
 import random
 import shutil
@@ -89,6 +90,7 @@ def readers(world: World) -> Mapping[str, tuple[str, str, Reader]]:
     }
 
 
+@functools.cache
 def _state_like(world: World) -> Any:
     """Return a state of the run's structure."""
     import jax
