@@ -19,6 +19,8 @@ from crisalad_jax.utils.notes import tell
 CHECKSUM = "checksum"
 """Key of the digest, the first of its object."""
 BLANK = "0" * 64
+_PIECE = 2**25
+"""Bytes that are hashed at a time beside other work."""
 _HEADER_LIMIT = 2**27
 """Largest header of a safetensors file in bytes; the library allows 100 MB."""
 
@@ -170,7 +172,8 @@ def _safetensors_are_right(path: pathlib.Path) -> bool:
     digester = hashlib.sha256(header.replace(digest.encode(), BLANK.encode(), 1))
     with path.open("rb") as file:
         file.seek(len(header))
-        buffer = memoryview(bytearray(2**20))
+        # Large pieces: after each one this thread waits for Python's lock, which the block holds.
+        buffer = memoryview(bytearray(min(_PIECE, max(1, path.stat().st_size))))
         while count := file.readinto(buffer):
             digester.update(buffer[:count])
     return digester.hexdigest() == digest

@@ -30,7 +30,8 @@ def table(rows: list[dict]) -> str:
         kinds = [row["attack"].partition(": ")[2] for row in group]
         of = f": {', '.join(map(_code, kinds))}" if all(kinds) else ""
         tries, failures = _sums(group)
-        lines.append(f"| {attack}{of} | {promise} | {tries:,} | {failures:,} |".replace("\n", " "))
+        texts = (text.replace("|", "\\|") for text in (attack + of, promise))
+        lines.append(f"| {' | '.join(texts)} | {tries:,} | {failures:,} |")
     tries, failures = _sums(rows)
     return "\n".join([*lines, f"| **all** | | **{tries:,}** | **{failures:,}** |"])
 
