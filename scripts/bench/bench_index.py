@@ -29,7 +29,7 @@ from tables import Study, Table, count, flags, leave, read
 
 from crisalad_jax.data.places import COLUMNS
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.progress import progress_bar
 
 LIMIT_SECONDS, LIMIT_BYTES = 10, 1e9
@@ -126,7 +126,7 @@ def make_tree(root: pathlib.Path, arguments: argparse.Namespace) -> None:
     """
     made_as = {name: getattr(arguments, name) for name in ("cities", "places", "images", "size")}
     done = root / "tree.json"
-    if done.exists() and json.loads(done.read_text(encoding="utf-8")) == made_as:
+    if done.exists() and read_json(done, "how an index was made") == made_as:
         return
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise InputError(f"{root}: found files, expected nothing, or a tree of {made_as}")

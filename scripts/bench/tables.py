@@ -1,6 +1,7 @@
 """What a study leaves: a table in Markdown, its numbers, a picture; and the page that shows it."""
 
 import argparse
+import json
 import pathlib
 from collections.abc import Callable, Collection, Iterable
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import around, atomic_path, check_target, write_json
+from crisalad_jax.utils.files import around, atomic_path, check_target
 
 INK, GREY, PALE = "#222222", "#757575", "#e4e4e4"
 # Okabe and Ito's: told apart by the colour-blind.
@@ -54,7 +55,8 @@ def save(name: str, study: Study, out: pathlib.Path) -> None:
     text, numbers, picture = files_of(name, out)
     with atomic_path(text) as temporary:
         temporary.write_text(markdown(study.table), encoding="utf-8")
-    write_json(numbers, study.values)
+    with atomic_path(numbers) as temporary:  # numbers for people: no reader checks them
+        temporary.write_text(json.dumps(study.values, indent=2) + "\n", encoding="utf-8")
     if study.figure is not None:
         with atomic_path(picture) as temporary:
             study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
