@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import safetensors
 
@@ -242,7 +241,7 @@ def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path
             problems.append(f"{name} holds NaN or infinity")
     if problems:
         raise InputError(f"{path}: weights do not fit: {'; '.join(sorted(problems))}")
-    leaves = [jnp.asarray(arrays[name]) for name in wanted]
+    leaves = [jax.device_put(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 

@@ -7,6 +7,7 @@ byte of the file counts, and one rule serves JSON and the metadata of safetensor
 import contextlib
 import hashlib
 import json
+import mmap
 import os
 import pathlib
 from collections.abc import Iterator, Mapping
@@ -19,8 +20,6 @@ from crisalad_jax.utils.notes import tell
 CHECKSUM = "checksum"
 """Key of the digest, the first of its object."""
 BLANK = "0" * 64
-_PIECE = 2**25
-"""Bytes that are hashed at a time beside other work."""
 _HEADER_LIMIT = 2**27
 """Largest header of a safetensors file in bytes; the library allows 100 MB."""
 
@@ -168,14 +167,14 @@ def _safetensors_are_right(path: pathlib.Path) -> bool:
         return True
     if not _is_digest(digest) or digest.encode() not in header:
         return False
-    # A file object's position tells where the rest of the digest begins.
     digester = hashlib.sha256(header.replace(digest.encode(), BLANK.encode(), 1))
-    with path.open("rb") as file:
-        file.seek(len(header))
-        # Large pieces: after each one this thread waits for Python's lock, which the block holds.
-        buffer = memoryview(bytearray(min(_PIECE, max(1, path.stat().st_size))))
-        while count := file.readinto(buffer):
-            digester.update(buffer[:count])
+    # One call for all: between calls this thread waits for Python's lock, which the block holds.
+    with (
+        path.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        memoryview(data)[len(header) :] as rest,
+    ):
+        digester.update(rest)
     return digester.hexdigest() == digest
 
 

@@ -2,9 +2,10 @@
 
     python scripts/bench/bench_checksums.py [--preset b14] [--images 5000] [--rounds 7]
 
-Each round takes both ways in turns; ratios are medians over rounds. Weights: with and without
-`verify`. Descriptors: `extract` into a .npy, which keeps its work in files, hashes all and can be
-resumed, beside the same call in memory and numpy's own writing.
+Each round takes both ways in turns; ratios are medians over rounds. Weights: `load` beside
+`load(verify=False)`, and beside safetensors' own `load_file` with an array of JAX of each array, as
+`load` was before files had checksums. Descriptors: `extract` into a .npy, which keeps its work in
+files, hashes all and can be resumed, beside the same call in memory and numpy's own writing.
 """
 
 import argparse
@@ -16,7 +17,9 @@ from collections.abc import Callable
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
+from safetensors.numpy import load_file
 
 from crisalad_jax import PRESETS, extract, init_crisalad, load, save_weights
 
@@ -32,12 +35,13 @@ def main() -> None:
         weights = folder / "weights.safetensors"
         config = PRESETS[given.preset]
         save_weights(weights, init_crisalad(jax.random.key(0), config), config)
-        ratio(
-            f"load {given.preset}, {weights.stat().st_size / 1e6:.0f} MB",
-            lambda: load(weights),
-            lambda: load(weights, verify=False),
-            3 * given.rounds,
-        )
+        size = f"load {given.preset}, {weights.stat().st_size / 1e6:.0f} MB"
+        others = {
+            "load(verify=False)": lambda: load(weights, verify=False),
+            "load_file": lambda: jax.tree.map(jnp.asarray, load_file(weights)),
+        }
+        for other, plain in others.items():
+            ratio(f"{size}, beside {other}", lambda: load(weights), plain, 3 * given.rounds)
         if given.images:
             extraction(folder, given.images, given.rounds)
 
