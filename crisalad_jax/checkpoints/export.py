@@ -17,7 +17,7 @@ from jax import export
 from jaxtyping import Array, Float, UInt8
 
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import check_types, choose
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
@@ -60,6 +60,7 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_types(self)
         choose("grouping", self.grouping, GROUPINGS)
         if self.batch_size is not None and self.batch_size < 1:
             raise InputError(f"batch size: found {self.batch_size}, expected at least 1")

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.config.checks import check_seed
+from crisalad_jax.config.checks import check_seed, check_types
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.chunks import as_rows, pieces, sample
 from crisalad_jax.utils.checksums import checked_safetensors
@@ -39,6 +39,10 @@ class PcaConfig:
     """Make the reduced descriptors unit vectors again, as `retrieval.search` and all that compares
     by cosine take them (and Jegou and Chum after whitening). CricaVPR leaves them as they are, and
     searches by L2: its published figures are without."""
+
+    def __post_init__(self) -> None:
+        """Check the types."""
+        check_types(self)
 
 
 class Pca(NamedTuple):

@@ -106,6 +106,9 @@ def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Cris
     Returns:
         The whole model, with one stack of blocks.
 
+    Raises:
+        InputError: parameters of another model.
+
     Example:
         >>> import jax
         >>> from crisalad_jax import PRESETS, init_crisalad
@@ -116,6 +119,7 @@ def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Cris
         True
     """
     params = eqx.combine(trainable, frozen)
+    check_params(params, config)
     return dataclasses.replace(params, backbone=config.backbone.join_blocks(params.backbone))
 
 

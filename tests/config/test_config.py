@@ -6,12 +6,15 @@ import re
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints.export import ExportConfig
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.io import from_plain
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
+from crisalad_jax.experiments.demo import DemoConfig
+from crisalad_jax.experiments.synthetic import SyntheticCityConfig
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.circle import CircleConfig
 from crisalad_jax.losses.contrastive import ContrastiveConfig
@@ -32,6 +35,7 @@ from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.retrieval.pca import PcaConfig
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import RECIPES, recipe
@@ -411,6 +415,11 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
         (TrainConfig, {"cities": "Bath"}, "'Bath'", "a tuple, each text, or None"),
         (TrainConfig, {"cities": ("Bath", 3)}, "('Bath', 3)", "a tuple, each text, or None"),
         (LightAugmentConfig, {"blur": "1"}, "'1'", "a number"),
+        (ExportConfig, {"batch_size": 1.5}, "1.5", "a whole number, or None"),
+        (ExportConfig, {"platforms": "cpu"}, "'cpu'", "a tuple, each text"),
+        (PcaConfig, {"whiten": "no"}, "'no'", "True or False"),
+        (DemoConfig, {"epochs": 1.5}, "1.5", "a whole number"),
+        (SyntheticCityConfig, {"test_places": "150"}, "'150'", "a whole number"),
     ],
 )
 @pytest.mark.usefixtures("_unchecked")

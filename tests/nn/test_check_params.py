@@ -225,6 +225,13 @@ def test_what_training_has_cast_and_cut_still_fits(trainable: str) -> None:
         check_params(whole, config, stored=True)
 
 
+def test_trees_of_another_model_are_not_merged() -> None:
+    chosen, frozen = split_params(PARAMS, MODEL, "head")
+    other = dataclasses.replace(MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=1))
+    with pytest.raises(InputError, match=r"params: not of this configuration: cross_image\."):
+        merge_params(chosen, frozen, other)
+
+
 def test_a_vocabularys_backbone_makes_no_misfit() -> None:
     alone = CrossImageConfig(layers=0)
     config = with_aggregator(MODEL, "anyloc", "tiny", cross_image=alone)

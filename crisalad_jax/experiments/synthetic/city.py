@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from crisalad_jax.config.checks import check_seed
+from crisalad_jax.config.checks import check_seed, check_types
 from crisalad_jax.experiments.synthetic.camera import PITCH
 from crisalad_jax.experiments.synthetic.mesh import EYE
 from crisalad_jax.experiments.synthetic.picture import render
@@ -58,7 +58,8 @@ class SyntheticCityConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the types and ranges."""
+        check_types(self)
         for name, least in (
             ("train_places", len(CITY_NAMES)),
             ("images_per_place", 1),
