@@ -170,6 +170,27 @@ def test_plain_iterations_are_counted_right_and_others_converge(study: ModuleTyp
 
 
 @pytest.mark.slow
+def test_sharper_scores_are_counted_right_and_newton_meets_them(study: ModuleType) -> None:
+    limit = 400
+    values = run(study, "sharpness", limit=limit).values
+    assert len(values) == len(study.FORMATS) * len(study.EPSILONS) * len(study.SOLVERS)
+    found = {(v["dtype"], v["epsilon"], v["solver"]): v for v in values}
+    for epsilon in study.EPSILONS:
+        scores = study.cosines(size(study)) / epsilon
+        # In float32 a change near the tolerance may round to either side: its counts are not said.
+        counts = np.array([iterations_to(1e-6, one, limit) for one in scores])
+        plain = found["float64", epsilon, "plain"]
+        assert plain["median"] == np.median(np.minimum(counts, limit))
+        assert plain["missed"] == (counts > limit).sum()
+        for dtype, tolerance in study.FORMATS.items():
+            newton = found[dtype, epsilon, "Newton"]
+            assert newton["missed"] == 0
+            # A change is of logarithms; 1e-3 of them is this much more of a mass.
+            assert newton["error"] < 1.001 * tolerance
+    assert found["float64", 2e-4, "plain"]["missed"] == IMAGES
+
+
+@pytest.mark.slow
 def test_rounded_scores_are_as_far_off_as_numpy_says(study: ModuleType) -> None:
     values = run(study, "precision").values
     for kind, std in CASES:
