@@ -54,10 +54,15 @@ def indices(value: Any) -> Int64[np.ndarray, " _"]:
     return np.array([int(item) for item in items], np.int64)
 
 
-def matches(value: Any, database: int) -> Int64[np.ndarray, " _"]:
+def matches(value: Any, database: int, *, windows: bool = False) -> Int64[np.ndarray, " _"]:
     """Return the unique database indices that a ground truth file gives a query, ascending.
 
     An index of -1 stands for no match (VPR-Bench) and is dropped.
+
+    Args:
+        value: a number, flat list or integer array.
+        database: the number of images.
+        windows: whether indices after the last image are dropped too, where others are left.
 
     Raises:
         InputError: they are no indices below `database`. The caller puts the file's name in front.
@@ -67,6 +72,8 @@ def matches(value: Any, database: int) -> Int64[np.ndarray, " _"]:
     except (TypeError, OverflowError) as error:
         raise InputError(f"found {error}, expected indices") from error
     references = np.unique(references[references != -1])
+    if windows and references.size and 0 <= references[0] < database:
+        references = references[references < database]
     if references.size and not 0 <= references[0] <= references[-1] < database:
         raise InputError(
             f"found reference indices {references[0]} to {references[-1]}, "

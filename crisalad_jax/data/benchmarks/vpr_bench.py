@@ -12,6 +12,7 @@ from crisalad_jax.data.benchmarks.ground_truth import indices, is_nordland_star,
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.notes import tell
 
 TRUTH = "ground_truth_new.npy"
 
@@ -23,10 +24,13 @@ def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
     there is no match. An index is a position among the images in the order of their numbers. No
     code in the file is run.
 
+    The published lists of GardensPointWalking and 17places are windows of frames, and the last ones
+    end after the last image. Such references are left out, and a note counts them.
+
     Raises:
         InputError: a folder or the file is missing, a number is skipped among the images' names,
-            the file holds anything but plain arrays, lists and numbers, an index is out of range,
-            a query has no row or two.
+            the file holds anything but plain arrays, lists and numbers, all references of a query
+            are out of range, a query has no row or two.
     """
     root = pathlib.Path(root)
     database, queries = (_numbered(list_part(root / part)) for part in ("ref", "query"))
@@ -63,10 +67,12 @@ def _match(
             f"{path}: found shape {rows.shape}, expected ({queries}, 2): one row for each query"
         )
     positives: dict[int, np.ndarray] = {}
+    beyond = 0
     for number, (query, references) in enumerate(rows):
         try:
             index = indices(query)
-            matching = matches(references, database)
+            matching = matches(references, database, windows=True)
+            beyond += int((indices(references) >= database).sum())
         except (InputError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: row {number}: {error}") from error
         if index.size != 1 or not 0 <= index[0] < queries or int(index[0]) in positives:
@@ -75,4 +81,9 @@ def _match(
                 f"{queries - 1} that no other row has"
             )
         positives[int(index[0])] = matching
+    if beyond:
+        tell(
+            f"{path}: found {beyond} references after the last of {database} images, where windows "
+            "of frames end; left out"
+        )
     return tuple(positives[query] for query in range(queries))

@@ -9,6 +9,7 @@ import pytest
 
 from crisalad_jax.data.benchmarks import read_vpr_bench
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 from tests.data.benchmarks.trees import (
     every_tenth,
     lists_of,
@@ -62,6 +63,15 @@ def test_vpr_bench_refuses_a_gap_in_the_numbers(tmp_path):
         InputError, match=r"ref/0000002.jpg: found after number 0, expected number 1"
     ):
         read_vpr_bench(root)
+
+
+def test_vpr_bench_leaves_out_references_after_the_last_image(tmp_path):
+    """As published for GardensPointWalking, whose query 199 has 197 to 201 of 200 references."""
+    rows = truth_rows((0, [0, 1]), (1, [2, 3, 4]), (2, [3, 4, 5]))
+    root = write_vpr_bench(tmp_path, rows)
+    with pytest.warns(Note, match=r"found 3 references after the last of 4 images, .* left out"):
+        benchmark = read_vpr_bench(root)
+    assert lists_of(benchmark.positives) == [[0, 1], [2, 3], [3]]
 
 
 @pytest.mark.parametrize(
