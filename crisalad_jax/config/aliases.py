@@ -102,6 +102,12 @@ def _salad(value: Plain) -> None:
         value.update({k: v for k, v in sinkhorn.items() if k in PROBLEM})
 
 
+def _boq(value: Plain) -> None:
+    # Files hold all fields: one without this one is of the time when there was always the norm.
+    if value.keys() >= {"channels", "queries", "layers", "rows"}:
+        value.setdefault("last_norm", True)
+
+
 def _sinkhorn(value: Plain) -> None:
     if "method" not in value:
         return
@@ -136,6 +142,7 @@ def _training(value: Plain) -> None:
 _CHANGES: Mapping[str, Callable[[Plain], None]] = {
     "ModelConfig": _model,
     "SaladConfig": _salad,
+    "BoqConfig": _boq,
     "SinkhornConfig": _sinkhorn,
     "LossConfig": _loss,
     "LargeMarginCosineConfig": _large_margin_cosine,

@@ -105,6 +105,8 @@ class Crisalad(nn.Module):
             return self.aggregate(self.backbone.facet(images, found.block(depth), found.facet))
         if isinstance(found, TransVprConfig):
             return self.aggregate(self.backbone(images, found.features(depth).levels))
+        if isinstance(found, BoqConfig) and not found.last_norm:
+            return self.aggregate(self.backbone.facet(images, depth - 1, "token"))
         return self.aggregate(self.backbone(images))
 
     def aggregate(self, features: Features) -> Tokens:

@@ -19,7 +19,7 @@ from crisalad_jax.nn.attention import (
     cross_attention,
     init_torch_attention,
 )
-from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.cross_image import NORM_EPSILON, EncoderLayer, init_encoder_layer
 from crisalad_jax.nn.layers import (
     Conv,
@@ -74,6 +74,9 @@ class BoqConfig(Aggregator):
     """Number of blocks, each an encoder layer and its queries."""
     rows: int = 32
     """Number of rows that a linear layer makes of all blocks' answers."""
+    last_norm: bool = False
+    """Whether patches go through the backbone's last layer norm. In the public code they do not;
+    they do in weight files of this package that are older than this field."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -88,6 +91,10 @@ class BoqConfig(Aggregator):
     def heads(self) -> int:
         """Number of heads of every attention, as the public code has them."""
         return max(1, self.channels // 64)
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the last patches, by default as the last block leaves them."""
+        return FeatureRequest(norm=self.last_norm)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one token for each row."""

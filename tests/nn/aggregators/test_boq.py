@@ -1,5 +1,7 @@
 """BoQ against torch's own transformer modules, under the names of the public checkpoints."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import extract_features
 from tests.conftest import random_params
 
 CONFIG = ModelConfig(
@@ -104,6 +107,20 @@ def test_the_published_model_has_12288_numbers_and_these_parameters() -> None:
         if name.startswith("aggregator.")
     }
     assert found == {name: tuple(tensor.shape) for name, tensor in theirs.items()}
+
+
+def test_patches_go_through_the_last_norm_only_if_asked_for() -> None:
+    params = random_params(CONFIG)
+    images = np.random.default_rng(0).integers(0, 256, (2, 28, 42, 3), np.uint8)
+    asked = dataclasses.replace(CONFIG.aggregator, last_norm=True)
+    without = extract_features(params, images, CONFIG).patches
+    found = extract_features(params, images, dataclasses.replace(CONFIG, aggregator=asked)).patches
+    norm = params.backbone.norm
+    weight, bias = (torch.tensor(np.asarray(x)) for x in (norm.weight, norm.bias))
+    expected = F.layer_norm(torch.tensor(np.asarray(without)), (12,), weight, bias, 1e-6)
+    # Float32's rounding in one layer norm.
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert np.abs(without - found).max() > 0.1
 
 
 @pytest.mark.slow

@@ -1,0 +1,62 @@
+"""Layouts of published place-recognition models, random weights for them, and the outputs of the
+public code on these.
+
+`layouts/NAME.json` has names and shapes as the published file has them; `goldens/NAME.npz` has
+images and what the public code made of them with the weights of `random_state`. The weights of a
+name depend on nothing but the name, the shape and the seed.
+"""
+
+import json
+import pathlib
+import re
+import zlib
+
+import numpy as np
+
+HERE = pathlib.Path(__file__).parent
+NAMES = tuple(sorted(path.stem for path in (HERE / "goldens").glob("*.npz")))
+SEED = 11
+CHANGED: tuple[tuple[str, str, float], ...] = ()
+"""Weights of another size than the rest: a pattern of models, one of names, and a factor. With them
+a descriptor depends on the image more than on a bias."""
+
+
+def layout(name: str) -> dict[str, tuple[int, ...]]:
+    """Return the shapes by name; "outer/inner" is a name within the file's dictionary `outer`."""
+    shapes = json.loads((HERE / "layouts" / f"{name}.json").read_text(encoding="utf-8"))
+    return {key: tuple(shape) for key, shape in shapes.items()}
+
+
+def golden(name: str) -> dict[str, np.ndarray]:
+    """Return the images and the public code's outputs."""
+    with np.load(HERE / "goldens" / f"{name}.npz") as file:
+        return dict(file)
+
+
+def random_state(name: str, seed: int = SEED) -> dict[str, np.ndarray]:
+    """Return random weights by name, without the names of outer dictionaries."""
+    shapes = {key.rpartition("/")[2]: shape for key, shape in layout(name).items()}
+    return {key: _array(name, key, shape, seed) for key, shape in shapes.items()}
+
+
+def _array(model: str, key: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
+    """Draw an array so that activations stay finite through many layers."""
+    generator = np.random.default_rng([seed, zlib.crc32(key.encode())])
+    last = key.rpartition(".")[2]
+    if last == "num_batches_tracked":
+        return np.array(3, np.int64)
+    if last == "running_var":
+        return (generator.random(shape) + 0.5).astype(np.float32)
+    array = generator.standard_normal(shape)
+    if "gamma" in last:
+        array = 0.3 + 0.1 * array
+    elif last == "weight" and len(shape) == 1:
+        array = 1 + 0.2 * array
+    elif len(shape) > 1 and ("weight" in last or "in_proj" in last):
+        array *= int(np.prod(shape[1:])) ** -0.5
+    else:
+        array *= 0.1
+    for models, names, factor in CHANGED:
+        if re.search(models, model) and re.search(names, key):
+            array *= factor
+    return array.astype(np.float32)
