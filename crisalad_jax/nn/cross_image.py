@@ -6,6 +6,7 @@ Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, 
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
@@ -73,9 +74,13 @@ class CrossImageEncoder:
 
 
 def init_cross_image(key: PRNGKeyArray, dim: int, config: CrossImageConfig) -> CrossImageEncoder:
-    """Draw parameters as torch does: Glorot-uniform attention, zero biases, default linears."""
-    keys = jax.random.split(key, config.layers)
-    return CrossImageEncoder(tuple(init_encoder_layer(k, dim, config.feedforward) for k in keys))
+    """Draw parameters as torch does: Glorot-uniform attention, zero biases, default linears.
+
+    All layers start equal, for torch's `nn.TransformerEncoder` copies the one that it is given.
+    """
+    layer = init_encoder_layer(key, dim, config.feedforward)
+    # Copies: a training step that donates its buffers must not find one twice.
+    return CrossImageEncoder(tuple(jax.tree.map(jnp.copy, layer) for _ in range(config.layers)))
 
 
 def init_encoder_layer(key: PRNGKeyArray, dim: int, feedforward: int) -> EncoderLayer:

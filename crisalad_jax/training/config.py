@@ -77,7 +77,9 @@ class TrainConfig:
 
     model: ModelConfig = ModelConfig()
     loss: LossConfig = LossConfig()
-    optimiser: OptimiserConfig = OptimiserConfig()
+    optimiser: OptimiserConfig = OptimiserConfig(end_lr_fraction=0.2, decay_steps=4000)
+    """By default AdamW as in the paper, whose decay is "as adopted in SALAD": to 0.2 in 4,000
+    steps."""
     trainable: str = "adapters+head"
     """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), head, or all."""
     augmentation: OrName[Augmentation] = part_field(AUGMENTATIONS, "rand-augment")

@@ -62,6 +62,11 @@ def test_presets_are_the_four_sizes_of_dinov2(preset, dim, depth, heads, hidden)
 def test_the_recipe_is_the_papers():
     config = recipe("b14")  # section 4.2
     assert config.optimiser.learning_rate == 6e-5
+    # "Linear, as adopted in SALAD", whose code decays to a fifth in 4,000 steps.
+    for name in ("crisalad", "crisalad-1e-4"):
+        optimiser = recipe("b14", name).optimiser
+        assert optimiser.schedule == "linear"
+        assert (optimiser.end_lr_fraction, optimiser.decay_steps) == (0.2, 4000)
     assert (config.places_per_batch, config.images_per_place) == (48, 4)
     assert config.trainable == "adapters+head"
     assert config.model.image_size == (224, 224)

@@ -8,6 +8,7 @@ import torch
 
 from crisalad_jax.nn.cross_image import (
     CrossImageConfig,
+    CrossImageEncoder,
     cross_image_encoder,
     init_cross_image,
 )
@@ -40,7 +41,9 @@ def torch_encoder(params) -> torch.nn.TransformerEncoder:
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_equals_torch(masked: bool) -> None:
-    params = init_cross_image(jax.random.key(0), DIM, CONFIG)
+    # Layers that differ, as they do after training.
+    layers = (init_cross_image(jax.random.key(seed), DIM, CONFIG).layers[0] for seed in range(2))
+    params = CrossImageEncoder(tuple(layers))
     tokens = jax.random.normal(jax.random.key(1), (IMAGES, TOKENS, DIM))
     mask = None
     if masked:
@@ -58,7 +61,15 @@ def test_equals_torch(masked: bool) -> None:
 def test_starts_as_torch_does() -> None:
     """Glorot-uniform attention with zero biases: the largest weight comes close to the bound."""
     params = init_cross_image(jax.random.key(0), 64, CONFIG)
-    attn = params.layers[0].attn
+    # `nn.TransformerEncoder` copies its layer.
+    first, second = params.layers
+    theirs = torch.nn.TransformerEncoder(torch.nn.TransformerEncoderLayer(64, 4), 2).layers
+    pairs = zip(theirs[0].parameters(), theirs[1].parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    pointers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves(params)]
+    assert len(set(pointers)) == len(pointers)
+    attn = first.attn
     bound = np.sqrt(6 / (64 + 192))
     assert 0.99 * bound < float(jnp.abs(attn.qkv.weight).max()) <= bound
     assert not attn.qkv.bias.any()

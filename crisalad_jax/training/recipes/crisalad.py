@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes.base import from_scratch, register_recipe
 
 
@@ -14,8 +14,9 @@ def crisalad(model: ModelConfig, preset: str) -> TrainConfig:
     return TrainConfig(model=model)
 
 
-def _varied(model: ModelConfig, **optimiser: Any) -> TrainConfig:
-    return TrainConfig(model=model, optimiser=OptimiserConfig(**optimiser))
+def _varied(model: ModelConfig, **changes: Any) -> TrainConfig:
+    optimiser = dataclasses.replace(TrainConfig.optimiser, **changes)
+    return TrainConfig(model=model, optimiser=optimiser)
 
 
 @register_recipe("crisalad-1e-4")
