@@ -47,6 +47,7 @@ from crisalad_jax.nn.model import extract_tokens as extract_tokens
 from crisalad_jax.nn.model import init_crisalad as init_crisalad
 from crisalad_jax.nn.model import self_mask as self_mask
 from crisalad_jax.nn.model import valid_mask as valid_mask
+from crisalad_jax.nn.projection import ProjectionConfig as ProjectionConfig
 from crisalad_jax.nn.tokens import Tokens as Tokens
 from crisalad_jax.retrieval.extract import extract as extract
 from crisalad_jax.retrieval.maps.build import index as index

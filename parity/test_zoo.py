@@ -14,7 +14,11 @@ from crisalad_jax.checkpoints.layouts import infer, to_params, to_state
 from parity import zoo
 
 BOUND = 2e-5
-LAYOUTS = {"boq_dinov2_12288": "boq-dinov2", "salad_cm": "dino-salad"}
+LAYOUTS = {
+    "boq_dinov2_12288": "boq-dinov2",
+    "megaloc": "megaloc",
+    "salad_cm": "dino-salad",
+}
 
 
 def test_every_golden_is_compared() -> None:
@@ -39,3 +43,19 @@ def test_descriptors_are_the_public_codes(name: str) -> None:
     assert np.linalg.norm(found - expected) < BOUND * np.linalg.norm(expected)
     # Another image's descriptor is far: the bound tells images apart.
     assert np.linalg.norm(expected - expected[::-1]) > 1e-2
+
+
+def test_megalocs_first_file_is_the_same_model() -> None:
+    state = zoo.random_state("megaloc")
+    names = zoo.layout("megaloc_v1_torch")
+    first = {"backbone.model.mask_token": np.zeros((1, 768), np.float32)} | {
+        key.replace("backbone.", "backbone.model."): array for key, array in state.items()
+    }
+    assert {key: array.shape for key, array in first.items()} == names
+    layout, config = infer(first, source="first")
+    assert layout == "megaloc-v1"
+    assert config == infer(state, source="second")[1]
+    params, extras = to_params(first, config, layout, source="first")
+    expected, _ = to_params(state, config, "megaloc", source="second")
+    jax.tree.map(np.testing.assert_array_equal, params, expected)
+    assert list(to_state(params, config, layout, extras)) == list(names)

@@ -18,12 +18,12 @@ class Convert:
 
     source: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC")]
     """DINOv2 .pth, Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth, BoQ-DINOv2
-    .pth, the torch reference, or a file of this package."""
+    .pth, MegaLoc .safetensors, the torch reference, or a file of this package."""
     target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST")]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
     layout: str | None = None
-    """dinov2, huggingface, dino-salad, cricavpr, boq-dinov2 or reference, for a source of this
-    package; by default the one its parts came from (huggingface if the target is a
+    """dinov2, huggingface, dino-salad, cricavpr, boq-dinov2, megaloc or reference, for a source of
+    this package; by default the one its parts came from (huggingface if the target is a
     .safetensors)."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""

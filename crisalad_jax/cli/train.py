@@ -32,7 +32,8 @@ class Train:
     """Weights of a whole model to start from; none starts from random ones."""
     backbone: pathlib.Path | None = None
     """Start from this backbone alone: a file of this package or a public checkpoint (DINOv2 .pth,
-    Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth, BoQ-DINOv2 .pth)."""
+    Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth, BoQ-DINOv2 .pth,
+    MegaLoc .safetensors)."""
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
     recipe: str | None = None

@@ -12,6 +12,7 @@ from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 
 MOST_PIXELS = 4096
@@ -41,6 +42,8 @@ class ModelConfig:
     """Registered aggregator, or its name; it turns features into tokens."""
     cross_image: CrossImageConfig = CrossImageConfig()
     """Encoder whose attention runs across the images of a batch."""
+    projection: ProjectionConfig = ProjectionConfig()
+    """Linear layer over the whole descriptor; by default none."""
     compute_dtype: Literal["float32", "bfloat16", "float64"] = free_field("float32")
     """Type of the matrix products; normalisations, softmax and transport are float32 at least.
     float64 is for numerical studies, under JAX's 64-bit mode."""
@@ -100,6 +103,11 @@ class ModelConfig:
     @property
     def descriptor_dim(self) -> int:
         """Width of a descriptor."""
+        return self.projection.dim or self.unprojected_dim
+
+    @property
+    def unprojected_dim(self) -> int:
+        """Width of a descriptor before `projection`."""
         shape = self.token_shape
         return shape.global_dim + shape.tokens * shape.token_dim
 

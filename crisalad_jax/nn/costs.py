@@ -18,6 +18,7 @@ from crisalad_jax.nn.model import attend_across_images, extract_tokens, paramete
 from crisalad_jax.utils.pytree import named_leaves
 
 _SCOPES = {
+    "projection": "projection",
     "cross_image": "cross-image encoder",
     "aggregator": "aggregator",
     "adapter": "adapters",
@@ -72,13 +73,21 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
         attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
         attended = _count(jax.make_jaxpr(attend)(params, tokens))
         macs["cross-image encoder"] = attended["cross-image encoder"] // images
+    if params.projection is not None:
+        macs["projection"] = math.prod(params.projection.weight.shape)
     counts = collections.Counter[str]()
     for name, leaf in named_leaves(params).items():
         counts[_part_of(name)] += math.prod(leaf.shape)
-    return [PartCost(part, counts[part], macs[part]) for part in reversed(_SCOPES.values())]
+    return [
+        PartCost(part, counts[part], macs[part])
+        for part in reversed(_SCOPES.values())
+        if part != "projection" or counts[part]
+    ]
 
 
 def _part_of(name: str) -> str:
+    if name.startswith("projection."):
+        return "projection"
     if name.startswith("cross_image."):
         return "cross-image encoder"
     if name.startswith("aggregator"):

@@ -16,9 +16,17 @@ from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
-from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise, split_key
+from crisalad_jax.nn.layers import (
+    Keys,
+    Linear,
+    at_least_float32,
+    init_linear,
+    l2_normalise,
+    split_key,
+)
 from crisalad_jax.nn.misfits import misfits, not_finite, shortened
 from crisalad_jax.nn.pixels import check_pixels, normalise
+from crisalad_jax.nn.projection import project
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
@@ -37,6 +45,8 @@ class Crisalad:
     """Parameters of `ModelConfig.aggregator`; None where it has none."""
     cross_image: CrossImageEncoder | None
     """Parameters of the cross-image encoder; None without one."""
+    projection: Linear | None = None
+    """Parameters of `ModelConfig.projection`; None without one."""
 
 
 def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
@@ -69,6 +79,11 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         aggregator=aggregator,
         cross_image=init_cross_image(keys[2], config.token_shape.token_dim, config.cross_image)
         if config.cross_image.layers
+        else None,
+        projection=init_linear(
+            jax.random.fold_in(key, 3), config.unprojected_dim, config.projection.dim
+        )
+        if config.projection.dim
         else None,
     )
 
@@ -207,7 +222,7 @@ def describe(
         micro_batch: see `extract_tokens`; images still attend to the whole batch.
 
     Returns:
-        Descriptors of length 1, in float32 at least.
+        Descriptors of length 1 (but see `ProjectionConfig.renormalise`), in float32 at least.
 
     Raises:
         InputError: parameters that are not of the configuration; while tracing, for images of the
@@ -372,7 +387,7 @@ def attend_across_images(
         key: see `describe`.
 
     Returns:
-        Descriptors of length 1, in float32 at least.
+        See `describe`.
 
     Raises:
         InputError: parameters or tokens that are not of the configuration, or, while tracing, a
@@ -407,7 +422,12 @@ def attend_across_images(
                 params.cross_image, sequence, options, mask=mask, key=key
             )
         tokens = jax.vmap(leave)(sequence.astype(tokens.local.dtype), tokens)
-    return jax.vmap(functools.partial(to_descriptor, aggregator=config.aggregator))(tokens)
+    make = functools.partial(to_descriptor, aggregator=config.aggregator)
+    descriptors = jax.vmap(make)(tokens)
+    if params.projection is None:
+        return descriptors
+    with jax.named_scope("projection"):
+        return project(params.projection, descriptors, config.projection)
 
 
 def _check_token_shapes(tokens: Tokens, config: ModelConfig) -> None:

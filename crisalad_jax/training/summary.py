@@ -95,10 +95,11 @@ def model_words(config: ModelConfig) -> str:
         'backbone of width 768, 12 blocks, 0 registers, adapter depthwise'
     """
     backbone = config.backbone
+    projection = "projected " if config.projection.dim else ""
     return (
         f"backbone of width {backbone.dim}, {backbone.depth} blocks{backbone.extras}; "
         f"aggregator {config.aggregator.part_name}; {config.cross_image.layers} cross-image "
-        f"layers; descriptor of {config.descriptor_dim} numbers"
+        f"layers; {projection}descriptor of {config.descriptor_dim} numbers"
     )
 
 

@@ -59,7 +59,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         (True, True)
     """
     check_params(params, config)
-    head = ("aggregator.", "cross_image.")
+    head = ("aggregator.", "cross_image.", "projection.")
     match = _LAST_BLOCKS.fullmatch(trainable)
     if trainable == ALL:
         prefixes: tuple[str, ...] = ("",)

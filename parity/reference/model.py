@@ -79,6 +79,8 @@ class Crisalad(nn.Module):
             if config.cross_image.layers
             else None
         )
+        dim = config.projection.dim
+        self.projection = nn.Linear(config.unprojected_dim, dim) if dim else None
 
     def forward(self, images: Tensor, mask: Tensor | None = None) -> Tensor:
         """Unit descriptors of a batch of images.
@@ -133,10 +135,14 @@ class Crisalad(nn.Module):
         return self.to_descriptor(tokens)
 
     def to_descriptor(self, tokens: Tokens) -> Tensor:
-        """One unit descriptor: the global token, then the local ones in the published order."""
+        """The global token, then the local ones in the published order; the projection last."""
         transposed = isinstance(self.config.aggregator, TRANSPOSED)
         local = published_order(tokens.local) if transposed else tokens.local
-        return l2_normalise(torch.cat([tokens.global_token, local.flatten(1)], dim=1))
+        descriptor = l2_normalise(torch.cat([tokens.global_token, local.flatten(1)], dim=1))
+        if self.projection is None:
+            return descriptor
+        projected = self.projection(descriptor)
+        return l2_normalise(projected) if self.config.projection.renormalise else projected
 
 
 def _aggregator(config: ModelConfig) -> nn.Module | None:

@@ -20,27 +20,27 @@ _BACKBONE = "backbone.model."
 
 
 @register_head("salad")
-def salad_lines(config: SaladConfig) -> Iterator[Entry]:
-    """Yield SALAD's table, under serizba/salad's names."""
+def salad_lines(config: SaladConfig, prefix: str = "aggregator.") -> Iterator[Entry]:
+    """Yield SALAD's table, under serizba/salad's names after their prefix."""
     if config.dustbin.part_name in ("column", "row and column", "mass"):
-        yield Entry(("aggregator.dust_bin",), ("aggregator.dust_bin",), SAME)
+        yield Entry(("aggregator.dust_bin",), (f"{prefix}dust_bin",), SAME)
     for name, second, form in (
         ("token_features", 2, LINEAR),
         ("cluster_features", 3, POINTWISE),
         ("score", 3, POINTWISE),
     ):
-        yield from affine(f"aggregator.{name}.fc1", f"aggregator.{name}.0", form)
-        yield from affine(f"aggregator.{name}.fc2", f"aggregator.{name}.{second}", form)
+        yield from affine(f"aggregator.{name}.fc1", f"{prefix}{name}.0", form)
+        yield from affine(f"aggregator.{name}.fc2", f"{prefix}{name}.{second}", form)
 
 
-def infer_salad(state: State) -> SaladConfig:
+def infer_salad(state: State, prefix: str = "aggregator.") -> SaladConfig:
     """Infer SALAD's sizes."""
-    head = Reader(state)
+    head = Reader(state, prefix)
     return SaladConfig(
-        clusters=head.size("aggregator.score.3.weight", 0),
-        cluster_dim=head.size("aggregator.cluster_features.3.weight", 0),
-        token_dim=head.size("aggregator.token_features.2.weight", 0),
-        hidden=head.size("aggregator.score.0.weight", 0),
+        clusters=head.size("score.3.weight", 0),
+        cluster_dim=head.size("cluster_features.3.weight", 0),
+        token_dim=head.size("token_features.2.weight", 0),
+        hidden=head.size("score.0.weight", 0),
     )
 
 

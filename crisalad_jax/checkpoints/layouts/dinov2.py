@@ -37,12 +37,18 @@ def accepts_bare_backbone(config: ModelConfig) -> str | None:
 
 
 def accepts_parts(
-    config: ModelConfig, aggregator: str, adapter: str, *, cross_image: bool
+    config: ModelConfig,
+    aggregator: str,
+    adapter: str,
+    *,
+    cross_image: bool,
+    projection: bool = False,
 ) -> str | None:
     """Accept a vision transformer with exactly these parts; else return them in words."""
     parts = parts_in_words(config)
     encoder = "an" if cross_image else "no"
     expected = f"aggregator {aggregator}, adapter {adapter}, {encoder} encoder"
+    expected += ", a projection" * projection
     return None if parts == expected else expected
 
 
@@ -50,10 +56,11 @@ def parts_in_words(config: ModelConfig) -> str:
     """Name a model's parts."""
     backbone = config.backbone
     encoder = "an" if config.cross_image.layers else "no"
+    projection = ", a projection" if config.projection.dim else ""
     words = f"aggregator {config.aggregator.part_name}"
     if isinstance(backbone, ViTConfig):
-        return f"{words}, adapter {backbone.adapter.kind}, {encoder} encoder"
-    return f"{words}, backbone {backbone.part_name}, {encoder} encoder"
+        return f"{words}, adapter {backbone.adapter.kind}, {encoder} encoder{projection}"
+    return f"{words}, backbone {backbone.part_name}, {encoder} encoder{projection}"
 
 
 def vit_of(config: ModelConfig) -> ViTConfig:
@@ -62,15 +69,19 @@ def vit_of(config: ModelConfig) -> ViTConfig:
     return config.backbone
 
 
-def vit_lines(config: ViTConfig, prefix: str) -> Lines:
-    """Yield the backbone under facebookresearch/dinov2's names, adapters under CricaVPR's."""
+def vit_lines(config: ViTConfig, prefix: str, *, mask_token: bool = True) -> Lines:
+    """Yield the backbone under facebookresearch/dinov2's names, adapters under CricaVPR's.
+
+    Only training from nothing uses the mask token; some files leave it out.
+    """
     yield Entry(("backbone.cls_token",), (f"{prefix}cls_token",), CLASS_TOKEN)
     yield Entry(
         ("backbone.pos_embed_cls", "backbone.pos_embed"), (f"{prefix}pos_embed",), POSITIONS
     )
     if config.registers:
         yield Entry(("backbone.register_tokens",), (f"{prefix}register_tokens",), FIRST)
-    yield Extra("backbone.mask_token", f"{prefix}mask_token", (1, config.dim), np.float32)
+    if mask_token:
+        yield Extra("backbone.mask_token", f"{prefix}mask_token", (1, config.dim), np.float32)
     yield from affine("backbone.patch_embed", f"{prefix}patch_embed.proj", PATCHES)
     for i in range(config.depth):
         ours, theirs = f"backbone.blocks.{i}", f"{prefix}blocks.{i}"

@@ -11,6 +11,7 @@ from crisalad_jax.checkpoints.layouts.base import (
 from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines, infer_encoder
 from crisalad_jax.checkpoints.layouts.dino_salad import infer_salad
 from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words, vit_config, vit_lines
+from crisalad_jax.checkpoints.layouts.forms import LINEAR, affine
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -29,6 +30,8 @@ def _lines(config: ModelConfig) -> Lines:
     yield from vit_lines(config.backbone, _BACKBONE)
     yield from head_lines(config)
     yield from encoder_lines(config.cross_image)
+    if config.projection.dim:
+        yield from affine("projection", "projection", LINEAR)
 
 
 def _infer(state: State) -> ModelConfig:

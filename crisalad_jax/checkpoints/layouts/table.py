@@ -48,12 +48,23 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
     Raises:
         InputError: naming `source`, if the names are of no layout or the widths of no model.
     """
+    found: list[tuple[int, str, ModelConfig]] = []
+    problems: list[InputError] = []
     for layout in LAYOUTS.values():
         if layout.infer is not None and layout.detects(state):
             try:
-                return layout.name, layout.infer(state)
+                config = layout.infer(state)
+                names = public_shapes(config, layout.name).keys()
             except InputError as error:
-                raise InputError(f"{source}: {error}") from error
+                problems.append(error)
+            else:
+                found.append((len(names ^ state.keys()), layout.name, config))
+    if found:
+        # Families share names: the one that holds most of them, and the first of equals.
+        _, name, config = min(found, key=lambda each: each[0])
+        return name, config
+    if problems:
+        raise InputError(f"{source}: {problems[0]}") from problems[0]
     names = ", ".join(sorted(state)[:3]) or "none"
     raise InputError(
         f"{source}: found no checkpoint that we know (its first names: {names}); expected "

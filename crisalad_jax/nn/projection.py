@@ -1,0 +1,36 @@
+"""Project whole descriptors by a linear layer, such as MegaLoc's last one or a stored whitening."""
+
+import dataclasses
+
+from jaxtyping import Array, Float
+
+from crisalad_jax.config.checks import check_types, require
+from crisalad_jax.nn.layers import Linear, l2_normalise, linear
+
+
+@dataclasses.dataclass(frozen=True)
+class ProjectionConfig:
+    """A linear layer with a bias over the unit descriptor, the last of a model.
+
+    Example:
+        >>> ProjectionConfig(dim=4096).renormalise
+        True
+    """
+
+    dim: int = 0
+    """Width of the projected descriptor. 0 leaves the layer out."""
+    renormalise: bool = True
+    """Whether projected descriptors are made unit vectors again."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_types(self)
+        require(self.dim >= 0, f"ProjectionConfig.dim: found {self.dim}, expected at least 0")
+
+
+def project(
+    params: Linear, descriptors: Float[Array, "image descriptor"], config: ProjectionConfig
+) -> Float[Array, "image projected"]:
+    """Project descriptors, and make them unit vectors if asked to."""
+    projected = linear(params, descriptors)
+    return l2_normalise(projected) if config.renormalise else projected
