@@ -14,6 +14,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source
 
 
 def read_start(
@@ -42,6 +43,7 @@ def read_start(
         return params
     if backbone is None:
         return None
+    check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     fresh = init_crisalad(jax.random.key(config.seed), config.model)
     pretrained = read_backbone(backbone, config.model.backbone, fresh.backbone)
     return dataclasses.replace(fresh, backbone=pretrained)

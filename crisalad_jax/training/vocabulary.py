@@ -30,7 +30,7 @@ from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target
+from crisalad_jax.utils.files import check_source, check_target
 from crisalad_jax.utils.progress import progress_bar
 
 IMAGES = 500
@@ -155,6 +155,8 @@ def start_vocabulary(
             )
     part = dataclasses.replace(part, **(fields or {}))
     config = dataclasses.replace(config, aggregator=part).resized(image_size)
+    if backbone is not None:
+        check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     params = init_crisalad(jax.random.key(seed), config)
     if backbone is not None:
         pretrained = read_backbone(backbone, config.backbone, params.backbone)

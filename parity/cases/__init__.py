@@ -18,6 +18,7 @@ from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -45,6 +46,7 @@ AGGREGATORS: Mapping[str, Aggregator] = {
     "mixvpr": MixVprConfig(channels=20, rows=3, depth=2),
     "netvlad": NetVladConfig(clusters=5),
     "salad": SALAD,
+    "supervlad": SuperVladConfig(clusters=3, ghosts=2),
     "transvpr": TransVprConfig(levels=2, dim=24),
 }
 """Tiny ones, by their names."""
@@ -93,6 +95,7 @@ HEADS = {
     "CosPlace's head": "cosplace",
     "MixVPR": "mixvpr",
     "BoQ": "boq",
+    "SuperVLAD": "supervlad",
 }
 """What they are called in the table."""
 

@@ -16,6 +16,7 @@ from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -32,7 +33,7 @@ from parity.reference.salad import Salad, published_order
 from parity.reference.tokens import Tokens, as_sequence, from_sequence
 from parity.reference.transvpr import TransVpr
 from parity.reference.vit import Features, ViT
-from parity.reference.vlad import AnyLoc, NetVlad
+from parity.reference.vlad import AnyLoc, NetVlad, SuperVlad
 
 TRANSPOSED = (SaladConfig, ConvApConfig, MixVprConfig, BoqConfig)
 """Whose public descriptors have all local tokens' first number, then all their second."""
@@ -44,6 +45,7 @@ HELD = (
     GemConfig,
     GemPyramidConfig,
     NetVladConfig,
+    SuperVladConfig,
     TransVprConfig,
 )
 
@@ -107,7 +109,7 @@ class Crisalad(nn.Module):
             return self.aggregate(self.backbone.facet(images, found.block(depth), found.facet))
         if isinstance(found, TransVprConfig):
             return self.aggregate(self.backbone(images, found.features(depth).levels))
-        if isinstance(found, BoqConfig) and not found.last_norm:
+        if isinstance(found, BoqConfig | MixVprConfig) and not found.last_norm:
             return self.aggregate(self.backbone.facet(images, depth - 1, "token"))
         return self.aggregate(self.backbone(images))
 
@@ -117,6 +119,8 @@ class Crisalad(nn.Module):
             return self.aggregator(features)
         if self.aggregator is not None:
             return Tokens.of_local(self.aggregator(features.patches))
+        if isinstance(self.aggregation, SuperVlad):
+            return self.aggregation(features)
         if isinstance(self.aggregation, CosPlace):
             return Tokens.of_global(self.aggregation(features.patches))
         class_token = at_least_float32(features.class_token)
@@ -168,6 +172,8 @@ def _aggregation(config: ModelConfig) -> nn.Module | None:
     found = config.aggregator
     if isinstance(found, CosPlaceConfig):
         return CosPlace(config.backbone.dim, found.dim)
+    if isinstance(found, SuperVladConfig):
+        return SuperVlad(config.backbone.dim, found.clusters, found.ghosts)
     if isinstance(found, GemConfig):
         return nn.Sequential(UnitPatches(), GeM())
     if isinstance(found, GemPyramidConfig):

@@ -1,4 +1,4 @@
-"""NetVLAD (Arandjelovic et al., CVPR 2016), and AnyLoc's hard VLAD (Keetha et al., RA-L 2023)."""
+"""NetVLAD (Arandjelovic et al. 2016), AnyLoc's hard VLAD (Keetha et al. 2023), SuperVLAD (2024)."""
 
 import torch
 from torch import Tensor, nn
@@ -39,6 +39,23 @@ class AnyLoc(nn.Module):
         nearest = torch.cdist(patches.mT, self.words.expand(len(patches), -1, -1)).argmin(dim=2)
         shares = F.one_hot(nearest, len(self.words)).mT.to(patches.dtype)
         return _tokens(features, _vlad(shares, patches, self.words))
+
+
+class SuperVlad(nn.Module):
+    """Sums of patches, not of residuals; ghosts take shares and are dropped."""
+
+    def __init__(self, dim: int, clusters: int, ghosts: int) -> None:
+        """Random, as torch's layers start."""
+        super().__init__()
+        self.clusters = clusters
+        self.conv = nn.Conv2d(dim, clusters + ghosts, 1, bias=False)
+
+    def forward(self, features: Features) -> Tokens:
+        """V(k) = sum of a_k(x) x over the patches, each of length 1, then all of them together."""
+        patches = F.normalize(at_least_float32(features.patches), dim=1)
+        shares = self.conv(patches).softmax(dim=1).flatten(2)[:, : self.clusters]
+        sums = F.normalize(shares @ patches.flatten(2).mT, dim=2)
+        return _tokens(features, F.normalize(sums.flatten(1), dim=1).view_as(sums))
 
 
 def _vlad(shares: Tensor, patches: Tensor, centroids: Tensor) -> Tensor:

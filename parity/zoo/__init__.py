@@ -16,7 +16,10 @@ import numpy as np
 HERE = pathlib.Path(__file__).parent
 NAMES = tuple(sorted(path.stem for path in (HERE / "goldens").glob("*.npz")))
 SEED = 11
-CHANGED: tuple[tuple[str, str, float], ...] = (("^megaloc", r"aggregator\.linear\.bias$", 0.02),)
+CHANGED: tuple[tuple[str, str, float], ...] = (
+    ("^megaloc", r"aggregator\.linear\.bias$", 0.02),
+    ("^supervlad", r"aggregation\.conv\.weight$", 100.0),
+)
 """Weights of another size than the rest: a pattern of models, one of names, and a factor. With them
 a descriptor depends on the image more than on a bias."""
 
@@ -34,9 +37,10 @@ def golden(name: str) -> dict[str, np.ndarray]:
 
 
 def random_state(name: str, seed: int = SEED) -> dict[str, np.ndarray]:
-    """Return random weights by name, without the names of outer dictionaries."""
+    """Return random weights by name, without outer dictionaries' names and torch's `module.`."""
     shapes = {key.rpartition("/")[2]: shape for key, shape in layout(name).items()}
-    return {key: _array(name, key, shape, seed) for key, shape in shapes.items()}
+    arrays = {key: _array(name, key, shape, seed) for key, shape in shapes.items()}
+    return {key.removeprefix("module."): array for key, array in arrays.items()}
 
 
 def _array(model: str, key: str, shape: tuple[int, ...], seed: int) -> np.ndarray:

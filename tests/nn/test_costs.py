@@ -21,6 +21,7 @@ from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
@@ -156,6 +157,8 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
     # Scores, and sums by them.
     "netvlad": (NetVladConfig(clusters=5), 2 * PATCHES * DIM * 5),
     "anyloc": (AnyLocConfig(clusters=7, layer=-1), 2 * PATCHES * DIM * 7),
+    # Six score, four are summed.
+    "supervlad": (SuperVladConfig(clusters=4, ghosts=2), PATCHES * DIM * (6 + 4)),
     # Three levels score each patch three times, and are summed up once; then a linear layer.
     "transvpr": (
         TransVprConfig(levels=3, dim=24),

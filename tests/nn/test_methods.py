@@ -19,6 +19,7 @@ from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig, init_cross_image
@@ -49,6 +50,7 @@ PARTS: dict[str, Aggregator] = {
     "mixvpr": MixVprConfig(channels=16, rows=2, depth=2),
     "anyloc": AnyLocConfig(clusters=4, layer=-1),
     "boq": BoqConfig(channels=16, queries=3, rows=2),
+    "supervlad": SuperVladConfig(clusters=3),
     "transvpr": TransVprConfig(levels=2, dim=16),
 }
 METHODS = [

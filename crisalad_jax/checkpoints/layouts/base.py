@@ -6,14 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.checkpoints.layouts.forms import SAME, Entry, Extra
+from crisalad_jax.checkpoints.layouts.forms import SAME, Absent, Entry, Extra
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 State = Mapping[str, np.ndarray]
-Lines = Iterator[Entry | Extra]
+Lines = Iterator[Entry | Extra | Absent]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
     POINTWISE,
     POSITIONS,
     SAME,
+    Absent,
     Entry,
     Extra,
     affine,
@@ -69,10 +70,12 @@ def vit_of(config: ModelConfig) -> ViTConfig:
     return config.backbone
 
 
-def vit_lines(config: ViTConfig, prefix: str, *, mask_token: bool = True) -> Lines:
+def vit_lines(
+    config: ViTConfig, prefix: str, *, mask_token: bool = True, norm: bool = True
+) -> Lines:
     """Yield the backbone under facebookresearch/dinov2's names, adapters under CricaVPR's.
 
-    Only training from nothing uses the mask token; some files leave it out.
+    Some files leave out what they do not use: the mask token, or the last layer norm.
     """
     yield Entry(("backbone.cls_token",), (f"{prefix}cls_token",), CLASS_TOKEN)
     yield Entry(
@@ -94,7 +97,11 @@ def vit_lines(config: ViTConfig, prefix: str, *, mask_token: bool = True) -> Lin
             yield from affine(f"{ours}.mlp.{name}", f"{theirs}.mlp.{name}", LINEAR)
         yield Entry((f"{ours}.ls2",), (f"{theirs}.ls2.gamma",), SAME)
         yield from adapter_lines(config, f"{ours}.adapter", f"{theirs}.adapter")
-    yield from affine("backbone.norm", f"{prefix}norm", SAME)
+    if norm:
+        yield from affine("backbone.norm", f"{prefix}norm", SAME)
+    else:
+        yield Absent("backbone.norm.weight", 1.0)
+        yield Absent("backbone.norm.bias", 0.0)
 
 
 def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:

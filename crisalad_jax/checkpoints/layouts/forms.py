@@ -35,6 +35,13 @@ class Extra(NamedTuple):
     dtype: type
 
 
+class Absent(NamedTuple):
+    """An array of ours that no output needs and their files leave out: filled when read."""
+
+    ours: str
+    value: float
+
+
 SAME = Form(lambda x: (x,), lambda x: (x,))
 LINEAR = Form(lambda w: (w.T,), lambda w: (w.T,))
 FIRST = Form(lambda x: (x[0],), lambda x: (x[None],))

@@ -10,7 +10,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.layouts.base import LAYOUTS, State
 from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words
-from crisalad_jax.checkpoints.layouts.forms import Entry, Extra
+from crisalad_jax.checkpoints.layouts.forms import Absent, Entry, Extra
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences
@@ -23,7 +23,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 
-def table(config: ModelConfig, layout: str) -> list[Entry | Extra]:
+def table(config: ModelConfig, layout: str) -> list[Entry | Extra | Absent]:
     """Return a layout's table for a model, in the public order, without the prefix `module.`.
 
     Raises:
@@ -133,7 +133,7 @@ def public_shapes(config: ModelConfig, layout: str) -> dict[str, tuple[int, ...]
     for line in table(config, layout):
         if isinstance(line, Extra):
             shapes[line.theirs] = line.shape
-        else:
+        elif isinstance(line, Entry):
             # Broadcast arrays have shapes without memory of their own.
             blanks = (np.broadcast_to(np.float32(0), wanted[name].shape) for name in line.ours)
             arrays = line.form.theirs(*blanks)
@@ -165,11 +165,15 @@ def to_params(
             f"{source}: does not fit the layout {layout} of {_size(config)}: "
             f"{'; '.join(sorted(problems, key=_natural))}"
         )
+    template = named_leaves(parameter_shapes(config))
     ours: dict[str, np.ndarray] = {}
     extras: dict[str, np.ndarray] = {}
     for line in table(config, layout):
         if isinstance(line, Extra):
             extras[line.name] = state[line.theirs]
+        elif isinstance(line, Absent):
+            shape = template[line.ours].shape
+            ours[line.ours] = np.full(shape, line.value, np.float32)
         else:
             arrays = line.form.ours(*(state[name] for name in line.theirs))
             ours |= zip(line.ours, arrays, strict=True)
@@ -189,7 +193,7 @@ def to_state(
     for line in table(config, layout):
         if isinstance(line, Extra):
             state[line.theirs] = extras.get(line.name, np.zeros(line.shape, line.dtype))
-        else:
+        elif isinstance(line, Entry):
             arrays = line.form.theirs(*(np.asarray(ours[name]) for name in line.ours))
             for name, array in zip(line.theirs, arrays, strict=True):
                 state[name] = np.ascontiguousarray(array).reshape(array.shape)

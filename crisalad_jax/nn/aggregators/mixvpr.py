@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
     Keys,
     LayerNorm,
@@ -61,10 +61,16 @@ class MixVprConfig(Aggregator):
     """Number of values of each channel after the projection."""
     depth: int = 4
     """Number of feature mixers, as wide inside as there are patches."""
+    last_norm: bool = True
+    """Whether patches go through the backbone's last layer norm. In DINO-Mix they do not."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "channels", "rows", "depth")
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the last patches."""
+        return FeatureRequest(norm=self.last_norm)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one token for each row."""
