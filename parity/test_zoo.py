@@ -23,6 +23,9 @@ LAYOUTS = {
     "supervlad_crossimage": "supervlad",
 }
 
+QUICK = ("boq_dinov2_12288", "supervlad_crossimage")
+"""Enough for the test command: full-size models take ten seconds and more each."""
+
 
 def test_every_golden_is_compared() -> None:
     assert set(LAYOUTS) == set(zoo.NAMES)
@@ -33,7 +36,10 @@ def compare(found: jax.Array, expected: np.ndarray) -> None:
     assert np.linalg.norm(found - expected) < BOUND * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in LAYOUTS],
+)
 def test_descriptors_are_the_public_codes(name: str) -> None:
     state, golden = zoo.random_state(name), zoo.golden(name)
     layout, config = infer(state, source=name)
@@ -52,6 +58,7 @@ def test_descriptors_are_the_public_codes(name: str) -> None:
     assert np.linalg.norm(expected - expected[::-1]) > 1e-2
 
 
+@pytest.mark.slow
 def test_megalocs_first_file_is_the_same_model() -> None:
     state = zoo.random_state("megaloc")
     names = zoo.layout("megaloc_v1_torch")
