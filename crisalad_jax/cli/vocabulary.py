@@ -6,6 +6,7 @@ from typing import Literal
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import say
+from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.vocabulary import (
@@ -63,6 +64,7 @@ class Vocabulary:
 def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
     check_target(arguments.out, ".safetensors")
+    list_images(arguments.images)  # first: drawing parameters takes seconds
     params, config = _model(arguments)
     built = build_vocabulary(
         params,

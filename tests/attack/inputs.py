@@ -1522,7 +1522,7 @@ def main() -> int:
     parser.add_argument("--most", type=int, default=None)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", default="")
-    parser.add_argument("--limit", type=float, default=20, help="seconds until a command hangs")
+    parser.add_argument("--limit", type=float, default=60, help="seconds until a command hangs")
     parser.add_argument("--world", type=pathlib.Path, help="a folder to keep the world in")
     given = parser.parse_args()
     import_everything()
