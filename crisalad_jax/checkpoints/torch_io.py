@@ -7,6 +7,7 @@ import pathlib
 import pickle
 import re
 import warnings
+import zipfile
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -133,6 +134,7 @@ def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 def _read_torch(path: pathlib.Path) -> Any:
     torch = _torch(f"read {path}")
+    _check_unpacked_size(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about deprecated formats, which are refused below
@@ -164,6 +166,28 @@ def _read_torch(path: pathlib.Path) -> Any:
             raise InputError(f"{path}: {name} is no plain tensor: {error}") from error
 
     return arrays(content, "its content")
+
+
+def _check_unpacked_size(path: pathlib.Path) -> None:
+    """Check that a torch archive does not unpack to more than its own size.
+
+    Torch stores tensors as they are, but reads compressed ones too: some kilobytes could fill any
+    memory.
+
+    Raises:
+        InputError: it does.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(each.file_size for each in archive.infolist())
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        return  # torch says what is wrong with it
+    size = path.stat().st_size
+    if unpacked > size:
+        raise InputError(
+            f"{path}: found an archive of {size} bytes that unpacks to {unpacked}, expected a "
+            "torch checkpoint, whose tensors are not compressed"
+        )
 
 
 def _torch(purpose: str) -> Any:

@@ -232,8 +232,9 @@ def _is_out_of_memory(error: Exception) -> bool:
 _WORDS_OF_MEMORY = (
     *("RESOURCE_EXHAUSTED", "Insufficient memory", "bad_alloc", "Cannot allocate memory"),
     *("failed to map segment", "can't start new thread", "Unable to allocate"),
+    "error return without exception set",
 )
-"""What XLA, OpenCV, C++, the system, its linker, Python's threads and numpy say."""
+"""What XLA, OpenCV, C++, the system, its linker, Python's threads, numpy and code in C say."""
 
 
 def _tell_of_plugin(error: BaseException) -> int | None:

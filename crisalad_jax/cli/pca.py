@@ -43,6 +43,7 @@ def run(arguments: Pca) -> None:
         PcaConfig(arguments.whiten, arguments.renormalise),
         samples=arguments.samples,
         seed=arguments.seed,
+        name=str(arguments.descriptors),
         quiet=arguments.quiet,
     )
     save_pca(arguments.out, pca)

@@ -21,6 +21,10 @@ class Positions(NamedTuple):
     of: dict[str, tuple[float, float]]
 
 
+MOST_METRES = 1e8
+"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+
+
 def utm_position(name: str) -> tuple[float, float] | None:
     """Read east and north in metres from a name `@UTM_east@UTM_north@...`; None for other names."""
     fields = name.split("@")
@@ -99,4 +103,8 @@ def _position(row: dict[str, str], axes: tuple[str, str], where: str) -> tuple[f
         raise InputError(f"{where}: found {texts}, expected two finite numbers")
     if axes == AXES[1] and not (abs(first) <= 90 and abs(second) <= 180):
         raise InputError(f"{where}: found {texts}, expected a latitude and a longitude")
+    if max(abs(first), abs(second)) > MOST_METRES:
+        raise InputError(
+            f"{where}: found {texts}, expected metres east and north, at most {MOST_METRES:g}"
+        )
     return first, second

@@ -110,6 +110,7 @@ def fit_pca(
     *,
     samples: int | None = SAMPLES,
     seed: int = 0,
+    name: str = "descriptors",
     quiet: bool = True,
 ) -> Pca:
     """Fit `dim` principal components, in memory that depends on d alone.
@@ -123,6 +124,7 @@ def fit_pca(
         config: whether to whiten, and whether to normalise.
         samples: fit at most so many descriptors, drawn at random; None for all.
         seed: draws them.
+        name: what messages call the descriptors, such as their file.
         quiet: no progress bar.
 
     Returns:
@@ -140,18 +142,18 @@ def fit_pca(
         (50, 3)
     """
     check_seed("seed", seed)
-    descriptors = as_rows(descriptors, "descriptors")
+    descriptors = as_rows(descriptors, name)
     total, length = descriptors.shape
     count = total if samples is None else min(samples, total)
     if count < 2:
-        raise InputError(f"descriptors: found {count} to fit to, expected at least 2")
+        raise InputError(f"{name}: found {count} to fit to, expected at least 2")
     if not 1 <= dim <= min(count - 1, length):
         raise InputError(
             f"dim: found {dim}, expected 1 to {min(count - 1, length)}, the highest rank that "
             f"{count} descriptors of length {length} can have about their mean"
         )
     places = None if count == total else sample(total, count, seed)
-    chunks = pieces(descriptors, "descriptors", _rows_at_a_time(length), places)
+    chunks = pieces(descriptors, name, _rows_at_a_time(length), places)
     with progress_bar("components", count, "rows", quiet=quiet) as bar:
         if count <= length:
             fitted = _by_gram(_told(chunks, bar), dim)
@@ -222,6 +224,8 @@ def _leading(
     matrix: Float64[np.ndarray, "m m"], dim: int, count: int, length: int
 ) -> tuple[Float64[np.ndarray, " dim"], Float64[np.ndarray, "dim m"]]:
     """Return the `dim` largest eigenvalues and their vectors, largest first."""
+    # OpenBLAS, which comes with it, waits for ever for memory that is not there: ask first.
+    np.empty((1 + (os.cpu_count() or 1), 2**25), np.uint8)
     import scipy.linalg  # takes a tenth of a second, which applying components does not need
 
     size = len(matrix)

@@ -491,3 +491,17 @@ def test_without_torch_its_files_ask_for_it(tmp_path: pathlib.Path, monkeypatch)
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(InputError, match=r"torch is needed and not installed"):
         read_checkpoint(source)
+
+
+def test_an_archive_that_unpacks_to_more_than_its_size_is_not_read(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "bomb.pth"
+    torch.save({"cls_token": torch.zeros(2**20)}, tmp_path / "whole.pth")
+    with (
+        zipfile.ZipFile(tmp_path / "whole.pth") as whole,
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bomb,
+    ):
+        for each in whole.infolist():
+            bomb.writestr(each.filename, whole.read(each))
+    words = r"bomb\.pth: found an archive of \d+ bytes that unpacks to 419\d+, expected a torch"
+    with pytest.raises(InputError, match=words):
+        read_checkpoint(path)

@@ -36,6 +36,7 @@ def test_a_table_in_any_order_with_more_columns(tmp_path, axes):
         ("name,east,north\na,1,\n", r"line 2: found \['1', ''\], expected two finite numbers"),
         ("name,east,north\na,1\n", r"line 2: found \['1', None\], expected two finite"),
         ("name,east,north\na,1,inf\n", "line 2: .*expected two finite numbers"),
+        ("name,east,north\na,1,1e300\n", r"line 2: .*expected metres .*, at most 1e\+08"),
         (
             "name,east,north,lat,lon\na,1,2,3,4\n",
             "found columns name, east, north, lat, lon, expected name,east,north or name,lat,lon, "

@@ -1,5 +1,6 @@
 """Which database images are right for a query: by distance, or as a file lists them."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,10 +17,10 @@ def check_radius(radius: float) -> None:
     """Check a distance in metres.
 
     Raises:
-        InputError: it is negative or no number.
+        InputError: it is negative, infinite or no number.
     """
-    if not radius >= 0:
-        raise InputError(f"radius: found {radius}, expected metres from 0")
+    if not 0 <= radius < math.inf:
+        raise InputError(f"radius: found {radius}, expected finite metres from 0")
 
 
 def within(

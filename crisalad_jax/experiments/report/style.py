@@ -3,13 +3,17 @@
 They are drawn with matplotlib's object interface: no display, and no state outside the call.
 """
 
+import contextlib
 import os
+import warnings
+from collections.abc import Iterator
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text as Label
 
 from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.utils.output import printable
 
 INK = "#222222"
 GREY = "#757575"
@@ -26,9 +30,26 @@ NARROW, NARROW_DPI = 4.0, 200
 
 def fit_width(label: Label, figure: Figure) -> None:
     """Shrink a line of text so that its right margin is at least its left one."""
-    extent = label.get_window_extent()
+    with _any_names(figure):
+        extent = label.get_window_extent()
     room = figure.bbox.width - 2 * extent.x0
     label.set_fontsize(float(label.get_fontsize()) * min(1, room / extent.width))
+
+
+@contextlib.contextmanager
+def _any_names(figure: Figure) -> Iterator[None]:
+    """Let texts hold the name of any file while they are drawn.
+
+    Control characters and bytes that are no UTF-8 are drawn as escapes. Letters that the font lacks
+    are drawn as boxes, without the warning that would print them.
+    """
+    for label in figure.findobj(Label):
+        text = label.get_text()
+        if text != printable(text):
+            label.set_text(printable(text))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph .* missing", UserWarning)
+        yield
 
 
 def plain_axes(axes: Axes) -> None:
@@ -42,5 +63,5 @@ def plain_axes(axes: Axes) -> None:
 
 def save(figure: Figure, path: str | os.PathLike[str], dpi: int = DPI) -> None:
     """Write a figure as a PNG, whole or not at all, with `dpi` dots an inch."""
-    with atomic_path(path) as temporary:
+    with atomic_path(path) as temporary, _any_names(figure):
         figure.savefig(temporary, format="png", dpi=dpi, facecolor="white")

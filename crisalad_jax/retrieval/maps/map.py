@@ -183,14 +183,19 @@ class Map:
         try:
             columns = (record["names"], record["bytes"], record["positions"])
             images = [
-                MapImage(str(name), int(size), at and (float(at[0]), float(at[1])), record["root"])
+                MapImage(
+                    _inside(name),
+                    int(size),
+                    at and (float(at[0]), float(at[1])),
+                    record["root"],
+                )
                 for name, size, at in zip(*columns, strict=True)
             ]
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
             segment = _Segment(len(self), len(images), str(record["sha256"]))
             if not images:
                 raise ValueError("no images")
-        except (ValueError, LookupError, TypeError) as error:
+        except (ValueError, LookupError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: not a whole record of images: {error!r}") from error
         self._take(images, axes, segment)
 
@@ -408,3 +413,12 @@ def open_for_appending(
                 raise InputError(f"{folder}: found another map than was expected here")
             write_record(folder / DESCRIPTION, to_plain(description), indent=2)
         yield stack.enter_context(Map._opened(folder, description))
+
+
+def _inside(name: object) -> str:
+    """Return the name of an image, which is below its root; raise ValueError where it is not."""
+    name = str(name)
+    path = pathlib.PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"found name {name!r}, expected one below the folder of images")
+    return name

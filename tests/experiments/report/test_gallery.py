@@ -157,3 +157,14 @@ def test_gallery_shows_the_queries_chosen_in_their_order(photographs, tmp_path):
 
 def _is_level(picture, number):
     return is_colour(picture, (60, 20 * number + 60, 90))
+
+
+def test_names_of_any_letters_are_drawn_without_a_word(photographs, tmp_path, recwarn):
+    """Control characters, bytes that are no UTF-8, and letters that the font lacks."""
+    moved = {side: list(paths) for side, paths in photographs.items()}
+    for number, name in enumerate(("a\x1b[31m\a\r.jpg", "caf\udce9.jpg", "\u6771\u4eac.jpg")):
+        path = tmp_path / name
+        path.write_bytes(moved["database"][number].read_bytes())
+        moved["database"][number] = path
+    _gallery(moved, tmp_path / "g.png", [[0, 1, 2]], [[0]], title="\x1b[31m caf\udce9")
+    assert not [str(warning.message) for warning in recwarn]

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import pathlib
 import socket
@@ -24,6 +25,7 @@ from crisalad_jax.retrieval.maps.manifest import (
     write_record,
 )
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.utils.checksums import sealed_json
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.notes import Note
@@ -252,6 +254,23 @@ def test_a_changed_descriptor_of_a_map_of_format_2_is_found(folder):
     data[-1] ^= 1
     path.write_bytes(data)
     with pytest.warns(Note), pytest.raises(InputError, match="1 to 2 have changed since"):
+        Map.open(folder)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"names": ["/etc/passwd"]}, "found name '/etc/passwd', expected one below the folder"),
+        ({"names": ["a/../../b.jpg"]}, "found name 'a/../../b.jpg', expected one below"),
+        ({"bytes": [math.inf]}, "cannot convert float infinity"),
+    ],
+)
+def test_a_record_of_no_images_below_its_folder_is_refused(folder, fields, words):
+    """With the right checksum: who forges a record can forge that too."""
+    path = folder / "segments/0000000000.json"
+    record = json.loads(path.read_text()) | fields
+    path.write_bytes(sealed_json(record))
+    with pytest.raises(InputError, match=rf"0000000000\.json: not a whole record .*{words}"):
         Map.open(folder)
 
 
