@@ -108,6 +108,16 @@ def test_a_file_or_module_that_is_not_there(given: str, words: str, capfd: Captu
     fails(capfd, "info", f"--plugin={given}", words=(words,))
 
 
+def test_a_file_of_gigabytes_is_not_read(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "mine.py"
+    with path.open("wb") as file:
+        file.truncate(2**32)
+    with pytest.raises(
+        InputError, match=r"mine\.py: found 4294967296 bytes, expected a file of Py"
+    ):
+        load_plugin(str(path))
+
+
 def test_in_a_process_of_its_own(tmp_path: pathlib.Path) -> None:
     """One line and code 2, whatever the interpreter would say of a file that is no program."""
     path = tmp_path / "mine.py"

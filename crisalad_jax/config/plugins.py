@@ -56,6 +56,10 @@ def load_plugin(plugin: str) -> None:
         raise InputError(f"plugin {plugin}: {error}") from error
 
 
+_LARGEST = 2**24
+"""Most bytes of a plug-in's file: Python reads and copies it whole."""
+
+
 def _load_module(name: str) -> None:
     try:
         spec = importlib.util.find_spec(name)
@@ -70,6 +74,8 @@ def _load_file(file: str) -> None:
     path = pathlib.Path(file)
     if not path.is_file():
         raise InputError("found no such file, expected FILE.py or MODULE")
+    if (size := path.stat().st_size) > _LARGEST:
+        raise InputError(f"found {size} bytes, expected a file of Python, of at most {_LARGEST}")
     path = real_path(path)
     # Give files of the same name different modules.
     name = f"crisalad_plugin_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"

@@ -91,6 +91,8 @@ def read_image(
             f"{path}: found an image cut short after {len(data)} bytes, or damaged, expected a "
             "whole one"
         )
+    if data.startswith(_PNG_SIGNATURE):
+        _check_png_size(data, path)
     try:
         with QUIET:
             flags = cv2.IMREAD_COLOR_RGB | _reduction(data, enough)
@@ -155,6 +157,18 @@ def _png_is_whole(data: bytes) -> bool:
         if kind == b"IEND":
             return bytes(4) not in (data[16:20], data[20:24])
     return False
+
+
+_PNG_SIDE = 1_000_000
+"""Largest side that libpng decodes; of a larger one it writes lines of its own."""
+
+
+def _check_png_size(data: bytes, path: str | os.PathLike[str]) -> None:
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    if max(width, height) > _PNG_SIDE:
+        raise InputError(
+            f"{path}: found {width} x {height} pixels, expected sides of at most {_PNG_SIDE}"
+        )
 
 
 def _crc(data: bytes) -> bytes:

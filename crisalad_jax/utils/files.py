@@ -118,13 +118,24 @@ def parse_json(text: str | bytes, source: str, expected: str) -> Any:
         expected: what it should hold.
 
     Raises:
-        InputError: it is no JSON, or is nested deeper than any that this package writes.
+        InputError: it is no JSON, has a key twice in an object, or is nested deeper than any that
+            this package writes.
     """
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_each_once)
     except (ValueError, RecursionError) as error:
         reason = "nested too deep" if isinstance(error, RecursionError) else error
         raise InputError(f"{source}: found no JSON ({reason}), expected {expected}") from error
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of JSON, of whose equal keys Python would take the last without a word."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} twice")
+    return value
 
 
 def read_json(

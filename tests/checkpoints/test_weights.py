@@ -385,6 +385,7 @@ def test_weights_that_do_not_fit_are_all_listed(tmp_path, shared, change, words)
             "far from the sizes",
         ),
         ({"crisalad-jax 1": '{"backbone": {"dim": 9000000000000}}'}, "of up to 9000000000000"),
+        ({"crisalad-jax 2": '{"a": 1, "a": 2}'}, r"found no JSON \(the key 'a' twice\)"),
         ({"crisalad-jax 2": ""}, r"\(metadata\): found no JSON \(Expecting value"),
         ({"crisalad-jax 2": "{"}, r"\(metadata\): found no JSON \(Expecting property name"),
         ({"crisalad-jax 2": "[]"}, "found no configuration in its metadata, expected 'config'"),

@@ -222,6 +222,12 @@ def test_no_image(tmp_path, data):
     assert "\n" not in str(caught.value)
 
 
+def test_a_png_of_a_side_that_libpng_would_warn_of(tmp_path, capfd):
+    with pytest.raises(InputError, match=r"found 2147483647 x 2 pixels, .* at most 1000000$"):
+        read_bytes(tmp_path, png_of_claimed_size(2**31 - 1, 2))
+    assert capfd.readouterr().err == ""
+
+
 def test_no_file(tmp_path):
     with pytest.raises(InputError, match=r"nothing\.jpg: found no such file, expected an image"):
         read_image(tmp_path / "nothing.jpg")

@@ -191,6 +191,8 @@ class Map:
                 )
                 for name, size, at in zip(*columns, strict=True)
             ]
+            if not isinstance(record["root"], str):
+                raise ValueError(f"found root {record['root']!r}, expected text")
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
             segment = _Segment(len(self), len(images), str(record["sha256"]))
             if not images:

@@ -262,6 +262,8 @@ def test_a_changed_descriptor_of_a_map_of_format_2_is_found(folder):
     [
         ({"names": ["/etc/passwd"]}, "found name '/etc/passwd', expected one below the folder"),
         ({"names": ["a/../../b.jpg"]}, "found name 'a/../../b.jpg', expected one below"),
+        ({"root": None}, "found root None, expected text"),
+        ({"root": 3}, "found root 3, expected text"),
         ({"bytes": [math.inf]}, "cannot convert float infinity"),
     ],
 )
