@@ -67,7 +67,7 @@ class ExportConfig:
         if not self.platforms:
             raise InputError(f"platforms: found none, expected some of {', '.join(PLATFORMS)}")
         for name in self.platforms:
-            choose("platform", name, dict.fromkeys(PLATFORMS))
+            choose("platforms", name, dict.fromkeys(PLATFORMS))
 
 
 def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -> None:

@@ -33,7 +33,7 @@ def test_flags_become_the_manifest(
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--platforms", "cpu,metal"), ("platform: found 'metal'", "cpu, cuda, rocm, tpu")),
+        (("--platforms", "cpu,metal"), ("platforms: found 'metal'", "cpu, cuda, rocm, tpu")),
         (("--image-size", "42", "50"), ("42 x 50", "multiples of 14")),
         (("--image-size", "28", "28"), ("4 patches for 4 clusters",)),
         (("--batch-size", "0"), ("batch size: found 0",)),
