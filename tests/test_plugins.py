@@ -112,9 +112,7 @@ def test_a_file_of_gigabytes_is_not_read(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "mine.py"
     with path.open("wb") as file:
         file.truncate(2**32)
-    with pytest.raises(
-        InputError, match=r"mine\.py: found 4294967296 bytes, expected a"
-    ):
+    with pytest.raises(InputError, match=r"mine\.py: found 4294967296 bytes, expected a"):
         load_plugin(str(path))
 
 

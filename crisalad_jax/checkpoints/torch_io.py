@@ -252,16 +252,17 @@ def _float32(name: str, array: np.ndarray, path: pathlib.Path) -> np.ndarray:
 
 
 def layout_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
-    """Choose the public layout that holds the whole model; Hugging Face's for a .safetensors."""
-    if pathlib.Path(target).suffix == ".safetensors":
-        return "huggingface"
-    for layout in ("dinov2", "dino-salad", "cricavpr"):
-        try:
-            check_holds(config, layout)
-        except InputError:
-            continue
-        return layout
-    return "reference"
+    """Choose the public layout, of safetensors or of torch, that holds the whole model."""
+    safetensors = pathlib.Path(target).suffix == ".safetensors"
+    fallback = "huggingface" if safetensors else "reference"
+    for name, layout in LAYOUTS.items():
+        if layout.safetensors == safetensors and name != fallback:
+            try:
+                check_holds(config, name)
+            except InputError:
+                continue
+            return name
+    return fallback
 
 
 def write_checkpoint(
@@ -281,7 +282,7 @@ def write_checkpoint(
     names = choose("layout", layout, LAYOUTS)
     check_holds(config, layout, extras)
     state = to_state(params, config, layout, extras)
-    if layout == "huggingface":
+    if names.safetensors:
         write_safetensors(path, state, {"format": "pt"})
         return
     torch = _torch(f"write {path}")
@@ -345,7 +346,7 @@ def convert(
     suffix = pathlib.Path(target).suffix
     if checkpoint.layout is None:
         layout = layout or layout_for(checkpoint.config, target)
-        wanted = (".safetensors",) if layout == "huggingface" else TORCH_SUFFIXES
+        wanted = (".safetensors",) if LAYOUTS[layout].safetensors else TORCH_SUFFIXES
         if suffix not in wanted:
             raise InputError(
                 f"{target}: found suffix {suffix!r}, expected {' or '.join(wanted)} for {layout}"

@@ -35,6 +35,8 @@ class Layout:
     """Prefix of all names, as torch's DataParallel adds it."""
     under: str | None = None
     """Key of the file's dictionary that holds the state; None: the file is the state."""
+    safetensors: bool = False
+    """Whether the family's files are of safetensors; else they are torch's."""
 
 
 LAYOUTS: dict[str, Layout] = {}
