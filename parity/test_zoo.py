@@ -16,14 +16,23 @@ from parity import zoo
 BOUND = 2e-5
 LAYOUTS = {
     "boq_dinov2_12288": "boq-dinov2",
+    "boq_resnet50_16384": "boq-resnet50",
+    "convap_resnet50_4096": "conv-ap",
+    "cosplace_resnet18_512": "cosplace",
+    "cosplace_resnet50_2048": "cosplace",
+    "cosplace_vgg16_512": "cosplace",
     "dinomix_vitb14": "dino-mix",
     "megaloc": "megaloc",
+    "mixvpr_resnet50_4096": "mixvpr",
+    "netvlad_vgg16_nanne": "netvlad",
+    "patchnetvlad_mapillary_WPCA4096": "patch-netvlad",
+    "patchnetvlad_pittsburgh_WPCA512": "patch-netvlad",
     "salad_cm": "dino-salad",
     "supervlad": "supervlad",
     "supervlad_crossimage": "supervlad",
 }
 
-QUICK = ("boq_dinov2_12288", "supervlad_crossimage")
+QUICK = ("boq_dinov2_12288", "cosplace_resnet18_512", "supervlad_crossimage")
 """Enough for the test command: full-size models take ten seconds and more each."""
 
 

@@ -55,9 +55,14 @@ class ModelConfig:
     def __post_init__(self) -> None:
         """Check that the parts fit each other."""
         resolve_names(self)
-        self.check_image_size(self.image_size)
-        self.aggregator.features(self.backbone.depth)
+        request = self.aggregator.features(self.backbone.depth)
         name = self.aggregator.part_name
+        require(
+            self.backbone.class_token or not request.class_token,
+            f"backbone: found {self.backbone.part_name}, which has no class token, expected one "
+            f"that has, for aggregator {name}",
+        )
+        self.check_image_size(self.image_size)
         require(
             self.aggregator.learns or not self.cross_image.layers,
             f"CrossImageConfig.layers: found {self.cross_image.layers} for aggregator {name}, with "

@@ -45,7 +45,7 @@ class Conv:
     """A k x k convolution; torch stores `weight` as (dim_out, dim_in, k, k)."""
 
     weight: Float[Array, "*stack k k d_in d_out"]
-    bias: Float[Array, "*stack d_out"]
+    bias: Float[Array, "*stack d_out"] | None
 
 
 @pytree_dataclass
@@ -180,16 +180,25 @@ def depthwise_conv(
     return sum(taps, start=params.bias).astype(x.dtype)
 
 
-def conv(params: Conv, x: Float[Array, "height width d_in"]) -> Float[Array, "height width d_out"]:
-    """Convolve (cross-correlate, as torch) at stride 1 with zero padding, in the type of `x`."""
+def conv(
+    params: Conv, x: Float[Array, "*batch height width d_in"], *, stride: int = 1
+) -> Float[Array, "*batch rows columns d_out"]:
+    """Convolve (cross-correlate, as torch) with zero padding of half a kernel, in the type of `x`.
+
+    A side of n pixels becomes ceil(n / stride) for kernels of odd sizes.
+    """
+    margin = params.weight.shape[0] // 2
     y = jax.lax.conv_general_dilated(
-        x[None],
+        x.reshape(-1, *x.shape[-3:]),
         params.weight.astype(x.dtype),
-        window_strides=(1, 1),
-        padding="SAME",
+        window_strides=(stride, stride),
+        # Not "SAME", which pads less before the image than after it where the stride is 2.
+        padding=((margin, margin), (margin, margin)),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
     )
-    return (at_least_float32(y[0]) + params.bias).astype(x.dtype)
+    if params.bias is not None:
+        y = at_least_float32(y) + params.bias
+    return y.astype(x.dtype).reshape(*x.shape[:-3], *y.shape[1:])
 
 
 def batch_norm(

@@ -21,14 +21,13 @@ class Linear(nn.Linear):
 
 
 class Conv2d(nn.Conv2d):
-    """Convolution with bias."""
+    """Convolution, with or without bias."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(batch, d_in, height, width) to (batch, d_out, height, width)."""
         weight = self.weight.to(x.dtype)
         y = F.conv2d(x, weight, stride=self.stride, padding=self.padding, groups=self.groups)
-        assert self.bias is not None
-        return y + self.bias.to(x.dtype)[:, None, None]
+        return y if self.bias is None else y + self.bias.to(x.dtype)[:, None, None]
 
 
 class LayerNorm(nn.LayerNorm):

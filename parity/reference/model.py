@@ -18,10 +18,14 @@ from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.backbones.base import Backbone
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.utils.errors import InputError
 from parity.reference.boq import Boq
+from parity.reference.cnn import ResNet, Vgg
 from parity.reference.conv_ap import ConvAp
 from parity.reference.cosplace import CosPlace
 from parity.reference.cross_image import CrossImageEncoder
@@ -64,8 +68,6 @@ class Crisalad(nn.Module):
             InputError: a part that is none of `crisalad_jax`'s own.
         """
         super().__init__()
-        if not isinstance(config.backbone, ViTConfig):
-            raise InputError(f"backbone: found {config.backbone.part_name}, expected vit")
         if not isinstance(config.aggregator, HELD):
             raise InputError(
                 f"aggregator: found {config.aggregator.part_name}, expected one that comes with "
@@ -73,7 +75,7 @@ class Crisalad(nn.Module):
             )
         self.config = config
         self.compute_dtype: torch.dtype = getattr(torch, config.compute_dtype)
-        self.backbone = ViT(config.backbone)
+        self.backbone = _backbone(config.backbone)
         self.aggregator = _aggregator(config)
         self.aggregation = _aggregation(config)
         self.encoder = (
@@ -88,7 +90,7 @@ class Crisalad(nn.Module):
         """Unit descriptors of a batch of images.
 
         Args:
-            images: (batch, 3, height, width), normalised; the sides are multiples of 14.
+            images: (batch, 3, height, width), normalised; the sides fit the backbone.
             mask: (batch, batch) of bool: `mask[i, j]` says that image i may look at image j. None
                 lets all look at all.
 
@@ -104,6 +106,8 @@ class Crisalad(nn.Module):
         """The first half of `forward`: every image's tokens, which owe nothing to other images."""
         self.config.check_image_size((images.shape[2], images.shape[3]))
         images = images.to(self.compute_dtype)
+        if not isinstance(self.backbone, ViT):
+            return self.aggregate(self.backbone(images))
         depth, found = self.config.backbone.depth, self.config.aggregator
         if isinstance(found, AnyLocConfig):
             return self.aggregate(self.backbone.facet(images, found.block(depth), found.facet))
@@ -147,6 +151,16 @@ class Crisalad(nn.Module):
             return descriptor
         projected = self.projection(descriptor)
         return l2_normalise(projected) if self.config.projection.renormalise else projected
+
+
+def _backbone(config: Backbone) -> ViT | ResNet | Vgg:
+    if isinstance(config, ViTConfig):
+        return ViT(config)
+    if isinstance(config, ResNetConfig):
+        return ResNet(config)
+    if isinstance(config, VggConfig):
+        return Vgg()
+    raise InputError(f"backbone: found {config.part_name}, expected vit, resnet or vgg")
 
 
 def _aggregator(config: ModelConfig) -> nn.Module | None:

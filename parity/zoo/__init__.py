@@ -19,9 +19,17 @@ SEED = 11
 CHANGED: tuple[tuple[str, str, float], ...] = (
     ("^megaloc", r"aggregator\.linear\.bias$", 0.02),
     ("^supervlad", r"aggregation\.conv\.weight$", 100.0),
+    ("^cosplace", r"aggregation\.3\.bias$", 0.1),
+    ("^cosplace_vgg16|netvlad", r"(backbone|encoder)\.\d+\.weight$", 2**0.5),
+    ("netvlad", r"(pool\.conv|score_proj)\.weight$", 100.0),
+    ("netvlad", r"(pool\.centroids|netvlad\.centers)$", 0.4),
+    ("netvlad", r"(whiten|WPCA\.0)\.bias$", 0.02),
+    ("^transvpr", r"pool\.fc\.1\.bias$", 0.1),
 )
 """Weights of another size than the rest: a pattern of models, one of names, and a factor. With them
 a descriptor depends on the image more than on a bias."""
+FIXED = {r"aggregation\.1\.p$": 3.0}
+"""Weights that are no draws, by a pattern of names: GeM's exponent."""
 
 
 def layout(name: str) -> dict[str, tuple[int, ...]]:
@@ -63,4 +71,7 @@ def _array(model: str, key: str, shape: tuple[int, ...], seed: int) -> np.ndarra
     for models, names, factor in CHANGED:
         if re.search(models, model) and re.search(names, key):
             array *= factor
+    for names, value in FIXED.items():
+        if re.search(names, key):
+            array = np.full(shape, value)
     return array.astype(np.float32)

@@ -10,6 +10,7 @@ from crisalad_jax.checkpoints.layouts.base import (
     register_head,
     register_layout,
 )
+from crisalad_jax.checkpoints.layouts.cnn import Names
 from crisalad_jax.checkpoints.layouts.dinov2 import accepts_parts, vit_config, vit_lines, vit_of
 from crisalad_jax.checkpoints.layouts.forms import (
     CONV,
@@ -21,7 +22,9 @@ from crisalad_jax.checkpoints.layouts.forms import (
     torch_attention,
     transformer_layer,
 )
+from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 
@@ -78,4 +81,15 @@ register_layout(
         lambda state: f"{_BACKBONE}cls_token" in state or f"{_BACKBONE}pos_embed" in state,
         _infer,
     )
+)
+
+register_over_cnn(
+    "boq-resnet50",
+    "BoQ-ResNet50 .pth",
+    "boq",
+    infer_boq,
+    backbones=(ResNetConfig,),
+    names=Names("backbone.net.", numbered=True),
+    mark="aggregator.proj_c.weight",
+    image_size=lambda state: (384, 384),
 )

@@ -1,11 +1,15 @@
-"""The heads of gmberton/CosPlace and EigenPlaces, and GeM alone."""
+"""The layout of gmberton/CosPlace and EigenPlaces, which is one, and the head of GeM alone."""
 
 from collections.abc import Iterator
 
-from crisalad_jax.checkpoints.layouts.base import register_head
+from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
+from crisalad_jax.checkpoints.layouts.cnn import Names
 from crisalad_jax.checkpoints.layouts.forms import FIRST, LINEAR, Entry, affine
+from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
 from crisalad_jax.nn.aggregators.gem import GemConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vgg import VggConfig
 
 
 @register_head("gem")
@@ -19,3 +23,20 @@ def cosplace_lines(config: CosPlaceConfig) -> Iterator[Entry]:
     """Yield the exponent and the linear layer."""
     yield Entry(("aggregator.p",), ("aggregation.1.p",), FIRST)
     yield from affine("aggregator.fc", "aggregation.3", LINEAR)
+
+
+def infer_cosplace(state: State) -> CosPlaceConfig:
+    """Infer the width of the descriptor."""
+    return CosPlaceConfig(dim=Reader(state).size("aggregation.3.weight", 0))
+
+
+register_over_cnn(
+    "cosplace",
+    "CosPlace and EigenPlaces .pth",
+    "cosplace",
+    infer_cosplace,
+    backbones=(ResNetConfig, VggConfig),
+    names=Names("backbone.", numbered=True),
+    mark="aggregation.3.weight",
+    image_size=lambda state: (480, 640),
+)

@@ -1,10 +1,16 @@
-"""MixVPR's head, under the names of amaralibey/MixVPR."""
+"""The layout of amaralibey/MixVPR (Ali-bey et al., WACV 2023), and its head for other layouts."""
 
+import functools
 from collections.abc import Iterator
 
 from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
+from crisalad_jax.checkpoints.layouts.cnn import Names, square_image
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, SAME, Entry, affine
+from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+
+_ROWS = "aggregator.row_proj.weight"
 
 
 @register_head("mixvpr")
@@ -28,3 +34,16 @@ def infer_mixvpr(state: State, *, last_norm: bool) -> MixVprConfig:
         depth=head.count("mix."),
         last_norm=last_norm,
     )
+
+
+register_over_cnn(
+    "mixvpr",
+    "MixVPR .ckpt",
+    "mixvpr",
+    # A ResNet has no last layer norm: the field keeps its default.
+    functools.partial(infer_mixvpr, last_norm=True),
+    backbones=(ResNetConfig,),
+    names=Names("backbone.model.", numbered=False),
+    mark=_ROWS,
+    image_size=lambda state: square_image(state, _ROWS, ResNetConfig(stages=3).patch_size),
+)

@@ -8,26 +8,30 @@ from crisalad_jax.checkpoints.layouts.base import (
     head_lines,
     register_layout,
 )
+from crisalad_jax.checkpoints.layouts.cnn import Names, cnn_lines
 from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines, infer_encoder
 from crisalad_jax.checkpoints.layouts.dino_salad import infer_salad
-from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words, vit_config, vit_lines
+from crisalad_jax.checkpoints.layouts.dinov2 import vit_config, vit_lines
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, affine
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.utils.errors import InputError
 
 _BACKBONE = "backbone."
 
 
 def _accepts(config: ModelConfig) -> str | None:
-    return None if isinstance(config.backbone, ViTConfig) else "a vision transformer"
+    held = isinstance(config.backbone, ViTConfig | ResNetConfig | VggConfig)
+    return None if held else "a backbone vit, resnet or vgg"
 
 
 def _lines(config: ModelConfig) -> Lines:
-    if not isinstance(config.backbone, ViTConfig):
-        raise InputError(f"layout reference: found {parts_in_words(config)}, expected a vit")
-    yield from vit_lines(config.backbone, _BACKBONE)
+    if isinstance(config.backbone, ViTConfig):
+        yield from vit_lines(config.backbone, _BACKBONE)
+    else:
+        yield from cnn_lines(config.backbone, Names(_BACKBONE, numbered=True))
     yield from head_lines(config)
     yield from encoder_lines(config.cross_image)
     if config.projection.dim:

@@ -106,8 +106,11 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
 
 def _told(config: ModelConfig) -> ModelConfig:
     """Return a configuration with all fields reset that a trained model's arrays do not show."""
+    encoder = config.cross_image if config.cross_image.layers else CrossImageConfig(layers=0)
+    config = dataclasses.replace(config, cross_image=encoder)
     backbone = config.backbone
-    assert isinstance(backbone, ViTConfig)
+    if not isinstance(backbone, ViTConfig):
+        return config
     adapter = backbone.adapter
     if adapter.kind == "none":
         adapter = AdapterConfig(kind="none")
@@ -118,8 +121,7 @@ def _told(config: ModelConfig) -> ModelConfig:
     backbone = dataclasses.replace(
         backbone, mlp_ratio=backbone.hidden / backbone.dim, adapter=adapter
     )
-    encoder = config.cross_image if config.cross_image.layers else CrossImageConfig(layers=0)
-    return dataclasses.replace(config, backbone=backbone, cross_image=encoder)
+    return dataclasses.replace(config, backbone=backbone)
 
 
 def public_shapes(config: ModelConfig, layout: str) -> dict[str, tuple[int, ...]]:
@@ -200,14 +202,15 @@ def to_state(
     return state
 
 
-_BLOCKS = "backbone.blocks."
+_STACK = re.compile(r"backbone\.blocks\.(?!\d)")
+"""Beginning of the names of stacked blocks; blocks that are no stack have numbers already."""
 
 
 def _numbered(leaves: Mapping[str, Any]) -> dict[str, Any]:
     """Split stacks of blocks into single blocks, with numbered names."""
     cut: dict[str, Any] = {}
     for name, leaf in leaves.items():
-        if not name.startswith(_BLOCKS):
+        if not _STACK.match(name):
             cut[name] = leaf
             continue
         for i in range(leaf.shape[0]):
@@ -215,17 +218,20 @@ def _numbered(leaves: Mapping[str, Any]) -> dict[str, Any]:
                 single: Any = jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype)
             else:
                 single = leaf[i]
-            cut[f"{_BLOCKS}{i}.{name.removeprefix(_BLOCKS)}"] = single
+            cut[_name_of_block(name, i)] = single
     return cut
+
+
+def _name_of_block(name: str, number: int) -> str:
+    return _STACK.sub(lambda match: f"{match[0]}{number}.", name)
 
 
 def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
     template = parameter_shapes(config)
     leaves = []
     for name, leaf in named_leaves(template).items():
-        if name.startswith(_BLOCKS):
-            inner = name.removeprefix(_BLOCKS)
-            leaves.append(np.stack([ours[f"{_BLOCKS}{i}.{inner}"] for i in range(leaf.shape[0])]))
+        if _STACK.match(name):
+            leaves.append(np.stack([ours[_name_of_block(name, i)] for i in range(leaf.shape[0])]))
         else:
             # Empty arrays, such as absent registers, have no line in any table.
             leaves.append(ours[name] if leaf.size else np.zeros(leaf.shape, leaf.dtype))

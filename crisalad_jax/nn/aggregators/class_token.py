@@ -3,7 +3,7 @@
 import dataclasses
 
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.backbones.base import FeatureRequest, Features
 from crisalad_jax.nn.layers import Keys, at_least_float32
 from crisalad_jax.nn.tokens import Tokens
 
@@ -12,6 +12,10 @@ from crisalad_jax.nn.tokens import Tokens
 @dataclasses.dataclass(frozen=True)
 class ClassTokenConfig(Aggregator):
     """The backbone's class token, by itself (Oquab et al. 2023)."""
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the class token."""
+        return FeatureRequest(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token as wide as the backbone."""

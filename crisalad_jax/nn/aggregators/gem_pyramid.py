@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape, require_side
 from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
-from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import Keys, at_least_float32
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
@@ -28,6 +28,10 @@ class GemPyramid:
 @dataclasses.dataclass(frozen=True)
 class GemPyramidConfig(Aggregator):
     """CricaVPR's class token and generalised means over 13 regions (Lu et al., CVPR 2024)."""
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the last patches and the class token."""
+        return FeatureRequest(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of tokens as wide as the backbone."""

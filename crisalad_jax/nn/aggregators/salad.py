@@ -12,7 +12,7 @@ from crisalad_jax.config.checks import require, require_fraction, require_positi
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
     Keys,
     Linear,
@@ -108,6 +108,10 @@ class SaladConfig(Aggregator):
     def scores(self) -> int:
         """Number of scores of a patch: one for each cluster, and the dustbin's."""
         return self.clusters + self.dustbin.scores
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the last patches and the class token."""
+        return FeatureRequest(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the tokens' shape, which does not depend on the backbone."""

@@ -31,6 +31,8 @@ class FeatureRequest:
     attention, with the heads side by side."""
     norm: bool = True
     """Whether tokens go through the last layer norm."""
+    class_token: bool = False
+    """Whether the class token is used, which not every backbone has."""
 
 
 @dataclasses.dataclass(frozen=True)

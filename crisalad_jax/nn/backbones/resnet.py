@@ -1,0 +1,131 @@
+"""ResNet (He et al., CVPR 2016), in torchvision's form: the stride is in the 3 x 3 convolution."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Literal
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.nn.backbones.base import BACKBONES
+from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
+from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_conv_norm, max_pool
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+Layers = Literal[18, 50, 101, 152]
+BLOCKS: dict[Layers, tuple[int, ...]] = {
+    18: (2, 2, 2, 2),
+    50: (3, 4, 6, 3),
+    101: (3, 4, 23, 3),
+    152: (3, 8, 36, 3),
+}
+"""Number of residual blocks of each stage, by the number of layers."""
+STEM_DIM = 64
+"""Width of the first convolution, and within the blocks of the first stage."""
+STEM_SIDE = 7
+"""Side of the first convolution's kernel."""
+
+
+@pytree_dataclass
+class Residual:
+    """A residual block: convolutions, and one beside them where the shape changes."""
+
+    convs: tuple[ConvNorm, ...]
+    """Two of 3 x 3; or 1 x 1, 3 x 3, and 1 x 1 to four times the width."""
+    shortcut: ConvNorm | None
+
+
+@BACKBONES.register("resnet", tiny={"layers": 18, "stages": 2})
+@dataclasses.dataclass(frozen=True)
+class ResNetConfig(StagedBackbone):
+    """A ResNet (He et al., CVPR 2016), for images of any size."""
+
+    layers: Layers = 50
+    """Number of layers. 18 has blocks of two convolutions, the others of three."""
+    stages: int = 4
+    """Number of stages that are kept, from the first."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require(
+            1 <= self.stages <= 4,
+            f"ResNetConfig.stages: found {self.stages}, expected 1 to 4",
+        )
+
+    @property
+    def depth(self) -> int:
+        """Number of stages."""
+        return self.stages
+
+    @property
+    def dim(self) -> int:
+        """Width of a feature."""
+        return self.widths(self.stages - 1)[-1]
+
+    @property
+    def patch_size(self) -> int:
+        """Distance of two features in pixels."""
+        return 2 ** (self.stages + 1)
+
+    @property
+    def extras(self) -> str:
+        """The number of layers."""
+        return f", ResNet-{self.layers}"
+
+    def widths(self, stage: int) -> tuple[int, ...]:
+        """Return the widths of a block's convolutions in the stage of this number, from 0."""
+        width = STEM_DIM * 2**stage
+        return (width, width) if self.layers == 18 else (width, width, 4 * width)
+
+    def kernels(self) -> tuple[int, ...]:
+        """Return the sides of the kernels of a block's convolutions."""
+        return (3, 3) if self.layers == 18 else (1, 3, 1)
+
+    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """Return the rows and columns of features: every halving rounds up."""
+        height, width = image_size
+        return -(-height // self.patch_size), -(-width // self.patch_size)
+
+    def init(self, key: PRNGKeyArray) -> Stages:
+        """Draw parameters as torchvision does before training."""
+        stem_key, *keys = jax.random.split(key, 1 + self.stages)
+        return Stages(
+            init_conv_norm(stem_key, STEM_SIDE, 3, STEM_DIM),
+            tuple(Stage(tuple(self._init_stage(keys[i], i))) for i in range(self.stages)),
+        )
+
+    def _init_stage(self, key: PRNGKeyArray, stage: int) -> Iterator[Residual]:
+        d_in = self.widths(stage - 1)[-1] if stage else STEM_DIM
+        for block_key in jax.random.split(key, BLOCKS[self.layers][stage]):
+            shortcut_key, *keys = jax.random.split(block_key, 4)
+            widths = self.widths(stage)
+            shapes = zip(keys, self.kernels(), (d_in, *widths), widths, strict=False)
+            convs = tuple(init_conv_norm(*shape) for shape in shapes)
+            changes = d_in != widths[-1]
+            shortcut = init_conv_norm(shortcut_key, 1, d_in, widths[-1]) if changes else None
+            yield Residual(convs, shortcut)
+            d_in = widths[-1]
+
+    def run_stem(self, params: ConvNorm, images: Map) -> Map:
+        """Convolve by 7 x 7, and take the maxima of 3 x 3: both halve the grid."""
+        return max_pool(jax.nn.relu(conv_norm(params, images, stride=2)), 3, padding=1)
+
+    def run_stage(self, number: int, params: Stage, x: Map) -> Map:
+        """Run the blocks; the first halves the grid, but for the first stage's."""
+        for i, block in enumerate(params.layers):
+            x = residual(block, x, stride=2 if number and not i else 1)
+        return x
+
+
+def residual(params: Residual, x: Map, *, stride: int) -> Map:
+    """Add the convolutions' output to the input; the first of 3 x 3 has the stride."""
+    y = x
+    strided = next(i for i, each in enumerate(params.convs) if each.conv.weight.shape[0] == 3)
+    for i, layer in enumerate(params.convs):
+        y = conv_norm(layer, y, stride=stride if i == strided else 1)
+        if i + 1 < len(params.convs):
+            y = jax.nn.relu(y)
+    if params.shortcut is not None:
+        x = conv_norm(params.shortcut, x, stride=stride)
+    return jax.nn.relu(x + y)

@@ -1,0 +1,60 @@
+"""VGG-16 (Simonyan and Zisserman, ICLR 2015) up to its last convolution, as NetVLAD has it."""
+
+import dataclasses
+import itertools
+from typing import ClassVar
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from crisalad_jax.nn.backbones.base import BACKBONES
+from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
+from crisalad_jax.nn.convolutions import init_he_conv, max_pool
+from crisalad_jax.nn.layers import conv
+
+WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+"""Widths of the 3 x 3 convolutions of each stage."""
+
+
+@BACKBONES.register("vgg")
+@dataclasses.dataclass(frozen=True)
+class VggConfig(StagedBackbone):
+    """VGG-16 without its last ReLU and maximum (Simonyan and Zisserman, ICLR 2015)."""
+
+    patch_size: ClassVar[int] = 16
+    """Distance of two features in pixels."""
+
+    @property
+    def depth(self) -> int:
+        """Number of stages."""
+        return len(WIDTHS)
+
+    @property
+    def dim(self) -> int:
+        """Width of a feature."""
+        return WIDTHS[-1][-1]
+
+    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """Return the rows and columns of features: every halving rounds down."""
+        height, width = image_size
+        return height // self.patch_size, width // self.patch_size
+
+    def init(self, key: PRNGKeyArray) -> Stages:
+        """Draw parameters as torchvision does before training."""
+        widths = list(itertools.chain.from_iterable(WIDTHS))
+        pairs = zip(jax.random.split(key, len(widths)), (3, *widths), widths, strict=False)
+        layers = iter([init_he_conv(each, 3, a, b, bias=True) for each, a, b in pairs])
+        return Stages(None, tuple(Stage(tuple(itertools.islice(layers, len(w)))) for w in WIDTHS))
+
+    def run_stem(self, params: None, images: Map) -> Map:
+        """Return the images: nothing comes before the first stage."""
+        return images
+
+    def run_stage(self, number: int, params: Stage, x: Map) -> Map:
+        """Run the convolutions, after maxima that halve the grid; the last one has no ReLU."""
+        x = max_pool(x, 2) if number else x
+        for i, layer in enumerate(params.layers):
+            x = conv(layer, x)
+            if (number, i) != (len(WIDTHS) - 1, len(params.layers) - 1):
+                x = jax.nn.relu(x)
+        return x

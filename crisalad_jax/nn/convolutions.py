@@ -1,0 +1,69 @@
+"""What convolutional backbones are made of: convolutions with a batch norm, and maxima."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.nn.layers import BatchNorm, Conv, conv, init_batch_norm
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+BATCH_NORM_EPSILON = 1e-5
+"""Epsilon of torch's `nn.BatchNorm2d`, which all published backbones keep."""
+
+
+@pytree_dataclass
+class ConvNorm:
+    """A convolution and the batch norm after it."""
+
+    conv: Conv
+    norm: BatchNorm
+
+
+def init_he_conv(
+    key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int, *, bias: bool = False
+) -> Conv:
+    """Draw a convolution as torchvision: normal of variance 2 / (kernel_size^2 d_out), bias 0.
+
+    This is He et al.'s start (2015), by the number of outputs.
+    """
+    deviation = math.sqrt(2 / (kernel_size**2 * d_out))
+    weight = deviation * jax.random.normal(key, (kernel_size, kernel_size, d_in, d_out))
+    return Conv(weight, jnp.zeros(d_out) if bias else None)
+
+
+def init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
+    """Draw a convolution without bias, and start its batch norm as the identity."""
+    return ConvNorm(init_he_conv(key, kernel_size, d_in, d_out), init_batch_norm(d_out))
+
+
+def conv_norm(
+    params: ConvNorm, x: Float[Array, "*batch height width d_in"], *, stride: int = 1
+) -> Float[Array, "*batch rows columns d_out"]:
+    """Convolve, and normalise by the stored statistics, which are folded into the convolution.
+
+    Folding costs a pass over the weights, and saves one over the much larger activations.
+    """
+    norm = params.norm
+    scale = norm.weight * jax.lax.rsqrt(norm.running_var + BATCH_NORM_EPSILON)
+    shift = norm.bias - norm.running_mean * scale
+    if params.conv.bias is not None:
+        shift = shift + params.conv.bias * scale
+    return conv(Conv(params.conv.weight * scale, shift), x, stride=stride)
+
+
+def max_pool(
+    x: Float[Array, "*batch height width dim"], size: int, *, stride: int = 2, padding: int = 0
+) -> Float[Array, "*batch rows columns dim"]:
+    """Return the maximum of each window of size x size pixels; padding never wins."""
+    images = x.reshape(-1, *x.shape[-3:])
+    y = jax.lax.reduce_window(
+        images,
+        -jnp.inf,
+        jax.lax.max,
+        window_dimensions=(1, size, size, 1),
+        window_strides=(1, stride, stride, 1),
+        padding=((0, 0), (padding, padding), (padding, padding), (0, 0)),
+    )
+    return y.reshape(*x.shape[:-3], *y.shape[1:])

@@ -1,0 +1,183 @@
+"""ResNet and VGG: grids, maxima, parameters and work as published, and what they refuse.
+
+parity/test_cnn.py compares outputs and gradients with torch, parity/test_zoo.py with public code.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest
+from crisalad_jax.nn.backbones.resnet import Layers, ResNetConfig
+from crisalad_jax.nn.backbones.stages import StagedBackbone
+from crisalad_jax.nn.backbones.vgg import VggConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_he_conv, max_pool
+from crisalad_jax.nn.costs import count_macs, part_costs
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.layers import BatchNorm, Conv
+from crisalad_jax.nn.model import check_params, describe, parameter_shapes
+from crisalad_jax.training.trainable import count_trainable, merge_params, split_params
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import random_params
+
+BARE = CrossImageConfig(layers=0)
+SMALL = ModelConfig(
+    image_size=(37, 52),
+    backbone=ResNetConfig(layers=18, stages=2),
+    aggregator="gem",
+    cross_image=BARE,
+)
+
+
+def model(backbone: Backbone) -> ModelConfig:
+    return ModelConfig(backbone=backbone, aggregator="gem", cross_image=BARE)
+
+
+def macs(backbone: StagedBackbone) -> int:
+    """Multiply-accumulates of one image of 224 x 224."""
+    params = jax.eval_shape(backbone.init, jax.random.key(0))
+    image = jax.ShapeDtypeStruct((1, 224, 224, 3), jnp.float32)
+    apply = lambda p, x: backbone.apply(p, x, FeatureRequest(), remat="none").patches  # noqa: E731
+    return count_macs(apply, params, image)
+
+
+@pytest.mark.parametrize(
+    ("layers", "parameters", "gmacs"),
+    # torchvision's pages: all parameters, and "GFLOPS", which are multiply-accumulates.
+    [(18, 11_689_512, 1.81), (50, 25_557_032, 4.09), (101, 44_549_160, 7.80)],
+)
+def test_a_resnet_has_the_published_parameters_and_work(
+    layers: Layers, parameters: int, gmacs: float
+) -> None:
+    backbone = ResNetConfig(layers=layers)
+    shapes = jax.eval_shape(backbone.init, jax.random.key(0))
+    leaves = jax.tree_util.tree_leaves_with_path(shapes)
+    learnt = sum(leaf.size for path, leaf in leaves if "running" not in str(path[-1]))
+    classifier = 1000 * backbone.dim + 1000
+    assert learnt + classifier == parameters
+    assert (macs(backbone) + 1000 * backbone.dim) / 1e9 == pytest.approx(gmacs, abs=0.01)
+
+
+def test_vgg_16_has_the_published_parameters_and_work() -> None:
+    """Of the paper's 138 M parameters 123,642,856 are the classifier's, by its shapes."""
+    shapes = jax.eval_shape(VggConfig().init, jax.random.key(0))
+    classifier = 25_088 * 4096 + 4096 + 4096**2 + 4096 + 4096 * 1000 + 1000
+    assert sum(leaf.size for leaf in jax.tree.leaves(shapes)) + classifier == 138_357_544
+    products = 25_088 * 4096 + 4096**2 + 4096 * 1000
+    assert (macs(VggConfig()) + products) / 1e9 == pytest.approx(15.47, abs=0.01)
+
+
+@pytest.mark.parametrize("size", [(32, 64), (37, 52), (33, 65)])
+@pytest.mark.parametrize("backbone", [SMALL.backbone, ResNetConfig(layers=18), VggConfig()])
+def test_the_grid_is_that_of_the_features(backbone: StagedBackbone, size: tuple[int, int]) -> None:
+    params = jax.eval_shape(backbone.init, jax.random.key(0))
+    images = jax.ShapeDtypeStruct((2, *size, 3), jnp.float32)
+    apply = lambda p, x: backbone.apply(p, x, FeatureRequest(), remat="none")  # noqa: E731
+    features = jax.eval_shape(apply, params, images)
+    assert features.patches.shape == (2, math.prod(backbone.grid(size)), backbone.dim)
+    assert features.class_token.shape == (2, 0)
+
+
+@pytest.mark.parametrize(("size", "stride", "padding"), [(3, 2, 1), (2, 2, 0), (3, 2, 0)])
+def test_maxima_are_torchs(size: int, stride: int, padding: int) -> None:
+    x = np.random.default_rng(0).normal(size=(2, 7, 10, 3)).astype(np.float32)
+    found = max_pool(jnp.asarray(x), size, stride=stride, padding=padding)
+    expected = F.max_pool2d(torch.from_numpy(x).permute(0, 3, 1, 2), size, stride, padding)
+    np.testing.assert_array_equal(found, expected.permute(0, 2, 3, 1))
+
+
+@pytest.mark.parametrize("bias", [False, True])
+def test_a_folded_norm_is_torchs_convolution_and_norm(bias: bool) -> None:
+    rng = np.random.default_rng(0)
+    x, weight = rng.normal(size=(2, 9, 8, 3)), rng.normal(size=(3, 3, 3, 5))
+    own = rng.normal(size=5) if bias else None
+    gain, shift, mean, variance = rng.uniform(0.01, 1, (4, 5))
+    with jax.enable_x64(True):
+        params = ConvNorm(
+            Conv(jnp.asarray(weight), None if own is None else jnp.asarray(own)),
+            BatchNorm(*map(jnp.asarray, (gain, shift, mean, variance))),
+        )
+        found = conv_norm(params, jnp.asarray(x), stride=2)
+    first, kernel, *rest = map(torch.from_numpy, (x, weight, mean, variance, gain, shift))
+    convolved = F.conv2d(
+        first.permute(0, 3, 1, 2),
+        kernel.permute(3, 2, 0, 1),
+        None if own is None else torch.from_numpy(own),
+        stride=2,
+        padding=1,
+    )
+    # Sums of 27 products of order 1 in float64.
+    np.testing.assert_allclose(
+        found, F.batch_norm(convolved, *rest).permute(0, 2, 3, 1), atol=1e-12
+    )
+
+
+def test_convolutions_start_as_he_et_al() -> None:
+    weight = init_he_conv(jax.random.key(0), 3, 64, 128).weight
+    # 73,728 draws: a deviation is known to 0.3 %, of which 1 % is four.
+    assert float(weight.std()) == pytest.approx(math.sqrt(2 / (9 * 128)), rel=0.01)
+
+
+def test_the_last_stages_train_by_themselves() -> None:
+    params = random_params(SMALL)
+    trainable, frozen = split_params(params, SMALL, "last-1-blocks+head")
+    assert trainable.backbone.stem.conv.weight is None
+    first, _ = trainable.backbone.blocks
+    assert jax.tree.leaves(first) == []
+    # Two blocks of 128 channels, the first with a shortcut, without the norms' statistics; GeM's p.
+    convolutions = 64 * 128 * 9 + 3 * 128 * 128 * 9 + 64 * 128
+    assert count_trainable(SMALL, "last-1-blocks+head") == convolutions + 5 * 2 * 128 + 1
+    merged = merge_params(trainable, frozen, SMALL)
+    jax.tree.map(np.testing.assert_array_equal, merged, params)
+    check_params(merged, SMALL)
+
+
+def test_a_batch_is_its_images_and_bfloat16_is_near() -> None:
+    params = random_params(SMALL)
+    images = np.random.default_rng(0).integers(0, 256, (2, 37, 52, 3)).astype(np.uint8)
+    both = describe(params, images, SMALL)
+    # Sums of one program, in other batches.
+    np.testing.assert_allclose(describe(params, images[1:], SMALL)[0], both[1], atol=2e-6)
+    half = describe(params, images, dataclasses.replace(SMALL, compute_dtype="bfloat16"))
+    assert half.dtype == jnp.float32
+    # 8 bits of mantissa through ten layers.
+    assert float((half * both).sum(axis=1).min()) > 0.999
+    assert np.abs(half - both).max() > 1e-5
+    full = dataclasses.replace(SMALL, remat="full")
+    np.testing.assert_array_equal(describe(params, images, full), both)
+
+
+def test_parts_add_up() -> None:
+    rows = {cost.part: cost for cost in part_costs(SMALL)}
+    total = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(SMALL)))
+    assert sum(row.parameters for row in rows.values()) == total
+    # The first convolution, at ceil(37 / 2) x ceil(52 / 2) places.
+    assert rows["backbone embedding, norm"].macs == 19 * 26 * 7 * 7 * 3 * 64
+
+
+def test_what_needs_a_class_token_refuses_them() -> None:
+    with pytest.raises(InputError, match=r"found resnet, which has no class token.*aggregator sal"):
+        ModelConfig(backbone="resnet", cross_image=BARE)
+
+
+def test_facets_are_refused() -> None:
+    config = dataclasses.replace(SMALL, aggregator=AnyLocConfig(clusters=4, layer=-1))
+    with pytest.raises(InputError, match=r"facet value of backbone resnet, expected its last"):
+        jax.eval_shape(
+            lambda p, x: describe(p, x, config),
+            parameter_shapes(config),
+            jax.ShapeDtypeStruct((1, 37, 52, 3), jnp.uint8),
+        )
+
+
+def test_a_number_of_stages() -> None:
+    with pytest.raises(InputError, match=r"ResNetConfig.stages: found 5, expected 1 to 4"):
+        ResNetConfig(stages=5)
