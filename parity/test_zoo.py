@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax import describe
+from crisalad_jax import describe, extract_features
 from crisalad_jax.checkpoints.layouts import infer, to_params, to_state
 from parity import zoo
 
@@ -30,9 +30,10 @@ LAYOUTS = {
     "salad_cm": "dino-salad",
     "supervlad": "supervlad",
     "supervlad_crossimage": "supervlad",
+    "transvpr": "transvpr",
 }
 
-QUICK = ("boq_dinov2_12288", "cosplace_resnet18_512", "supervlad_crossimage")
+QUICK = ("cosplace_resnet18_512", "transvpr")
 """Enough for the test command: full-size models take ten seconds and more each."""
 
 
@@ -43,6 +44,18 @@ def test_every_golden_is_compared() -> None:
 def compare(found: jax.Array, expected: np.ndarray) -> None:
     assert found.shape == expected.shape
     assert np.linalg.norm(found - expected) < BOUND * np.linalg.norm(expected)
+
+
+def sampled(
+    patches: jax.Array, grid: tuple[int, int], golden: dict[str, np.ndarray]
+) -> tuple[jax.Array, np.ndarray]:
+    """The patches that the golden file keeps of the backbone's map: every n-th channel and row."""
+    expected = np.moveaxis(golden["features"], 1, -1)
+    maps = patches.reshape(-1, *grid, patches.shape[-1])
+    rows, columns, channels = (
+        -(-n // kept) for n, kept in zip(maps.shape[1:], expected.shape[1:], strict=True)
+    )
+    return maps[:, ::rows, ::columns, ::channels], expected
 
 
 @pytest.mark.parametrize(
@@ -61,6 +74,9 @@ def test_descriptors_are_the_public_codes(name: str) -> None:
     for key, array in state.items():
         np.testing.assert_array_equal(back[key], array)
 
+    if "features" in golden:
+        patches = extract_features(params, golden["images"], config).patches
+        compare(*sampled(patches, config.backbone.grid(golden["images"].shape[1:3]), golden))
     compare(describe(params, golden["images"], config), golden["descriptor"])
     expected = golden["descriptor"]
     # Another image's descriptor is far: the bound tells images apart.

@@ -181,13 +181,18 @@ def depthwise_conv(
 
 
 def conv(
-    params: Conv, x: Float[Array, "*batch height width d_in"], *, stride: int = 1
+    params: Conv,
+    x: Float[Array, "*batch height width d_in"],
+    *,
+    stride: int = 1,
+    padding: int | None = None,
 ) -> Float[Array, "*batch rows columns d_out"]:
-    """Convolve (cross-correlate, as torch) with zero padding of half a kernel, in the type of `x`.
+    """Convolve (cross-correlate, as torch) with zero padding, in the type of `x`.
 
-    A side of n pixels becomes ceil(n / stride) for kernels of odd sizes.
+    The padding is half a kernel by default: a side of n pixels then becomes ceil(n / stride) for
+    kernels of odd sizes.
     """
-    margin = params.weight.shape[0] // 2
+    margin = params.weight.shape[0] // 2 if padding is None else padding
     y = jax.lax.conv_general_dilated(
         x.reshape(-1, *x.shape[-3:]),
         params.weight.astype(x.dtype),

@@ -90,14 +90,15 @@ def attentions(
 def key_features(
     params: TransVpr, patches: Float[Array, "*batch patch wide"], levels: int
 ) -> Float[Array, "*batch patch dim"]:
-    """Return unit patch tokens of the middle level, and 0 for patches that are no key patches.
+    """Return the patch tokens of the middle level, and 0 for patches that are no key patches.
 
     Every level's attention is rescaled to 0 to 1, and so is their sum. Key patches are those above
-    `KEY_THRESHOLD`. As in the public code, no layer is learnt for the tokens alone.
+    `KEY_THRESHOLD`. As in the public code, tokens are no unit vectors, and no layer is learnt for
+    them alone.
     """
     fused = _stretch(_stretch(attentions(params, patches)).sum(axis=-1, keepdims=True))
     middle = jnp.split(at_least_float32(patches), levels, axis=-1)[levels // 2]
-    return jnp.where(fused > KEY_THRESHOLD, l2_normalise(middle), 0)
+    return jnp.where(fused > KEY_THRESHOLD, middle, 0)
 
 
 def _stretch(x: Float[Array, "*batch patch level"]) -> Float[Array, "*batch patch level"]:

@@ -1,0 +1,189 @@
+"""TransVPR's own backbone: convolutions, and a transformer over patches of all their maps.
+
+Wang et al., CVPR 2022, section 3.1. Constants that the paper leaves out are those of
+RuotongWANG/TransVPR-model-implementation.
+"""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
+from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_he_conv, max_pool
+from crisalad_jax.nn.layers import (
+    Conv,
+    LayerNorm,
+    Linear,
+    at_least_float32,
+    conv,
+    gelu,
+    init_batch_norm,
+    init_layer_norm,
+    layer_norm,
+    linear,
+)
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+NORM_EPSILON = 1e-5
+WIDTHS = (64, 128, 256, 512)
+"""Widths of the convolutions; each is followed by a maximum that halves the grid."""
+
+
+@pytree_dataclass
+class TransVprBlock:
+    """Attention and a feed-forward network. `norm1` takes the place of what it normalises."""
+
+    pre_norm: LayerNorm
+    self_attn: Attention
+    norm1: LayerNorm
+    linear1: Linear
+    linear2: Linear
+
+
+@pytree_dataclass
+class TransVprNet:
+    """The backbone. In `blocks` every leaf has a leading depth axis."""
+
+    convs: tuple[ConvNorm, ...]
+    tokenizers: tuple[Conv, ...]
+    """Convolutions without overlap, of every map to one grid."""
+    cls_token: Float[Array, " dim"]
+    blocks: TransVprBlock
+    norm: LayerNorm
+    """Layer norm of every block's output that is asked for."""
+
+
+@BACKBONES.register("transvpr", tiny={"dim": 64, "depth": 4})
+@dataclasses.dataclass(frozen=True)
+class TransVprNetConfig(Backbone):
+    """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
+
+    patch_size: ClassVar[int] = 16
+    dim: int = 256
+    depth: int = 6
+    heads: int = 4
+    hidden: int = 512
+    """Width of the feed-forward networks."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "dim", "depth", "heads", "hidden")
+        for name, divisor in (("heads", self.heads), ("maps", len(WIDTHS))):
+            require(
+                self.dim % divisor == 0,
+                f"TransVprNetConfig.dim: found {self.dim}, expected a multiple of the {divisor} "
+                f"{name}",
+            )
+
+    def init(self, key: PRNGKeyArray) -> TransVprNet:
+        """Draw parameters: convolutions as He et al., linears normal of deviation 0.02."""
+        conv_key, token_key, block_key = jax.random.split(key, 3)
+        maps = range(len(WIDTHS))
+        pairs = zip(jax.random.split(conv_key, len(WIDTHS)), (3, *WIDTHS), WIDTHS, strict=False)
+        part = self.dim // len(WIDTHS)
+        token_keys = jax.random.split(token_key, len(WIDTHS))
+        return TransVprNet(
+            convs=tuple(
+                ConvNorm(init_he_conv(each, 3, a, b, bias=True), init_batch_norm(b))
+                for each, a, b in pairs
+            ),
+            tokenizers=tuple(
+                init_he_conv(token_keys[i], _side(i), WIDTHS[i], part, bias=True) for i in maps
+            ),
+            cls_token=jnp.zeros(self.dim),
+            blocks=jax.vmap(self._init_block)(jax.random.split(block_key, self.depth)),
+            norm=init_layer_norm(self.dim),
+        )
+
+    def _init_block(self, key: PRNGKeyArray) -> TransVprBlock:
+        def draw(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
+            weight = 0.02 * jax.random.truncated_normal(key, -2.0, 2.0, (d_in, d_out))
+            return Linear(weight, jnp.zeros(d_out) if bias else None)
+
+        qkv, proj, first, second = jax.random.split(key, 4)
+        dim, hidden = self.dim, self.hidden
+        return TransVprBlock(
+            pre_norm=init_layer_norm(dim),
+            self_attn=Attention(draw(qkv, dim, 3 * dim, bias=False), draw(proj, dim, dim)),
+            norm1=init_layer_norm(dim),
+            linear1=draw(first, dim, hidden),
+            linear2=draw(second, hidden, dim),
+        )
+
+    def apply(
+        self,
+        params: TransVprNet,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+    ) -> Features:
+        """Return the patches of the requested levels side by side, and the last one's class token.
+
+        With remat "full" the backward pass computes every block again from its input.
+
+        Raises:
+            InputError: while tracing, for levels out of order, or a facet of attention.
+        """
+        levels = (self.depth,) if request.levels is None else request.levels
+        require(
+            list(levels) == sorted(set(levels)) and levels[0] > 0 and levels[-1] <= self.depth,
+            f"levels: found {levels}, expected numbers of blocks in order, 1 to {self.depth}",
+        )
+        require(
+            request.facet == "token",
+            f"features: found a request for facet {request.facet} of backbone {self.part_name}, "
+            "expected its blocks' output",
+        )
+
+        def body(
+            x: Float[Array, "image token dim"], layer: TransVprBlock
+        ) -> tuple[Float[Array, "image token dim"], Float[Array, "image token dim"]]:
+            y = block(layer, x, self.heads)
+            return y, y
+
+        if remat == "full":
+            body = jax.checkpoint(body, prevent_cse=False)
+        tokens = embed(params, images)
+        with jax.named_scope("blocks"):
+            _, outputs = jax.lax.scan(body, tokens, params.blocks)
+        chosen = [outputs[level - 1] for level in levels]
+        if request.norm:
+            chosen = [layer_norm(params.norm, x, epsilon=NORM_EPSILON) for x in chosen]
+        patches = jnp.concatenate([x[:, 1:] for x in chosen], axis=-1)
+        return Features(chosen[-1][:, 0], patches)
+
+
+def _side(number: int) -> int:
+    """Return the side of a patch on the map of this number, from 0."""
+    return TransVprNetConfig.patch_size // 2 ** (number + 1)
+
+
+def embed(
+    params: TransVprNet, images: Float[Array, "image height width 3"]
+) -> Float[Array, "image token dim"]:
+    """Return the class token, and for every patch a vector with a part from each map."""
+    x, parts = images, []
+    for number, layer in enumerate(params.convs):
+        x = max_pool(jax.nn.relu(conv_norm(layer, x)), 3, padding=1)
+        parts.append(conv(params.tokenizers[number], x, stride=_side(number), padding=0))
+    tokens = jnp.concatenate(parts, axis=-1)
+    tokens = tokens.reshape(len(images), -1, tokens.shape[-1])
+    first = jnp.broadcast_to(params.cls_token, (len(images), 1, tokens.shape[-1]))
+    return jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
+
+
+def block(
+    params: TransVprBlock, x: Float[Array, "image token dim"], heads: int
+) -> Float[Array, "image token dim"]:
+    """Add attention to the tokens, normalise them, and add the feed-forward network's output."""
+    normed = layer_norm(params.pre_norm, x, epsilon=NORM_EPSILON)
+    x = x + attention(params.self_attn, normed, heads, key=None)
+    x = layer_norm(params.norm1, x, epsilon=NORM_EPSILON)
+    update = linear(params.linear2, gelu(linear(params.linear1, x)))
+    return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)
