@@ -18,6 +18,7 @@ import safetensors
 import safetensors.numpy
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS, State, check_holds, infer, to_params, to_state
+from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX, read_matlab, write_matlab
 from crisalad_jax.checkpoints.safetensors_io import write_safetensors
 from crisalad_jax.checkpoints.weights import (
     count_layers,
@@ -36,7 +37,12 @@ from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, check_target
 
-TORCH_SUFFIXES = (".pth", ".pt", ".ckpt")
+SUFFIXES = {
+    "torch": (".pth", ".pt", ".ckpt"),
+    "safetensors": (".safetensors",),
+    "matlab": (MATLAB_SUFFIX,),
+}
+"""Suffixes of files by `Layout.stored`."""
 
 
 class Checkpoint(NamedTuple):
@@ -104,8 +110,10 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
-    if start[8:] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
-        content: Any = _read_safetensors(path)
+    if path.suffix == MATLAB_SUFFIX:
+        content: Any = read_matlab(path)
+    elif start[8:] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
+        content = _read_safetensors(path)
     else:
         content = _read_torch(path)
     state, config = _unwrap(content, path)
@@ -252,11 +260,12 @@ def _float32(name: str, array: np.ndarray, path: pathlib.Path) -> np.ndarray:
 
 
 def layout_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
-    """Choose the public layout, of safetensors or of torch, that holds the whole model."""
-    safetensors = pathlib.Path(target).suffix == ".safetensors"
-    fallback = "huggingface" if safetensors else "reference"
+    """Choose the public layout, stored as the target's suffix says, that holds the whole model."""
+    suffix = pathlib.Path(target).suffix
+    stored = next((kind for kind, suffixes in SUFFIXES.items() if suffix in suffixes), "torch")
+    fallback = {"safetensors": "huggingface", "matlab": "netvlad-matlab"}.get(stored, "reference")
     for name, layout in LAYOUTS.items():
-        if layout.safetensors == safetensors and name != fallback:
+        if layout.stored == stored and name != fallback:
             try:
                 check_holds(config, name)
             except InputError:
@@ -282,8 +291,11 @@ def write_checkpoint(
     names = choose("layout", layout, LAYOUTS)
     check_holds(config, layout, extras)
     state = to_state(params, config, layout, extras)
-    if names.safetensors:
+    if names.stored == "safetensors":
         write_safetensors(path, state, {"format": "pt"})
+        return
+    if names.stored == "matlab":
+        write_matlab(path, state)
         return
     torch = _torch(f"write {path}")
     content: Any = {
@@ -346,7 +358,7 @@ def convert(
     suffix = pathlib.Path(target).suffix
     if checkpoint.layout is None:
         layout = layout or layout_for(checkpoint.config, target)
-        wanted = (".safetensors",) if LAYOUTS[layout].safetensors else TORCH_SUFFIXES
+        wanted = SUFFIXES[LAYOUTS[layout].stored]
         if suffix not in wanted:
             raise InputError(
                 f"{target}: found suffix {suffix!r}, expected {' or '.join(wanted)} for {layout}"

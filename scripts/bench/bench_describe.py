@@ -1,7 +1,7 @@
 """Images described a second, beside the same model in torch, in one run.
 
     python scripts/bench/bench_describe.py [--out docs/performance] [--page docs/performance.md]
-        [--presets b14 ...] [--sizes 224x224 ...] [--batches 8 16] [--dtype bfloat16]
+        [--presets b14 megaloc ...] [--sizes 224x224 ...] [--batches 8 16] [--dtype bfloat16]
 
 The other side is the reference of the parity checks, with the same random weights. Needs torch (the
 `dev` extra). On a GPU if both jax and torch find one. Before anything is timed, descriptors are
@@ -21,7 +21,7 @@ import argparse
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,9 +41,16 @@ from timing import (
 import jax  # isort: skip
 import torch  # isort: skip
 
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.costs import part_costs
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, describe
+from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from parity.cases.case import build, convert, random
@@ -51,6 +58,23 @@ from parity.reference.model import Crisalad as TorchCrisalad
 
 TOLERANCES = {"float32": 1e-5, "bfloat16": 2e-2}
 """Of descriptors, which are unit vectors: parity measures 1e-6 and 5e-3 at this size."""
+MODELS: Mapping[str, ModelConfig] = {
+    **PRESETS,
+    "cosplace-resnet50": ModelConfig(
+        image_size=(480, 640),
+        backbone=ResNetConfig(),
+        aggregator=CosPlaceConfig(dim=2048),
+        cross_image=CrossImageConfig(layers=0),
+    ),
+    "megaloc": ModelConfig(
+        image_size=(322, 322),
+        backbone=ViTConfig(adapter=AdapterConfig(kind="none")),
+        aggregator=SaladConfig(cluster_dim=256),
+        cross_image=CrossImageConfig(layers=0),
+        projection=ProjectionConfig(dim=8448),
+    ),
+}
+"""The sizes of CriSALAD, and two published models as their files have them."""
 TORCHES = ("torch eager", "torch.compile")
 OURS = ("ours", "ours, over devices")
 
@@ -78,6 +102,10 @@ class Sides(NamedTuple):
 
 def sides(config: ModelConfig, name: str, batch: int, dtype: str) -> Sides:
     model = build(config, dtype, random(name, 0))
+    for layer in model.modules():
+        if isinstance(layer, torch.nn.BatchNorm2d):
+            # Drawn small, deviations would multiply to infinity.
+            layer.running_var = torch.ones_like(layer.weight)
     ours = convert(model)[0]
     images = np.random.default_rng(0).normal(size=(batch, *config.image_size, 3)).astype(np.float32)
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -218,7 +246,7 @@ def at_size(config: ModelConfig, size: tuple[int, int] | None) -> ModelConfig:
 def read_race(description: str, name: str) -> argparse.Namespace:
     """The flags of a race, whose presets can have the sizes."""
     parser = flags(description, "docs/performance")
-    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
+    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=MODELS)
     parser.add_argument(
         "--sizes", type=image_size, nargs="+", default=[None], help="such as 322x322"
     )
@@ -229,7 +257,7 @@ def read_race(description: str, name: str) -> argparse.Namespace:
     arguments = read(parser, name)
     try:
         for preset, size in itertools.product(arguments.presets, arguments.sizes):
-            at_size(PRESETS[preset], size)
+            at_size(MODELS[preset], size)
     except InputError as error:
         parser.error(str(error))
     return arguments
@@ -239,7 +267,7 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
     for preset, size, batch in itertools.product(
         arguments.presets, arguments.sizes, arguments.batches
     ):
-        config = at_size(PRESETS[preset], size)
+        config = at_size(MODELS[preset], size)
         both = sides(config, preset, batch, arguments.dtype)
         contenders = [by_torch(both, False), by_torch(both, True), by_us(both, False)]
         if len(jax.local_devices()) > 1:

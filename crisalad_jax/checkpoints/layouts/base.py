@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,8 @@ class Layout:
     """Prefix of all names, as torch's DataParallel adds it."""
     under: str | None = None
     """Key of the file's dictionary that holds the state; None: the file is the state."""
-    safetensors: bool = False
-    """Whether the family's files are of safetensors; else they are torch's."""
+    stored: Literal["torch", "safetensors", "matlab"] = "torch"
+    """Kind of the family's files."""
 
 
 LAYOUTS: dict[str, Layout] = {}

@@ -91,6 +91,6 @@ register_layout(
             not {"embeddings.cls_token", "embeddings.position_embeddings"}.isdisjoint(state)
         ),
         _infer,
-        safetensors=True,
+        stored="safetensors",
     )
 )

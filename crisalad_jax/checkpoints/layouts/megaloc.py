@@ -53,6 +53,6 @@ for _name, _file, _backbone, _mask_token in (
             functools.partial(_lines, backbone=_backbone, mask_token=_mask_token),
             functools.partial(_detects, backbone=_backbone),
             functools.partial(_infer, backbone=_backbone),
-            safetensors=_file.endswith(".safetensors"),
+            stored="safetensors" if _file.endswith(".safetensors") else "torch",
         )
     )

@@ -1,0 +1,79 @@
+"""Read and write NetVLAD's networks in MATLAB files, as MatConvNet has them.
+
+scipy reads them, which runs nothing of the file. Axes of length 1 are dropped, as by hloc's reader.
+"""
+
+import pathlib
+import re
+from typing import Any
+
+import numpy as np
+
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import LARGEST, atomic_path, check_source
+
+MATLAB_SUFFIX = ".mat"
+AVERAGE = "net.meta.normalization.averageImage"
+"""Name of the image that is subtracted from pixels of 0 to 255."""
+_WEIGHTS = re.compile(r"net\.layers\[(\d+)\]\.weights\[(\d)\]")
+_EXPECTED = "a MATLAB file of a network: net.layers with weights, and its averageImage"
+
+
+def read_matlab(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Return all weights of a network as float32, and its average image, by their paths.
+
+    Raises:
+        InputError: the file is cut short, or no network.
+    """
+    import scipy.io  # here: it takes half a second
+
+    check_source(path, _EXPECTED, largest=LARGEST)
+    try:
+        content = scipy.io.loadmat(path, struct_as_record=False, squeeze_me=True)
+    except NotImplementedError as error:
+        raise InputError(
+            f"{path}: found MATLAB's format 7.3, expected 7 or older (save it with '-v7')"
+        ) from error
+    except Exception as error:  # a damaged file may raise any exception
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path}: not a whole MATLAB file: {reason}") from error
+    try:
+        network = content["net"]
+        average = network.meta.normalization.averageImage
+        layers = [np.atleast_1d(getattr(layer, "weights", ())) for layer in network.layers]
+    except (KeyError, AttributeError, TypeError) as error:
+        raise InputError(f"{path}: found no {error}, expected {_EXPECTED}") from error
+    state = {AVERAGE: _numbers(path, AVERAGE, average)}
+    for number, weights in enumerate(layers):
+        for i, array in enumerate(weights):
+            name = f"net.layers[{number}].weights[{i}]"
+            state[name] = _numbers(path, name, array)
+    return state
+
+
+def _numbers(path: pathlib.Path, name: str, value: Any) -> np.ndarray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "fu":
+        raise InputError(f"{path}: {name} found {array.dtype}, expected numbers")
+    return array.astype(np.float32)
+
+
+def write_matlab(path: pathlib.Path, state: dict[str, np.ndarray]) -> None:
+    """Write a network under the paths that `read_matlab` returns.
+
+    Raises:
+        InputError: the file cannot be made.
+    """
+    import scipy.io
+
+    found = {name: _WEIGHTS.fullmatch(name) for name in state}
+    count = 1 + max(int(match[1]) for match in found.values() if match)
+    layers = np.empty(count, object)
+    for number in range(count):
+        arrays = [state[n] for n, match in found.items() if match and int(match[1]) == number]
+        weights = np.empty(len(arrays), object)
+        weights[:] = arrays
+        layers[number] = {"name": f"layer {number}", "weights": weights}
+    meta = {"normalization": {"averageImage": state[AVERAGE]}}
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        scipy.io.savemat(file, {"net": {"layers": layers, "meta": meta}}, oned_as="column")
