@@ -9,6 +9,7 @@ from crisalad_jax.checkpoints.torch_io import load as load
 from crisalad_jax.checkpoints.torch_io import read_backbone as read_backbone
 from crisalad_jax.checkpoints.weights import save_weights as save_weights
 from crisalad_jax.config.plugins import load_plugin as load_plugin
+from crisalad_jax.config.preprocessing import PreprocessingConfig as PreprocessingConfig
 from crisalad_jax.data.augmentations import Augmentation as Augmentation
 from crisalad_jax.data.augmentations import register_augmentation as register_augmentation
 from crisalad_jax.data.benchmarks import Benchmark as Benchmark
@@ -55,6 +56,7 @@ from crisalad_jax.retrieval.maps.map import Map as Map
 from crisalad_jax.retrieval.maps.query import query as query
 from crisalad_jax.retrieval.pca import fit_pca as fit_pca
 from crisalad_jax.retrieval.pca import load_pca as load_pca
+from crisalad_jax.retrieval.photographs import prepare_image as prepare_image
 from crisalad_jax.retrieval.search import search as search
 from crisalad_jax.sinkhorn import SinkhornConfig as SinkhornConfig
 from crisalad_jax.sinkhorn import register_dustbin as register_dustbin

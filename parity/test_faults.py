@@ -14,7 +14,6 @@ import pytest
 import crisalad_jax.nn.adapter
 import crisalad_jax.nn.backbones.vit
 import crisalad_jax.nn.cross_image
-import crisalad_jax.nn.pixels
 import parity.cases.case
 import parity.cases.parts
 import parity.cases.run
@@ -119,6 +118,13 @@ def _all_positives(mine: Any) -> Any:
     return wrong
 
 
+def _another_mean(normalise: Any) -> Any:
+    def wrong(image: Any, how: Any) -> Any:
+        return normalise(image, dataclasses.replace(how, mean=(0.485, 0.456, 0.407)))
+
+    return wrong
+
+
 def _transposed_mask(encoder: Any) -> Any:
     def wrong(*args: Any, mask: Any, **more: Any) -> Any:
         return encoder(*args, mask=mask.T, **more)
@@ -201,7 +207,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "mean of ImageNet": (
         "pixels to numbers",
         FORWARD,
-        replace(crisalad_jax.nn.pixels, "IMAGENET_MEAN", lambda _: (0.485, 0.456, 0.407)),
+        replace(PARTS, "normalise", _another_mean),
     ),
     "a weight without gradient": (
         "MLP",

@@ -14,13 +14,14 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 from jax import export
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float
 
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import check_types, choose
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
+from crisalad_jax.nn.model import Crisalad, Images, check_params, describe, self_mask
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
@@ -95,8 +96,9 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
 def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> export.Exported:
     """Export the program of `(weights, images)`, or of `images` where the weights are inside.
 
-    `images` are 8-bit RGB (batch, height, width, 3) of `config.image_size`; the result is their
-    unit descriptors (batch, descriptor). `weights` is a dictionary of the arrays by their dotted
+    `images` are RGB (batch, height, width, 3) of `config.input_size`: 8-bit, or normalised float32
+    where the model resizes floats. The result is their unit descriptors (batch, descriptor).
+    `weights` is a dictionary of the arrays by their dotted
     names. Nothing in the program depends on the platform that exports it, nor on who calls this.
 
     Raises:
@@ -106,9 +108,7 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     # A dictionary's leaves come in the order of its keys, not in that of the fields.
     weights, tree = named_leaves(params), jax.tree.structure(params)
 
-    def run(
-        weights: dict[str, Array], images: UInt8[Array, "image height width 3"]
-    ) -> Float[Array, "image descriptor"]:
+    def run(weights: dict[str, Array], images: Images) -> Float[Array, "image descriptor"]:
         restored = jax.tree.unflatten(tree, [weights[name] for name in named_leaves(params)])
         mask = self_mask(images.shape[0]) if how.grouping == "single" else None
         return describe(restored, images, config, mask=mask)
@@ -116,7 +116,8 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     batch = how.batch_size
     if batch is None:
         (batch,) = export.symbolic_shape("batch")
-    images = jax.ShapeDtypeStruct((batch, *config.image_size, 3), jnp.uint8)
+    dtype = jnp.uint8 if config.preprocessing.pixels == "bytes" else jnp.float32
+    images = jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
     with compiler.portable(), _without_sources():
         if how.weights_inside:
             whole = jax.jit(lambda images: run(weights, images))
@@ -196,8 +197,7 @@ def _manifest(
         "images": {
             "shape": _shape(images),
             "dtype": str(images.dtype),
-            "layout": "RGB, rows from the top, not normalised",
-            "resize": "Pillow's BILINEAR to (height, width), aspect ratio not kept",
+            **_chain(config),
         },
         "descriptors": {
             "shape": _shape(descriptors),
@@ -212,6 +212,22 @@ def _manifest(
         "model_sha256": model_hash(params, config),
         "model": to_plain(config),
     }
+
+
+def _chain(config: ModelConfig) -> dict[str, Any]:
+    """Tell how images are prepared for the program, which has one size, whatever the rule."""
+    how = config.preprocessing
+    values: dict[str, Any] = {
+        "layout": "RGB, rows from the top, not normalised",
+        "resize": "Pillow's BILINEAR to (height, width), aspect ratio not kept",
+    }
+    fixed = dataclasses.replace(how, size_rule="fixed", round_to_patch=False)
+    if fixed.in_words(config.input_size) != PreprocessingConfig().in_words(config.input_size):
+        values["resize"] = f"{fixed.in_words(config.input_size)}, aspect ratio not kept"
+    if how.pixels == "floats":
+        values["layout"] = "RGB, rows from the top, (pixels / 255 - mean) / deviation"
+        values |= {"mean": list(how.mean), "deviation": list(how.deviation)}
+    return values
 
 
 def _shape(array: Any) -> list[int | str]:

@@ -275,6 +275,8 @@ def model_hash(params: Crisalad, config: ModelConfig) -> str:
         SHA-256 in hexadecimal digits.
     """
     plain = essence(config)
+    # Where earlier versions had its fields; what is free in it leaves nothing.
+    plain |= plain.pop("preprocessing", {})
     if config.aggregator.fixed_grid:
         plain["image_size"] = list(config.image_size)
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import pathlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -66,6 +66,7 @@ def load_model(
     preset: str = "b14",
     seed: int = 0,
     image_size: tuple[int, int] | None = None,
+    resize: Sequence[str] = (),
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
     verify: bool = True,
 ) -> tuple[Crisalad, ModelConfig, str]:
@@ -76,6 +77,7 @@ def load_model(
         preset: the size of the untrained model.
         seed: draws the parameters of the untrained model.
         image_size: height and width in pixels; None is the model's.
+        resize: words that change how images are resized; see `ModelConfig.resized`.
         compute_dtype: type of the matrix products; None is the model's.
         verify: whether to check the file's bytes against its checksum.
 
@@ -95,4 +97,4 @@ def load_model(
         name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
     if compute_dtype is not None:
         config = dataclasses.replace(config, compute_dtype=compute_dtype)
-    return params, config.resized(image_size), name
+    return params, config.resized(image_size, resize), name

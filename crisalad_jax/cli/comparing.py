@@ -33,7 +33,10 @@ class ComparisonFlags:
     epochs: int | None = None
     """By default the recipes'; from nothing 6."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; by default the preset's."""
+    """Height and width, multiples of the patch size (14); by default the preset's, or a file's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of every model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     batch_size: int = 16
     """Images described together, which a grouping lets look at each other."""
     grouping: str = "single"
@@ -62,6 +65,7 @@ def settings_of(flags: ComparisonFlags) -> dict[str, Any]:
         "preset": flags.preset,
         "epochs": flags.epochs,
         "image_size": flags.image_size,
+        "resize": flags.resize,
         "batch_size": flags.batch_size,
         "grouping": flags.grouping,
         "seeds": flags.seeds,

@@ -40,7 +40,10 @@ class Evaluate:
     preset: str = "b14"
     """Model to start untrained where there are no weights."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; by default the model's."""
+    """Height and width, multiples of the patch size (14); by default the model's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     grouping: str = ",".join(DEFAULT_GROUPINGS)
     """Comma-separated: single, shuffled, sequential, window (an image with those just before it,
     --batch-size in all); QUERIES/DATABASE groups the two sides apart."""
@@ -109,6 +112,7 @@ def run(arguments: Evaluate) -> None:
         preset=arguments.preset,
         seed=arguments.seed,
         image_size=arguments.image_size,
+        resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
         verify=arguments.verify,
     )
@@ -129,6 +133,7 @@ def run(arguments: Evaluate) -> None:
         f"images; positive: {benchmark.rule}"
     )
     say(model_name)
+    say(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()
     results = evaluate(
         params,

@@ -17,7 +17,10 @@ class Export:
     out: pathlib.Path
     """New folder for the program, its manifest.json and its weights."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; by default the model's."""
+    """Height and width, multiples of the patch size (14); by default the model's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
     """Images in a call, or symbolic: any number."""
     grouping: Literal["single", "batch"] = "single"
@@ -47,6 +50,7 @@ def run(arguments: Export) -> None:
     params, config, _ = load_model(
         arguments.weights,
         image_size=arguments.image_size,
+        resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
     )
     manifest = write_export(arguments.out, params, config, how)

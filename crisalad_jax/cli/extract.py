@@ -20,7 +20,10 @@ class Extract:
     out: pathlib.Path
     """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; by default the model's."""
+    """Height and width, multiples of the patch size (14); by default the model's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     grouping: str = "single"
     """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
     all): a cross-image model's descriptors depend on it."""
@@ -67,6 +70,7 @@ def run(arguments: Extract) -> None:
     params, config, _ = load_model(
         arguments.weights,
         image_size=arguments.image_size,
+        resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
         verify=arguments.verify,
     )
@@ -93,5 +97,6 @@ def run(arguments: Extract) -> None:
     skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""
     say(
         f"{arguments.out}: {len(result.names)} descriptors of {result.descriptors.shape[1]} "
-        f"numbers, grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]}){skipped}"
+        f"numbers, grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]}), images at "
+        f"{config.images_in_words}{skipped}"
     )

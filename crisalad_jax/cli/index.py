@@ -28,7 +28,11 @@ class Index:
     dtype: Literal["float32", "float16"] | None = None
     """What files keep descriptors as, by default the map's, and in a new map float32."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; by default the map's, and of a new map the model's."""
+    """Height and width, multiples of the patch size (14); by default the map's, and of a new map
+    the model's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
@@ -53,6 +57,7 @@ def run(arguments: Index) -> None:
         arguments.out,
         weights=arguments.weights,
         image_size=arguments.image_size,
+        resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
         positions=arguments.positions,
         store=arguments.store,
@@ -79,4 +84,5 @@ def _words(result: Indexed) -> list[str]:
     if result.unreadable:
         words.append(f"{len(result.unreadable)} unreadable left out")
     length, store = description.descriptor_length, description.store
-    return [*words, f"{result.images} descriptors of {length} numbers ({store})"]
+    words.append(f"{result.images} descriptors of {length} numbers ({store})")
+    return [*words, f"images at {description.config.images_in_words}"]

@@ -36,7 +36,10 @@ class Info:
     verify: bool = False
     """Read all of the map's descriptors, and compare them with their digests."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; by default the model's."""
+    """Height and width, multiples of the patch size (14); by default the model's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     trainable: str | None = None
     """head, adapters+head, last-N-blocks+head or all; by default the recipe's, of
     a file adapters+head, or head where it has no adapter."""
@@ -67,7 +70,7 @@ def _model(arguments: Info) -> dict[str, Any]:
         defaults = recipe(arguments.preset)
         config, name = defaults.model, arguments.preset
         trainable = arguments.trainable or defaults.trainable
-    config = config.resized(arguments.image_size)
+    config = config.resized(arguments.image_size, arguments.resize)
     summary = model_summary(config, trainable, images=arguments.batch_size)
     console.print(summary_table(summary, name))
     say("\n".join(summary_lines(summary)))

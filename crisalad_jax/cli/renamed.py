@@ -1,9 +1,16 @@
 """Flags of earlier versions, which are replaced with a note."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from crisalad_jax.config.aliases import AGGREGATORS, CLASSES, LOSSES, PROBLEM, REMAT
+from crisalad_jax.config.aliases import (
+    AGGREGATORS,
+    CLASSES,
+    LOSSES,
+    NORMALISATION,
+    PROBLEM,
+    REMAT,
+)
 
 _PROBLEM = "|".join(name.replace("_", "-") for name in PROBLEM)
 _CLASSES = "|".join(name.replace("_", "-") for name in CLASSES)
@@ -16,6 +23,7 @@ _RENAMED: Sequence[tuple[str, str]] = (
     (rf"--model\.({'|'.join(AGGREGATORS)})\.(.+)", r"--model.aggregator.\2"),
     (r"--model\.encoder\.(.+)", r"--model.cross-image.\1"),
     (r"--model\.keeps", "--model.remat"),
+    (r"--model\.normalisation", "--model.preprocessing.normalisation"),
     (r"--model\.backbone\.position-start", "--model.backbone.position-init"),
     (r"--model\.backbone\.layer-scale-start", "--model.backbone.layer-scale-init"),
     (r"--loss\.epsilon", "--loss.miner-margin"),
@@ -36,6 +44,12 @@ _RENAMED: Sequence[tuple[str, str]] = (
     (r"--process", "--process-id"),
 )
 
+_VALUES: Mapping[str, Mapping[str, str]] = {
+    "--model.remat": REMAT,
+    "--model.preprocessing.normalisation": NORMALISATION,
+}
+"""Old values of flags, and today's."""
+
 
 def today(arguments: Sequence[str], tell: Callable[[str], None]) -> list[str]:
     """Replace old names of flags by today's; `tell` is given a line for each old one."""
@@ -51,8 +65,9 @@ def today(arguments: Sequence[str], tell: Callable[[str], None]) -> list[str]:
                 continue
             name = match.expand(new)
             tell(f"{old} is {name} now")
-            updated[position] = f"{name}{equals}{REMAT.get(value, value)}"
-            if name == "--model.remat" and not equals and position + 1 < len(updated):
-                updated[position + 1] = REMAT.get(updated[position + 1], updated[position + 1])
+            values = _VALUES.get(name, {})
+            updated[position] = f"{name}{equals}{values.get(value, value)}"
+            if not equals and position + 1 < len(updated):
+                updated[position + 1] = values.get(updated[position + 1], updated[position + 1])
             break
     return updated

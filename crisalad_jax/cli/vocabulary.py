@@ -45,7 +45,10 @@ class Vocabulary:
     facet: str | None = None
     """What of that block AnyLoc takes: query, key, value or token; by default its values."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; by default the model's."""
+    """Height and width, multiples of the patch size (14); by default the model's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     max_images: int = IMAGES
     """Read at most so many images, drawn at random."""
     batch_size: int = 16
@@ -79,7 +82,7 @@ def run(arguments: Vocabulary) -> None:
     )
     say(
         f"{arguments.out}: {vocabulary_words(config)}, {built.words} words from {built.images} "
-        f"images, descriptors of {config.descriptor_dim} numbers"
+        f"images at {config.images_in_words}, descriptors of {config.descriptor_dim} numbers"
     )
 
 
@@ -96,6 +99,7 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
             backbone=arguments.backbone,
             fields=fields,
             image_size=arguments.image_size,
+            resize=arguments.resize,
             seed=arguments.seed,
         )
     for name in ("backbone", "aggregator", *fields):
@@ -108,4 +112,4 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
             f"with a vocabulary ({', '.join(vocabulary_aggregators())}); --backbone takes the "
             "backbone of any model"
         )
-    return params, config.resized(arguments.image_size)
+    return params, config.resized(arguments.image_size, arguments.resize)

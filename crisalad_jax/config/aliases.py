@@ -24,6 +24,8 @@ RENAMED: Mapping[str, Mapping[str, str]] = {
 """Fields by the name of their class: the old name, and today's."""
 REMAT: Mapping[str, str] = {"products": "dots", "blocks": "full", "everything": "none"}
 """Values of the old `keeps`, with those of `remat`."""
+NORMALISATION: Mapping[str, str] = {"imagenet": "mean-deviation"}
+"""Values of the old `normalisation`, with those of today's, which stands in `preprocessing`."""
 AGGREGATORS = (
     *("salad", "gem-pyramid", "class-token", "gem", "netvlad", "conv-ap", "cosplace", "mixvpr"),
     *("anyloc", "boq", "transvpr"),
@@ -90,6 +92,11 @@ def _model(value: Plain) -> None:
     keeps = value.get("keeps")
     if isinstance(keeps, str) and keeps in REMAT:
         value["keeps"] = REMAT[keeps]
+    if "normalisation" in value and "preprocessing" not in value:
+        how = value.pop("normalisation")
+        if isinstance(how, str):
+            how = NORMALISATION.get(how, how)
+        value["preprocessing"] = {"normalisation": how}
     backbone = value.get("backbone")
     if isinstance(backbone, Mapping) and "name" not in backbone:
         value["backbone"] = {"name": "vit", **backbone}

@@ -6,18 +6,20 @@ import functools
 import itertools
 import os
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
+from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
+from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.read_ahead import read_ahead
-from crisalad_jax.data.resize import resize_image
+from crisalad_jax.data.resize import Pixels
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 
@@ -28,14 +30,12 @@ _IMAGES_PER_TASK = 8
 THREADS = min(usable_cores(), 16)
 """OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
 
-_Image = UInt8[np.ndarray, "h w 3"]
-
 
 class ImageBatch(NamedTuple):
     """Images of one size; `valid` is False for padding and for images that cannot be read."""
 
-    images: UInt8[np.ndarray, "batch h w 3"]
-    """Zeros where not valid."""
+    images: UInt8[np.ndarray, "batch h w 3"] | Float32[np.ndarray, "batch h w 3"]
+    """8-bit pixels, or normalised floats; zeros where not valid."""
     labels: Int32[np.ndarray, " batch"]
     """Place index; position in the list of paths where there are no places; -1 for padding."""
     valid: Bool[np.ndarray, " batch"]
@@ -53,23 +53,28 @@ class ImageCache:
     def __init__(self, budget_bytes: int = 2**30) -> None:
         """Start empty, with room for `budget_bytes` of pixels."""
         self._room = budget_bytes
-        self._images: dict[tuple[str, tuple[int, int], bool], _Image] = {}
+        self._images: dict[tuple[str, Preparation, bool], Pixels] = {}
         self._lock = threading.Lock()
 
     def read(
-        self, path: str | os.PathLike[str], image_size: tuple[int, int], *, quickly: bool = False
-    ) -> _Image:
-        """Read an image at (height, width), from memory if it is there; the array is read-only.
+        self,
+        path: str | os.PathLike[str],
+        how: Preparation,
+        check: Callable[[Size], None] | None = None,
+        *,
+        quickly: bool = False,
+    ) -> Pixels:
+        """Read and prepare an image, from memory if it is there; the array is read-only.
 
         With `quickly` a JPEG may be decoded at a smaller size; see `read_image`.
 
         Raises:
             InputError: the image cannot be read.
         """
-        key = (os.fspath(path), image_size, quickly)
+        key = (os.fspath(path), how, quickly)
         image = self._images.get(key)
         if image is None:
-            image = _read(path, image_size, quickly=quickly)
+            image = _read(path, how, check, quickly=quickly)
             image.setflags(write=False)
             with self._lock:
                 if key not in self._images and image.nbytes <= self._room:
@@ -79,9 +84,17 @@ class ImageCache:
 
 
 def _read(
-    path: str | os.PathLike[str], image_size: tuple[int, int], *, quickly: bool = False
-) -> _Image:
-    return resize_image(read_image(path, enough=image_size if quickly else None), image_size)
+    path: str | os.PathLike[str],
+    how: Preparation,
+    check: Callable[[Size], None] | None = None,
+    *,
+    quickly: bool = False,
+) -> Pixels:
+    image = read_image(path, enough=how.image_size if quickly else None)
+    try:
+        return how.prepare(image, check)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def training_batches(
@@ -94,6 +107,7 @@ def training_batches(
     augmentation: Augmentation,
     seed: int,
     epoch: int,
+    preprocessing: PreprocessingConfig = PreprocessingConfig(),
     steps: int | None = None,
     start_step: int = 0,
     part: tuple[int, int] = (0, 1),
@@ -118,6 +132,8 @@ def training_batches(
         augmentation: changes each image.
         seed: draws everything, together with the epoch and the step.
         epoch: from 0.
+        preprocessing: whose filter resizes bytes. Every image gets the same size, whatever its
+            rule.
         steps: number of batches; None takes every place once.
         start_step: the first batch to give, to go on with an epoch that was interrupted.
         part: (i, n) gives the i-th of n equal parts of every batch, for the i-th of n processes.
@@ -165,13 +181,14 @@ def training_batches(
     number, parts = part
     if not 0 <= number < parts or batch_size % parts:
         raise InputError(f"part: found {part}, expected the i-th of n, which divides {batch_size}")
+    how = Preparation(image_size, preprocessing.for_training())
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
     images = _TrainingImages(
         places,
         indices,
         _read if cache is None or num_workers else cache.read,
-        image_size=image_size,
+        how=how,
         batch_size=batch_size,
         images_per_place=images_per_place,
         augmentation=augmentation,
@@ -182,7 +199,7 @@ def training_batches(
         labels=places.image_place[indices],
         indices=indices,
         positions=slots[start_step:, number].reshape(-1),
-        image_size=image_size,
+        how=how,
         batch_size=batch_size // parts,
         on_bad_image=on_bad_image,
         threads=threads,
@@ -196,17 +213,17 @@ class _TrainingImages:
 
     places: Places
     indices: np.ndarray
-    read: Callable[..., _Image]
+    read: Callable[..., Pixels]
     _: dataclasses.KW_ONLY
-    image_size: tuple[int, int]
+    how: Preparation
     batch_size: int
     images_per_place: int
     augmentation: Augmentation
     seed: tuple[int, int]
 
-    def __call__(self, position: int) -> _Image:
+    def __call__(self, position: int) -> Pixels:
         path = self.places.path(self.indices[position])
-        image = self.read(path, self.image_size, quickly=True)
+        image = self.read(path, self.how, quickly=True)
         step, slot = divmod(position, self.batch_size)
         # The spawn key makes this stream, one for each place, independent of each image's.
         place = (*self.seed, step, slot // self.images_per_place)
@@ -225,21 +242,31 @@ class _TrainingImages:
 def image_batches(
     paths: Sequence[str | os.PathLike[str]],
     *,
-    image_size: tuple[int, int],
+    image_size: Size,
     batch_size: int,
+    preprocessing: PreprocessingConfig = PreprocessingConfig(),
+    side_multiple: int = 1,
+    check_size: Callable[[Size], None] | None = None,
     on_bad_image: OnBadImage = "stop",
     threads: int = THREADS,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Yield batches of the images in `paths`, in order; the last one is padded to `batch_size`.
 
+    Where a rule gives images sizes of their own, consecutive images of one size make a batch, and
+    every change of size ends and pads one: then a `batch_size` of 1 saves work.
+
     Under "skip" an image that cannot be read is not valid but keeps its index. The other arguments
     are those of `training_batches`.
 
     Args:
         paths: image files.
-        image_size: height and width in pixels that images are resized to.
+        image_size: height and width in pixels that images are resized to, or what the rule of
+            `preprocessing` takes from them.
         batch_size: number of images of a batch.
+        preprocessing: how images are resized, and floats normalised.
+        side_multiple: number of pixels that sides are rounded to multiples of.
+        check_size: raises InputError for a height and width that no image may have.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         threads: how many decode ahead; 0 decodes in the caller's thread.
         cache: holds decoded images.
@@ -260,13 +287,14 @@ def image_batches(
     if batch_size < 1:
         raise InputError(f"batch_size: found {batch_size}, expected at least 1")
     read = _read if cache is None else cache.read
+    how = Preparation(image_size, preprocessing, side_multiple)
     indices = np.arange(len(paths))
     return _batches(
-        lambda position: read(paths[position], image_size),
+        lambda position: read(paths[position], how, check_size),
         labels=indices,
         indices=indices,
         positions=indices,
-        image_size=image_size,
+        how=how,
         batch_size=batch_size,
         on_bad_image=on_bad_image,
         threads=threads,
@@ -274,12 +302,12 @@ def image_batches(
 
 
 def _batches(
-    load: Callable[[int], _Image],
+    load: Callable[[int], Pixels],
     *,
     labels: np.ndarray,
     indices: np.ndarray,
     positions: np.ndarray,
-    image_size: tuple[int, int],
+    how: Preparation,
     batch_size: int,
     on_bad_image: OnBadImage,
     threads: int,
@@ -287,18 +315,14 @@ def _batches(
 ) -> Iterator[ImageBatch]:
     """Check the arguments at once, not at the first batch, and return an iterator of batches.
 
-    A batch holds the results of `load` for the next `batch_size` of `positions`.
+    A batch holds the results of `load` for the next `batch_size` of `positions`, or fewer where the
+    size changes.
     """
     if on_bad_image not in ("skip", "stop"):
         raise InputError(f"on_bad_image: found {on_bad_image!r}, expected one of skip, stop")
     for name, count in (("threads", threads), ("num_workers", num_workers)):
         if count < 0:
             raise InputError(f"{name}: found {count}, expected at least 0")
-    if min(image_size) < 1:
-        raise InputError(
-            f"image_size: found {image_size}, expected a height and width of at least 1"
-        )
-
     spans = [
         range(start, min(start + batch_size, len(positions)))
         for start in range(0, len(positions), batch_size)
@@ -321,36 +345,68 @@ def _batches(
         )
         with ONE_THREAD, contextlib.closing(read):
             images = itertools.chain.from_iterable(read)
-            for span in spans:
-                part = positions[span.start : span.stop]
-                batch = _empty_batch(batch_size, image_size)
+            if on_bad_image == "stop":
+                images = map(_must, images)
+            start = 0
+            for run in _alike(images, batch_size):
+                part = positions[start : start + len(run)]
+                start += len(run)
+                sizes = (each.shape[:2] for each in run if not isinstance(each, InputError))
+                # Where none can be read, the size is that of an image of the model's.
+                size_of_all = next(sizes, how.size_of(how.image_size))
+                batch = _empty_batch(batch_size, size_of_all, how.dtype)
                 batch.labels[: len(part)] = labels[part]
                 batch.indices[: len(part)] = indices[part]
-                for slot, image in enumerate(itertools.islice(images, len(part))):
+                for slot, image in enumerate(run):
                     if not isinstance(image, InputError):
                         batch.images[slot] = image
                         batch.valid[slot] = True
-                    elif on_bad_image == "stop":
-                        raise image
                 yield batch
 
     return batches()
 
 
-def _read_all(load: Callable[[int], _Image], positions: np.ndarray) -> list[_Image | InputError]:
+def _alike(
+    images: Iterable[Pixels | InputError], batch_size: int
+) -> Iterator[list[Pixels | InputError]]:
+    """Yield runs of at most `batch_size` consecutive images of one size; errors are of any size."""
+    run: list[Pixels | InputError] = []
+    shape: tuple[int, ...] | None = None
+    for image in images:
+        own = None if isinstance(image, InputError) else image.shape
+        if None not in (own, shape) and own != shape:
+            yield run
+            run, shape = [], None
+        run.append(image)
+        shape = own or shape
+        if len(run) == batch_size:
+            yield run
+            run, shape = [], None
+    if run:
+        yield run
+
+
+def _must(image: Pixels | InputError) -> Pixels:
+    """Return an image; raise the error that stands in its place."""
+    if isinstance(image, InputError):
+        raise image
+    return image
+
+
+def _read_all(load: Callable[[int], Pixels], positions: np.ndarray) -> list[Pixels | InputError]:
     return [_read_or_tell(load, position) for position in positions.tolist()]
 
 
-def _read_or_tell(load: Callable[[int], _Image], position: int) -> _Image | InputError:
+def _read_or_tell(load: Callable[[int], Pixels], position: int) -> Pixels | InputError:
     try:
         return load(position)
     except InputError as error:
         return error
 
 
-def _empty_batch(batch_size: int, image_size: tuple[int, int]) -> ImageBatch:
+def _empty_batch(batch_size: int, image_size: Size, dtype: type[np.generic]) -> ImageBatch:
     return ImageBatch(
-        images=np.zeros((batch_size, *image_size, 3), np.uint8),
+        images=np.zeros((batch_size, *image_size, 3), dtype),
         labels=np.full(batch_size, -1, np.int32),
         valid=np.zeros(batch_size, np.bool_),
         indices=np.full(batch_size, -1, np.int64),

@@ -1,57 +1,92 @@
-"""Resize images as Pillow does, compiled by numba: OpenCV has no antialiased bilinear filter."""
+"""Resize images as Pillow and torch do, compiled by numba: OpenCV has no antialiased filters."""
 
 import functools
 import threading
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
+from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
+
+Pixels = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
 
 
 def resize_image(
-    image: UInt8[np.ndarray, "h w 3"], image_size: tuple[int, int]
-) -> UInt8[np.ndarray, "height width 3"]:
+    image: Pixels,
+    image_size: tuple[int, int],
+    *,
+    filter: Literal["bilinear", "bicubic", "area"] = "bilinear",
+    antialias: bool = True,
+    pixels: Literal["bytes", "floats"] = "bytes",
+) -> Pixels:
     """Resize an image, without keeping the aspect ratio.
 
-    The filter is bilinear, and antialiased where the image shrinks: a triangle two output pixels
-    wide. The public models were trained and evaluated with it, as Pillow's BILINEAR and
-    torchvision's Resize. The result equals Pillow's within one grey level. (OpenCV's INTER_AREA is
-    a box filter, several times further from Pillow on photographs; its INTER_LINEAR aliases.)
+    By default the filter is bilinear, and antialiased where the image shrinks: a triangle two
+    output pixels wide. Most public models were trained and evaluated with it, as Pillow's BILINEAR
+    and torchvision's Resize. The result equals Pillow's within one grey level, as that of "bicubic"
+    on bytes does. (OpenCV's INTER_AREA is a box filter, several times further from Pillow on
+    photographs; its INTER_LINEAR aliases.) Floats equal torch's `interpolate` up to rounding, with
+    the antialias or without.
     Without numba, which the `train` extra installs, matrix products take a hundred times as long.
 
     Args:
-        image: 8-bit RGB.
+        image: 8-bit RGB; with "floats" also float32.
         image_size: height and width in pixels.
+        filter: "bilinear", "bicubic", or "area", OpenCV's INTER_AREA; where a side grows that is
+            INTER_LINEAR, as hloc has it.
+        antialias: whether the filter widens where the image shrinks. Without it "bicubic" is a
+            little sharper, as torch's is.
+        pixels: "bytes" are rounded after each pass, as by Pillow; "floats" are neither rounded nor
+            clamped, and stay in the range of the image.
 
     Returns:
-        The image at that size.
+        The image at that size, of uint8 or float32.
 
     Raises:
-        InputError: the image is not 8-bit RGB, or either size has no pixel.
+        InputError: the image is not 8-bit RGB, either size has no pixel, or no such filter.
 
     Example:
         >>> import numpy as np
         >>> resize_image(np.full((4, 6, 3), 7, np.uint8), (2, 3))[0, 0].tolist()
         [7, 7, 7]
     """
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+    choose("pixels", pixels, {"bytes": None, "floats": None})
+    choose("filter", filter, {**_KERNELS, "area": None})
+    kinds = (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32)
+    if image.dtype not in kinds or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(
             f"image: found {image.dtype} of shape {image.shape}, expected uint8 of shape "
             "(height, width, 3) with sides of at least 1"
         )
     if min(image_size) < 1:
         raise InputError(f"image_size: found {image_size}, expected sides of at least 1")
+    if filter == "area":
+        return _resize_by_area(image, image_size, pixels)
     height, width = image.shape[:2]
-    pixels = np.ascontiguousarray(image).reshape(height, 3 * width)
-    resized = np.empty((*image_size, 3), np.uint8)
-    lines, columns = _taps(height, image_size[0]), _taps(width, image_size[1])
-    with _COMPILING:
+    lines = _taps(height, image_size[0], filter, antialias)
+    columns = _taps(width, image_size[1], filter, antialias)
+    flat = np.ascontiguousarray(image).reshape(height, 3 * width)
+    if (filter, antialias, pixels) == ("bilinear", True, "bytes"):
+        resized = np.empty((*image_size, 3), np.uint8)
         resample = _compiled()
-    resample(pixels, *lines, *columns, resized.reshape(image_size[0], -1))
-    return resized
+        resample(flat, *lines, *columns, resized.reshape(image_size[0], -1))
+        return resized
+    resized = np.empty((*image_size, 3), np.float32)
+    resample = _compiled_floats()
+    target = resized.reshape(image_size[0], -1)
+    resample(flat.astype(np.float32), *lines, *columns, target, pixels == "bytes")
+    return resized.astype(np.uint8) if pixels == "bytes" else resized
+
+
+def _resize_by_area(image: Pixels, image_size: tuple[int, int], pixels: str) -> Pixels:
+    grows = any(new > old for new, old in zip(image_size, image.shape, strict=False))
+    how = cv2.INTER_LINEAR if grows else cv2.INTER_AREA
+    given: Any = image if pixels == "bytes" else image.astype(np.float32)
+    return cv2.resize(given, image_size[::-1], interpolation=how)
 
 
 class _Taps(NamedTuple):
@@ -63,46 +98,103 @@ class _Taps(NamedTuple):
     """Sum to 1; 0 from `count` on."""
 
 
+def _triangle(distances: np.ndarray) -> np.ndarray:
+    return np.maximum(0, 1 - distances)
+
+
+def _cubic(distances: np.ndarray, a: float) -> np.ndarray:
+    """Compute Keys' cubic; `a` is its slope at 1, the first zero."""
+    near = ((a + 2) * distances - (a + 3)) * distances**2 + 1
+    far = a * (((distances - 5) * distances + 8) * distances - 4)
+    return np.where(distances < 1, near, np.where(distances < 2, far, 0))
+
+
+_KERNELS: Mapping[str, tuple[int, Callable[[np.ndarray], np.ndarray]]] = {
+    "bilinear": (1, _triangle),
+    "bicubic": (2, functools.partial(_cubic, a=-0.5)),
+}
+"""Radius in output pixels and weights by distance, of Pillow's filters and torch's antialiased."""
+_SHARPER = {"bilinear": _triangle, "bicubic": functools.partial(_cubic, a=-0.75)}
+"""Weights of torch's filters without antialias."""
+
+
 @functools.lru_cache(maxsize=256)
-def _taps(old: int, new: int) -> _Taps:
+def _taps(old: int, new: int, name: str, antialias: bool) -> _Taps:
+    if not antialias:
+        return _taps_at_points(old, new, name)
+    support, kernel = _KERNELS[name]
     scale = old / new
-    radius = max(scale, 1.0)
+    stretch = max(scale, 1.0)
+    radius = support * stretch
     centres = (np.arange(new) + 0.5) * scale
     first = np.maximum(0, np.floor(centres - radius + 0.5)).astype(np.int64)
     last = np.minimum(old - 1, np.ceil(centres + radius - 0.5) - 1).astype(np.int64)
     count = last - first + 1
     number = np.arange(count.max())
-    distances = np.abs(first[:, None] + number + 0.5 - centres[:, None]) / radius
-    weights = np.where(number < count[:, None], np.maximum(0, 1 - distances), 0)
+    distances = np.abs(first[:, None] + number + 0.5 - centres[:, None]) / stretch
+    weights = np.where(number < count[:, None], kernel(distances), 0)
     weights /= weights.sum(axis=1, keepdims=True)
     return _Taps(first, count, weights.astype(np.float32))
+
+
+def _taps_at_points(old: int, new: int, name: str) -> _Taps:
+    """Make taps that do not widen; beyond the border the last pixel is repeated."""
+    support, _ = _KERNELS[name]
+    points = (np.arange(new) + 0.5) * (old / new) - 0.5
+    if name == "bilinear":
+        points = np.maximum(points, 0)
+    floor = np.floor(points)
+    near = floor[:, None] + np.arange(1 - support, 1 + support)
+    weights = _SHARPER[name](np.abs(near - points[:, None]))
+    inside = np.clip(near, 0, old - 1).astype(np.int64)
+    first, count = inside[:, 0], inside[:, -1] - inside[:, 0] + 1
+    summed = np.zeros_like(weights)
+    np.add.at(summed, (np.arange(new)[:, None], inside - first[:, None]), weights)
+    return _Taps(np.ascontiguousarray(first), count, summed.astype(np.float32))
 
 
 _COMPILING = threading.Lock()
 """Lock around the compilation: without it every thread would compile at its first image."""
 
 
-@functools.cache
 def _compiled() -> Callable[..., None]:
-    """Return `_resample` as machine code, which releases Python's global lock.
+    """Return `_resample` as machine code, or as matrix products without numba."""
+    with _COMPILING:
+        return _machine_code(_resample, "uint8", "uint8") or _multiply
 
-    It compiles in less than a second, and is cached on disk (beside this file, or for the user).
+
+def _compiled_floats() -> Callable[..., None]:
+    """Return `_resample_floats` as machine code, or as matrix products without numba."""
+    with _COMPILING:
+        return _machine_code(_resample_floats, "float32", "float32", "bool_") or _multiply_floats
+
+
+@functools.cache
+def _machine_code(
+    function: Callable[..., None], old: str, new: str, *more: str
+) -> Callable[..., None] | None:
+    """Compile a function of pixels, taps and result, which then releases Python's global lock.
+
+    It compiles in about a second, and is cached on disk (beside this file, or for the user). The
+    result is None without numba.
     """
     try:
         import numba
         from numba import types
     except ModuleNotFoundError:
-        return _multiply
+        return None
 
-    old = types.Array(types.uint8, 2, "C", readonly=True)  # accepts writable arrays too
-    new, numbers = types.uint8[:, ::1], types.int64[::1]
+    # A readonly array accepts writable ones too.
+    pixels = types.Array(getattr(types, old), 2, "C", readonly=True)
+    numbers = types.int64[::1]
     taps = (numbers, numbers, types.float32[:, ::1])
+    result = (getattr(types, new)[:, ::1], *(getattr(types, each) for each in more))
     options = {"nogil": True, "fastmath": {"contract"}}
-    signature = types.void(old, *taps, *taps, new)
+    signature = types.void(pixels, *taps, *taps, *result)
     try:
-        return numba.njit(signature, cache=True, **options)(_resample)
+        return numba.njit(signature, cache=True, **options)(function)
     except (RuntimeError, OSError):  # no writable cache folder, or a full disk
-        return numba.njit(signature, **options)(_resample)
+        return numba.njit(signature, **options)(function)
 
 
 def _resample(
@@ -138,6 +230,47 @@ def _resample(
             target[3 * column + 2] = np.uint8(blue)
 
 
+def _resample_floats(
+    pixels: np.ndarray,
+    first_line: np.ndarray,
+    line_count: np.ndarray,
+    line_weights: np.ndarray,
+    first_column: np.ndarray,
+    column_count: np.ndarray,
+    column_weights: np.ndarray,
+    resized: np.ndarray,
+    rounds: bool,
+) -> None:
+    """Resample along rows, then along columns, as Pillow does; with `rounds` to 0 to 255."""
+    lines = np.empty((pixels.shape[0], resized.shape[1]), np.float32)
+    for row in range(pixels.shape[0]):
+        line = lines[row]
+        for column in range(first_column.size):
+            near = pixels[row, 3 * first_column[column] :]
+            red = green = blue = np.float32(0)
+            for tap in range(column_count[column]):
+                weight = column_weights[column, tap]
+                red += weight * near[3 * tap]
+                green += weight * near[3 * tap + 1]
+                blue += weight * near[3 * tap + 2]
+            line[3 * column] = red
+            line[3 * column + 1] = green
+            line[3 * column + 2] = blue
+        if rounds:
+            for i in range(line.size):
+                line[i] = min(max(np.floor(line[i] + np.float32(0.5)), 0), 255)
+    for row in range(resized.shape[0]):
+        target = resized[row]
+        target[:] = 0
+        for tap in range(line_count[row]):
+            weight, source = line_weights[row, tap], lines[first_line[row] + tap]
+            for i in range(target.size):
+                target[i] += weight * source[i]
+        if rounds:
+            for i in range(target.size):
+                target[i] = min(max(np.floor(target[i] + np.float32(0.5)), 0), 255)
+
+
 def _multiply(pixels: np.ndarray, *taps_and_result: np.ndarray) -> None:
     """Resample as `_resample` does, by dense matrix products."""
     *taps, resized = taps_and_result
@@ -148,6 +281,20 @@ def _multiply(pixels: np.ndarray, *taps_and_result: np.ndarray) -> None:
     np.add(
         np.einsum("hwc,vw->hvc", rows, columns, optimize=True), 0.5, out=target, casting="unsafe"
     )
+
+
+def _multiply_floats(pixels: np.ndarray, *taps_result_and_rounds: Any) -> None:
+    """Resample as `_resample_floats` does, by dense matrix products."""
+    *taps, resized, rounds = taps_result_and_rounds
+    lines = _matrix(_Taps(*taps[:3]), pixels.shape[0])
+    columns = _matrix(_Taps(*taps[3:]), pixels.shape[1] // 3)
+    rows = np.einsum("hwc,vw->hvc", pixels.reshape(len(pixels), -1, 3), columns, optimize=True)
+    rows = rows.reshape(len(pixels), -1)
+    if rounds:
+        rows = np.clip(np.floor(rows + np.float32(0.5)), 0, 255)
+    np.matmul(lines, rows, out=resized)
+    if rounds:
+        np.clip(np.floor(resized + np.float32(0.5)), 0, 255, out=resized)
 
 
 def _matrix(taps: _Taps, old: int) -> np.ndarray:

@@ -1,13 +1,15 @@
 """The configuration of a whole model, and the presets of model sizes."""
 
 import dataclasses
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -33,9 +35,10 @@ class ModelConfig:
     """
 
     image_size: tuple[int, int] = free_field((224, 224))
-    """Height and width that images are resized to, multiples of 14."""
-    normalisation: Literal["imagenet", "local-contrast"] = "imagenet"
-    """Mean and deviation that normalise 8-bit pixels: ImageNet's or local ones."""
+    """Height and width that images are resized to, multiples of the patch size (but see
+    `PreprocessingConfig.size_rule`)."""
+    preprocessing: PreprocessingConfig = PreprocessingConfig()
+    """How images are resized and normalised."""
     backbone: OrName[Backbone] = part_field(BACKBONES, "vit")
     """Registered backbone, or its name; it turns pixels into features."""
     aggregator: OrName[Aggregator] = part_field(AGGREGATORS, "salad")
@@ -62,7 +65,8 @@ class ModelConfig:
             f"backbone: found {self.backbone.part_name}, which has no class token, expected one "
             f"that has, for aggregator {name}",
         )
-        self.check_image_size(self.image_size)
+        self._check_size_rule()
+        self.check_image_size(self.input_size)
         require(
             self.aggregator.learns or not self.cross_image.layers,
             f"CrossImageConfig.layers: found {self.cross_image.layers} for aggregator {name}, with "
@@ -71,6 +75,15 @@ class ModelConfig:
         shape = self.token_shape
         if self.cross_image.layers:
             self._check_cross_image(shape)
+
+    def _check_size_rule(self) -> None:
+        rule = self.preprocessing.size_rule
+        require(
+            rule == "fixed" or not self.aggregator.fixed_grid,
+            f"PreprocessingConfig.size_rule: found {rule}, expected fixed: aggregator "
+            f"{self.aggregator.part_name} has parameters for every patch, and was made for images "
+            "of one size alone",
+        )
 
     def _check_cross_image(self, shape: TokenShape) -> None:
         heads = self.cross_image.heads
@@ -118,13 +131,44 @@ class ModelConfig:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of patches in an image of `image_size`."""
-        return self.backbone.grid(self.image_size)
+        """Rows and columns of patches in an image of `input_size`."""
+        return self.backbone.grid(self.input_size)
 
     @property
     def patches(self) -> int:
-        """Number of patches in an image of `image_size`."""
+        """Number of patches in an image of `input_size`."""
         return math.prod(self.grid)
+
+    @property
+    def input_size(self) -> Size:
+        """Height and width of the network's input: `image_size`, rounded where that is asked for.
+
+        Training, an export and costs are of this size, whatever `PreprocessingConfig.size_rule`.
+        """
+        return self.rounded_size(self.image_size)
+
+    def rounded_size(self, size: Size) -> Size:
+        """Return the height and width of the network's input for an image resized to `size`."""
+        return self.preprocessing.rounded_size(size, self.side_multiple)
+
+    @property
+    def side_multiple(self) -> int:
+        """Number of pixels that sides are multiples of: 1 where the backbone takes any size."""
+        return _side_multiple(self.backbone)
+
+    @property
+    def images_in_words(self) -> str:
+        """The size and filter of images, in a few words.
+
+        Example:
+            >>> PRESETS["b14"].images_in_words
+            '224 x 224, bilinear, antialiased, on bytes'
+        """
+        words = self.preprocessing.in_words(self.image_size)
+        multiple = self.side_multiple
+        needed = self.preprocessing.size_rule != "fixed" or self.input_size != self.image_size
+        rounded = self.preprocessing.rounds and multiple > 1 and needed
+        return f"{words}, rounded to multiples of {multiple}" if rounded else words
 
     def check_image_size(self, image_size: tuple[int, int]) -> None:
         """Check that this model can describe images of this height and width.
@@ -138,8 +182,8 @@ class ModelConfig:
                 f"image size: found {' x '.join(map(str, image_size))}, expected at most "
                 f"{MOST_PIXELS} pixels a side"
             )
-        if self.aggregator.fixed_grid and tuple(image_size) != tuple(self.image_size):
-            given, expected = (f"{h} x {w}" for h, w in (image_size, self.image_size))
+        if self.aggregator.fixed_grid and tuple(image_size) != tuple(self.input_size):
+            given, expected = (f"{h} x {w}" for h, w in (image_size, self.input_size))
             raise InputError(
                 f"image size: found {given}, expected {expected}: aggregator "
                 f"{self.aggregator.part_name} has parameters for every patch, and was made for "
@@ -147,26 +191,41 @@ class ModelConfig:
             )
         self.aggregator.check_grid(self.backbone.grid(image_size), self.backbone.patch_size)
 
-    def resized(self, image_size: tuple[int, int] | None) -> "ModelConfig":
-        """Return this model for images of another size.
+    def resized(self, image_size: Size | None, resize: Sequence[str] = ()) -> "ModelConfig":
+        """Return this model for images of another size, or resized in another way.
 
         Args:
             image_size: height and width in pixels; None keeps the model's own.
+            resize: some of `preprocessing.WORDS`, such as "bicubic"; none keep the model's own.
 
         Returns:
             The configuration, which fits the same parameters.
 
         Raises:
-            InputError: what `check_image_size` raises.
+            InputError: what `check_image_size` and `PreprocessingConfig.changed_by` raise.
 
         Example:
             >>> PRESETS["tiny"].resized((70, 98)).grid
             (5, 7)
         """
+        changed = self.preprocessing.changed_by(resize)
+        config = dataclasses.replace(self, preprocessing=changed) if resize else self
         if image_size is None:
-            return self
-        self.check_image_size(image_size)
-        return dataclasses.replace(self, image_size=image_size)
+            return config
+        config.check_image_size(config.rounded_size(image_size))
+        return dataclasses.replace(config, image_size=image_size)
+
+
+@functools.cache
+def _side_multiple(backbone: Backbone) -> int:
+    """Ask a backbone whether it takes a side that is no multiple of its patch size."""
+    size = backbone.patch_size
+    side = MOST_PIXELS // size * size - 1
+    try:
+        backbone.grid((side, side))
+    except InputError:
+        return size
+    return 1
 
 
 def _preset(dim: int, depth: int, heads: int, **backbone: Any) -> ModelConfig:
@@ -177,7 +236,7 @@ def _preset(dim: int, depth: int, heads: int, **backbone: Any) -> ModelConfig:
 PRESETS: Mapping[str, ModelConfig] = {
     "tiny": ModelConfig(
         image_size=(98, 98),
-        normalisation="local-contrast",
+        preprocessing=PreprocessingConfig(normalisation="local-contrast"),
         backbone=ViTConfig(dim=128, depth=4, heads=4, position_grid=7, position_init="sincos"),
         aggregator=AGGREGATORS.make("salad", "tiny"),
         cross_image=CrossImageConfig(heads=4, feedforward=128, dropout=0.0),

@@ -47,7 +47,7 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     Work that a batch does once, independent of its images, does not count.
 
     Args:
-        config: the model; images are of its `image_size`.
+        config: the model; images are of its `input_size`.
         images: number of images that attend to each other in the cross-image encoder. Only the
             cost of its attention depends on it.
 
@@ -62,13 +62,13 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     params = parameter_shapes(config)
 
     def tokens_of(count: int) -> Any:
-        pixels = jax.ShapeDtypeStruct((count, *config.image_size, 3), jnp.uint8)
+        pixels = jax.ShapeDtypeStruct((count, *config.input_size, 3), jnp.uint8)
         return jax.make_jaxpr(functools.partial(extract_tokens, config=config))(params, pixels)
 
     single, double = (_count(tokens_of(count)) for count in (1, 2))
     macs = {part: double[part] - single[part] for part in _SCOPES.values()}
     if params.cross_image is not None:
-        pixels = jax.ShapeDtypeStruct((images, *config.image_size, 3), jnp.uint8)
+        pixels = jax.ShapeDtypeStruct((images, *config.input_size, 3), jnp.uint8)
         tokens = jax.eval_shape(functools.partial(extract_tokens, config=config), params, pixels)
         attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
         attended = _count(jax.make_jaxpr(attend)(params, tokens))

@@ -156,7 +156,7 @@ def _check_classes(params: Any, config: Any) -> None:
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
 
 
-def _door(second: str, check: Callable[[Any], None]) -> Callable[..., Any]:
+def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[..., Any]:
     """Make a decorator that checks what a trace cannot, before the call of a compiled function.
 
     Args:
@@ -171,7 +171,7 @@ def _door(second: str, check: Callable[[Any], None]) -> Callable[..., Any]:
             if len(given.keys() & {"params", second, "config"}) < 3:
                 return function(*args, **options)  # which raises Python's own error
             _check_classes(given["params"], given["config"])
-            check(given[second])
+            check(given[second], given["config"])
             try:
                 return function(*args, **options)
             except TypeError:
@@ -183,14 +183,18 @@ def _door(second: str, check: Callable[[Any], None]) -> Callable[..., Any]:
     return decorate
 
 
-def _check_token_class(tokens: Any) -> None:
+def _check_images(images: Any, config: ModelConfig) -> None:
+    check_pixels(images, config.preprocessing)
+
+
+def _check_token_class(tokens: Any, _: ModelConfig) -> None:
     if not isinstance(tokens, Tokens):
         raise InputError(
             f"tokens: found {type(tokens).__name__}, expected Tokens, of `extract_tokens`"
         )
 
 
-@_door("images", check_pixels)
+@_door("images", _check_images)
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def describe(
     params: Crisalad,
@@ -213,9 +217,9 @@ def describe(
 
     Args:
         params: from `init_crisalad` or a weight file.
-        images: 8-bit pixels, which are normalised here as `config.normalisation` says, or floats
-            that already are (pixels of 0 to 1 or to 255 as floats are refused). The sides are
-            multiples of 14; they need not be `config.image_size`.
+        images: 8-bit pixels, which are normalised here as `config.preprocessing` says, or floats
+            that already are (pixels of 0 to 1 or to 255 as floats are refused). The sides are such
+            as the backbone takes; they need not be `config.image_size`. See `prepare_image`.
         config: the model, static.
         mask: which images attend to which.
         key: draws the dropout (a `jax.random.key`); None means inference.
@@ -242,7 +246,7 @@ def describe(
     return attend_across_images(params, tokens, config, mask=mask, key=cross_key)
 
 
-@_door("images", check_pixels)
+@_door("images", _check_images)
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def extract_tokens(
     params: Crisalad,
@@ -308,7 +312,7 @@ def extract_tokens(
     return jax.tree.map(join, jax.lax.map(once, jax.tree.map(split, (images, keys))))
 
 
-@_door("images", check_pixels)
+@_door("images", _check_images)
 @functools.partial(compiler.jit, static_argnames="config")
 def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
     """Extract the features of every image that the aggregator requests.
@@ -343,14 +347,14 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
             f"images: found {images.dtype}, expected uint8 pixels, or floats that are normalised"
         )
     if images.dtype == jnp.uint8:
-        images = jax.vmap(functools.partial(normalise, how=config.normalisation))(images)
+        images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
     request = config.aggregator.features(config.backbone.depth)
     pixels = images.astype(config.compute_dtype)
     with jax.named_scope("backbone"):
         return config.backbone.apply(params.backbone, pixels, request, remat=config.remat)
 
 
-@_door("images", check_pixels)
+@_door("images", _check_images)
 @functools.partial(compiler.jit, static_argnames="config")
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
@@ -442,7 +446,7 @@ def _check_token_shapes(tokens: Tokens, config: ModelConfig) -> None:
         )
 
 
-@_door("images", check_pixels)
+@_door("images", _check_images)
 @functools.partial(compiler.jit, static_argnames="config")
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig

@@ -8,11 +8,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, UInt8
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.utils.errors import InputError
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 LOCAL_WINDOW = 21
 """Side in pixels of the box of local contrast normalisation: one and a half patches."""
 LOCAL_NOISE = 0.02
@@ -20,18 +18,22 @@ LOCAL_NOISE = 0.02
 
 _BYTES_FROM = 30.0
 """Numbers above this are pixels of 0 to 255. ImageNet's normalisation gives at most 2.7, and that
-of local contrast at most 21, the root of its window's size."""
+of local contrast at most 21, the root of its window's size. Other means and deviations may give
+more: see `_largest`."""
+_OVERSHOOT = 1.5
+"""Range of what a bicubic filter on floats gives, for pixels of a range of 1."""
 _SPREAD = 0.5
 """Least range of pixels of 0 to 1. Normalised images that lie inside of it are nearly uniform."""
 
 
-def check_pixels(images: Any) -> None:
+def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) -> None:
     """Check that images are an array, and that floats are normalised and no plain pixels.
 
     Traced values are not known, and pass.
 
     Args:
         images: 8-bit pixels, or floats.
+        how: how they are normalised.
 
     Raises:
         InputError: they are no array, or floats of 0 to 255 or of 0 to 1.
@@ -59,16 +61,22 @@ def check_pixels(images: Any) -> None:
         low, high = map(float, _range(images))
     else:
         return  # parts of it lie with other processes
-    if high > _BYTES_FROM:
-        how = "images.round().astype(np.uint8)"
+    if high > max(_BYTES_FROM, _largest(how)):
+        cure = "images.round().astype(np.uint8)"
     elif low >= 0 and high <= 1 and high - low >= _SPREAD:
-        how = "(255 * images).round().astype(np.uint8)"
+        cure = "(255 * images).round().astype(np.uint8)"
     else:
         return
     raise InputError(
         f"images: found {images.dtype} from {low:.3g} to {high:.3g}, which are pixels, expected "
-        f"floats that are normalised, or uint8: {how}"
+        f"floats that are normalised, or uint8: {cure}"
     )
+
+
+def _largest(how: PreprocessingConfig) -> float:
+    """Return the largest number that pixels can be normalised to by mean and deviation."""
+    pairs = zip(how.mean, how.deviation, strict=True)
+    return max((_OVERSHOOT - mean) / deviation for mean, deviation in pairs)
 
 
 @jax.jit
@@ -76,23 +84,20 @@ def _range(images: Float[Array, "..."]) -> tuple[Float[Array, ""], Float[Array, 
     return images.min(), images.max()
 
 
-def normalise(image: UInt8[Array, "height width 3"], how: str) -> Float[Array, "height width 3"]:
+def normalise(
+    image: UInt8[Array, "height width 3"], how: PreprocessingConfig
+) -> Float[Array, "height width 3"]:
     """Normalise one RGB image.
 
-    "imagenet" subtracts ImageNet's mean and divides by its deviation, as DINOv2 expects.
-    "local-contrast" uses the mean and deviation of each pixel's 21 x 21 neighbourhood. It is for
+    "mean-deviation" subtracts the mean and divides by the deviation, by default ImageNet's, as
+    DINOv2 expects. "local-contrast" uses those of each pixel's 21 x 21 neighbourhood. It is for
     small models trained from scratch, which would have to learn to ignore the light.
-
-    Raises:
-        InputError: no such normalisation.
     """
-    ways = {"imagenet": _imagenet, "local-contrast": _local_contrast}
     # JAX's default float type: float32, and float64 in its 64-bit mode.
-    return choose("normalisation", how, ways)(image.astype(float) / 255)
-
-
-def _imagenet(image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
-    return (image - jnp.array(IMAGENET_MEAN)) / jnp.array(IMAGENET_DEVIATION)
+    pixels = image.astype(float) / 255
+    if how.normalisation == "local-contrast":
+        return _local_contrast(pixels)
+    return (pixels - jnp.array(how.mean)) / jnp.array(how.deviation)
 
 
 def _local_contrast(image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage, image_batches
+from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens
 from crisalad_jax.nn.tokens import Tokens
@@ -18,6 +18,7 @@ from crisalad_jax.retrieval.grouping import (
     Batches,
     batches_of,
 )
+from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.progress import progress_bar
@@ -50,7 +51,7 @@ def read_tokens(
     cache: ImageCache | None = None,
     quiet: bool = False,
 ) -> FolderTokens:
-    """Read images, resized to `config.image_size`, and extract their tokens in order.
+    """Read images, resized as `config` says, and extract their tokens in order.
 
     Raises:
         InputError: an image cannot be read, and `on_bad_image` is "stop".
@@ -76,7 +77,8 @@ def tokens_in_batches(
     on_bad_image: OnBadImage = "stop",
     cache: ImageCache | None = None,
 ) -> Iterator[tuple[FolderTokens, ImageBatch]]:
-    """Yield the tokens of images in order, batch by batch; the last batch is padded.
+    """Yield the tokens of images in order, batch by batch; the last batch is padded, and so
+    is each before a change of size.
 
     Each comes with the batch of images it was made of. Two batches are in memory, and the images
     that are read ahead.
@@ -84,12 +86,8 @@ def tokens_in_batches(
     Raises:
         InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
     """
-    batches = image_batches(
-        paths,
-        image_size=config.image_size,
-        batch_size=batch_size,
-        on_bad_image=on_bad_image,
-        cache=cache,
+    batches = photograph_batches(
+        config, paths, batch_size=batch_size, on_bad_image=on_bad_image, cache=cache
     )
     devices = devices_for(batch_size)
     params = devices.replicate(params)

@@ -69,7 +69,7 @@ def extract(
 
     Args:
         params: the model's parameters.
-        config: the model; images are resized to its `image_size`.
+        config: the model; images are resized as it says.
         images: a folder, searched with its subfolders in sorted order, or a list of files.
         out: a file .npy, with the names beside it, or .h5, as hloc reads it. How it was made is
             written beside it too, as JSON. None writes nothing.

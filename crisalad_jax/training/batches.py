@@ -56,7 +56,8 @@ def batches_of(
     """Yield the batches of an epoch; `options` go to `training_batches`."""
     return training_batches(
         places,
-        image_size=config.model.image_size,
+        image_size=config.model.input_size,
+        preprocessing=config.model.preprocessing,
         places_per_batch=config.places_per_batch,
         images_per_place=config.images_per_place,
         order=config.batch_order,

@@ -18,12 +18,13 @@ from jaxtyping import PyTree
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache, OnBadImage, image_batches
+from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.model import Crisalad, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
+from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.batches import batches_of, groups_of, steps_per_epoch
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.run_files import (
@@ -370,10 +371,9 @@ class Run:
         """Compute statistics of the transport on the first queries, without dropout."""
         model = self.config.model
         paths = benchmark.queries[:WATCHED_QUERIES]
-        batches = image_batches(
-            paths, image_size=model.image_size, batch_size=len(paths), cache=self._cache
-        )
-        transport = extract_tokens(params, next(iter(batches)).images, model).transport
+        batches = photograph_batches(model, paths, batch_size=len(paths), cache=self._cache)
+        batch = next(iter(batches))  # of the size of the first, where sizes differ
+        transport = extract_tokens(params, batch.images[batch.valid], model).transport
         return {} if transport is None else _numbers(jax.tree.map(jnp.mean, transport))
 
     def save_is_due(self) -> bool:

@@ -308,7 +308,7 @@ def make_train_step(
         key: PRNGKeyArray,
         valid: Bool[Array | np.ndarray, " image"] | None = None,
     ) -> tuple[TrainState, Metrics]:
-        check_pixels(images)
+        check_pixels(images, config.model.preprocessing)
         # JAX would keep the lower half of each, and join places that differ in the upper one.
         # Its own arrays have no such labels, and may be traced or still be computed.
         if not isinstance(labels, jax.Array) and np.max(labels, initial=0) >= 2**31:

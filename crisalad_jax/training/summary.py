@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.training.config import has_adapters
@@ -24,6 +25,10 @@ class ModelSummary(NamedTuple):
 
     image_size: tuple[int, int]
     """Height and width in pixels."""
+    images: str
+    """How images are resized, in words."""
+    preprocessing: dict[str, Any]
+    """How images are resized and normalised, as JSON values."""
     descriptor: int
     """Length of a descriptor."""
     trainable: str
@@ -71,6 +76,8 @@ def model_summary(
         adapter = AdapterSummary(count, adapter_macs(config), paper_adapter_macs(config))
     return ModelSummary(
         config.image_size,
+        config.images_in_words,
+        to_plain(config.preprocessing),
         config.descriptor_dim,
         trainable,
         trained,
@@ -115,6 +122,7 @@ def summary_json(summary: ModelSummary, name: str) -> dict[str, Any]:
 def summary_lines(summary: ModelSummary) -> list[str]:
     """Format the rest of a summary as lines for the terminal."""
     lines = [
+        f"images                {summary.images}",
         f"descriptor            {summary.descriptor:>13,} numbers",
         f"trainable             {summary.trainable_parameters:>13,} parameters "
         f"({summary.trainable})",

@@ -20,13 +20,14 @@ from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.data.images import list_images
-from crisalad_jax.data.loader import OnBadImage, image_batches
+from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.describe import useful_batch_size
+from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
@@ -124,6 +125,7 @@ def start_vocabulary(
     backbone: str | os.PathLike[str] | None = None,
     fields: Mapping[str, Any] | None = None,
     image_size: tuple[int, int] | None = None,
+    resize: Sequence[str] = (),
     seed: int = 0,
 ) -> tuple[Crisalad, ModelConfig]:
     """Make a model that lacks only its vocabulary.
@@ -134,6 +136,7 @@ def start_vocabulary(
         backbone: a checkpoint of which the backbone is taken; None is a random one.
         fields: settings of the aggregator that are other than the preset's, by name.
         image_size: height and width in pixels; None is the preset's.
+        resize: words that change how images are resized; see `ModelConfig.resized`.
         seed: draws what is random.
 
     Returns:
@@ -154,7 +157,7 @@ def start_vocabulary(
                 f"expected one of {', '.join(known) or 'none'}"
             )
     part = dataclasses.replace(part, **(fields or {}))
-    config = dataclasses.replace(config, aggregator=part).resized(image_size)
+    config = dataclasses.replace(config, aggregator=part).resized(image_size, resize)
     if backbone is not None:
         check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     params = init_crisalad(jax.random.key(seed), config)
@@ -271,7 +274,7 @@ def _check_counts(
 
 
 def _taken(config: ModelConfig) -> int:
-    """Count the features that are taken of an image."""
+    """Count the features that are taken of an image of the model's size."""
     return min(PATCHES, config.patches)
 
 
@@ -286,9 +289,7 @@ def _read_features(
     quiet: bool,
 ) -> Float32[np.ndarray, "feature dim"]:
     batch_size = useful_batch_size(batch_size, len(paths))
-    batches = image_batches(
-        paths, image_size=config.image_size, batch_size=batch_size, on_bad_image=on_bad_image
-    )
+    batches = photograph_batches(config, paths, batch_size=batch_size, on_bad_image=on_bad_image)
     devices = devices_for(batch_size)
     params = devices.replicate(params)
     generator = np.random.default_rng(seed)

@@ -70,7 +70,7 @@ def _channels_first(images: Tensor) -> Tensor:
 
 
 def _our_pixels(_: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    return {"images": jax.vmap(lambda image: normalise(image, config.normalisation))(x["images"])}
+    return {"images": jax.vmap(lambda image: normalise(image, config.preprocessing))(x["images"])}
 
 
 def _their_pixels(model: TorchCrisalad, x: Inputs, _: ModelConfig) -> dict[str, Tensor]:

@@ -45,12 +45,13 @@ from timing import PAUSE, Timed, measured, ratio, times
 import jax  # isort: skip
 import torch  # isort: skip
 
+from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.experiments import synthetic
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN, LOCAL_NOISE, LOCAL_WINDOW
+from crisalad_jax.nn.pixels import LOCAL_NOISE, LOCAL_WINDOW
 from crisalad_jax.retrieval import describe as describing
 from crisalad_jax.retrieval.descriptor_files import write_descriptors
 from crisalad_jax.utils import compiler
@@ -136,7 +137,7 @@ def box_mean(values: np.ndarray) -> np.ndarray:
 
 def normalised(image: np.ndarray, how: str) -> np.ndarray:
     values = image.astype(np.float32) / 255
-    if how == "imagenet":
+    if how == "mean-deviation":
         return (values - MEAN) / DEVIATION
     centred = values - box_mean(values)
     return centred / np.sqrt(box_mean(centred**2) + LOCAL_NOISE**2)
@@ -153,7 +154,7 @@ class Photographs(torch.utils.data.Dataset[torch.Tensor]):
 
     def __getitem__(self, index: int) -> torch.Tensor:
         image = resize_image(read_image(self.paths[index]), self.config.image_size)
-        values = normalised(image, self.config.normalisation)
+        values = normalised(image, self.config.preprocessing.normalisation)
         return torch.from_numpy(values).permute(2, 0, 1).contiguous()
 
 

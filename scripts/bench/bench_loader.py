@@ -38,10 +38,10 @@ from timing import PAUSE, Timed, measured, ratio, times
 # After timing, which says how many devices there are.
 import torch  # isort: skip
 
+from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.loader import ImageBatch, training_batches
 from crisalad_jax.data.places import COLUMNS, Places, epoch_batches, read_places
-from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.utils.host import usable_cores
 from parity.reference.augment import rand_augment
 

@@ -155,7 +155,11 @@ def test_the_reference_carries_its_configuration(tmp_path: pathlib.Path) -> None
     ("layout", "changed", "words"),
     [
         ("dino-salad", {"aggregator.sinkhorn.iterations": 10}, "iterations: found 3, expected 10"),
-        ("dino-salad", {"normalisation": "local-contrast"}, "normalisation: found imagenet"),
+        (
+            "dino-salad",
+            {"preprocessing.normalisation": "local-contrast"},
+            "preprocessing.normalisation: found mean-deviation",
+        ),
         ("dinov2", {"backbone.heads": 2}, "backbone.heads: found 1, expected 2"),
         ("cricavpr", {"backbone.adapter.alpha": 0.5}, "alpha: found 0.2, expected 0.5"),
         ("cricavpr", {"cross_image.heads": 4}, "cross_image.heads: found 16, expected 4"),

@@ -39,6 +39,7 @@ from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.sinkhorn import SinkhornConfig, SinkhornStep
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
@@ -543,6 +544,8 @@ def test_the_hash_changes_with_every_field_that_matters(params, name):
     free = {
         *("image_size", "compute_dtype", "remat", "aggregator.dropout", "cross_image.dropout"),
         *("backbone.position_init", "backbone.layer_scale_init"),
+        *("preprocessing.size_rule", "preprocessing.filter", "preprocessing.antialias"),
+        *("preprocessing.pixels", "preprocessing.round_to_patch"),
     }
     config, field = next((has, field) for each, has, field in fields_of(CONVERGING) if each == name)
     tried = 0
@@ -555,6 +558,20 @@ def test_the_hash_changes_with_every_field_that_matters(params, name):
         same = model_hash(params, other) == model_hash(params, CONVERGING)
         assert same == (name in free), value
     assert tried
+
+
+@pytest.mark.parametrize(
+    ("preset", "digest"),
+    [
+        ("tiny", "caa162529f019607f7e514c4eb10c44d5a321873ea16f99e849d45e67ecf6e1c"),
+        ("s14", "8d32a17170f22ce659a0f1694d7c8f4565df0a38fd04dfb60b15ad475ce7b588"),
+    ],
+)
+def test_digests_are_those_of_the_time_before_preprocessing_had_fields(preset, digest):
+    """Computed then, over zeros; tiny normalises by local contrast, whose field has moved."""
+    shapes = parameter_shapes(PRESETS[preset])
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    assert model_hash(zeros, PRESETS[preset]) == digest
 
 
 @dataclasses.dataclass(frozen=True)

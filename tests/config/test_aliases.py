@@ -15,6 +15,7 @@ import pytest
 from crisalad_jax.config.aliases import is_of_an_earlier_version
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.io import from_plain, read_config, to_plain
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations import Augmentation, NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
@@ -104,7 +105,7 @@ SALAD = SaladConfig(
 )
 MODEL = ModelConfig(
     image_size=(70, 98),
-    normalisation="local-contrast",
+    preprocessing=PreprocessingConfig(normalisation="local-contrast"),
     backbone=ViTConfig(
         dim=64,
         depth=4,

@@ -10,6 +10,7 @@ from crisalad_jax.checkpoints.export import ExportConfig
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.io import from_plain
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
@@ -310,7 +311,19 @@ def test_one_patch_more_than_clusters_is_enough():
         (CrossImageConfig, {"layers": -1}, "CrossImageConfig.layers: found -1"),
         (CrossImageConfig, {"dropout": float("nan")}, "CrossImageConfig.dropout: found nan"),
         (ModelConfig, {"compute_dtype": "float16"}, "ModelConfig.compute_dtype: found 'float16'"),
-        (ModelConfig, {"normalisation": "none"}, "ModelConfig.normalisation: found 'none'"),
+        (PreprocessingConfig, {"filter": "box"}, "PreprocessingConfig.filter: found 'box', expec"),
+        (PreprocessingConfig, {"deviation": (1.0, 0.0, 1.0)}, "deviation: found .* numbers above"),
+        (PreprocessingConfig, {"mean": (0.0, 0.0, float("nan"))}, "mean: found .* finite numbers"),
+        (
+            PreprocessingConfig,
+            {"mean": (0.5, 0.5)},
+            "Config.mean: found .* tuple of 3",
+        ),
+        (
+            PreprocessingConfig,
+            {"normalisation": "local-contrast", "pixels": "floats"},
+            "PreprocessingConfig.pixels: found floats with normalisation local-contrast",
+        ),
         (ModelConfig, {"image_size": (224, 225)}, "image size: found 224 x 225"),
         (ModelConfig, {"image_size": (112, 112)}, "64 patches for 64 clusters"),
         (

@@ -21,6 +21,7 @@ from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig, rand
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageBatch, ImageCache, image_batches, training_batches
 from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.errors import InputError
 
@@ -206,9 +207,9 @@ from crisalad_jax.data import loader
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.places import read_places
 
-def read(path, image_size, *, quickly):
+def read(path, how, *, quickly):
     time.sleep(1)
-    return np.zeros((*image_size, 3), np.uint8)
+    return np.zeros((*how.image_size, 3), np.uint8)
 
 if __name__ == "__main__":
     loader._read = read
@@ -354,14 +355,14 @@ def test_cache_decodes_once_within_its_budget(places):
     paths = [places.path(i) for i in range(4)]
     height, width = SIZE
     cache = ImageCache(budget_bytes=3 * height * width * 2)  # room for two images
-    first = [cache.read(path, SIZE) for path in paths]
+    first = [cache.read(path, Preparation(SIZE)) for path in paths]
     for path in paths[:2]:
         path.unlink()
     for path, image in zip(paths[:2], first, strict=False):
-        np.testing.assert_array_equal(cache.read(path, SIZE), image)
+        np.testing.assert_array_equal(cache.read(path, Preparation(SIZE)), image)
     paths[2].unlink()
     with pytest.raises(InputError):
-        cache.read(paths[2], SIZE)
+        cache.read(paths[2], Preparation(SIZE))
     with pytest.raises(InputError):
         cache.read(paths[0], (14, 14))  # another size is another image
     with pytest.raises(ValueError, match="read-only"):

@@ -1,12 +1,15 @@
-"""The resize, against Pillow's."""
+"""The resize, against Pillow's, torch's and OpenCV's, and what public chains made of one image."""
 
+import pathlib
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numba
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from crisalad_jax.data import resize
@@ -32,6 +35,100 @@ def test_resize_is_pillows(shape, image_size):
     difference = np.abs(resized.astype(int) - expected)
     assert difference.max() <= 1
     assert difference.mean() < 0.25
+
+
+GOLDENS = np.load(pathlib.Path(__file__).parent / "goldens" / "resize_chains.npz")
+"""One image as torchvision resizes it on Pillow's images and on tensors, every 4th (tensors: every
+8th) row and column."""
+
+
+@pytest.fixture(params=["numba", "numpy"])
+def both(request, monkeypatch):
+    """Machine code, and what stands in for it without numba."""
+    if request.param == "numpy":
+        monkeypatch.setattr(resize, "_machine_code", lambda *_: None)
+
+
+@pytest.mark.usefixtures("both")
+@pytest.mark.parametrize("image_size", [(84, 98), (154, 126)])
+@pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
+def test_public_chains(filter, image_size):
+    image = GOLDENS["images"][0]
+    name = f"{filter}_{image_size[0]}x{image_size[1]}"
+    bytes_ = resize_image(image, image_size, filter=filter)
+    assert bytes_.dtype == np.uint8
+    assert np.abs(bytes_[::4, ::4].astype(int) - GOLDENS[f"pil_{name}"][0]).max() <= 1
+    for antialias, chain in ((True, "tensor"), (False, "tensor_noaa")):
+        floats = resize_image(
+            image, image_size, filter=filter, antialias=antialias, pixels="floats"
+        )
+        assert floats.dtype == np.float32
+        expected = GOLDENS[f"{chain}_{name}"][0].transpose(1, 2, 0)
+        # Float32 of up to 1 has steps of 6e-8, and torch computes positions in it too.
+        np.testing.assert_allclose(floats[::8, ::8] / 255, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (61, 40), (1, 1), (3, 90)])
+@pytest.mark.parametrize("antialias", [True, False])
+@pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
+def test_floats_are_torchs(filter, antialias, shape):
+    """Neither rounded nor clamped: a bicubic filter overshoots on noise."""
+    image = picture(*shape)
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float()
+    for image_size in ((28, 42), (70, 56)):
+        expected = torch.nn.functional.interpolate(
+            tensor, image_size, mode=filter, antialias=antialias, align_corners=False
+        )
+        found = resize_image(image, image_size, filter=filter, antialias=antialias, pixels="floats")
+        # torch's positions are float32 of up to 90, with steps of 8e-6, which a slope of 255
+        # grey levels a pixel and filters of several taps enlarge.
+        np.testing.assert_allclose(found, expected[0].permute(1, 2, 0), atol=5e-3)
+
+
+@pytest.mark.usefixtures("both")
+@pytest.mark.parametrize("shape", [(480, 640), (72, 97), (1, 1)])
+def test_bicubic_on_bytes_is_pillows(shape):
+    # Where nothing overshoots 0 or 255, the order of the two directions does not show.
+    image = picture(*shape) // 2 + 64
+    for height, width in ((70, 126), (448, 420)):
+        expected = Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC)
+        found = resize_image(image, (height, width), filter="bicubic")
+        assert np.abs(found.astype(int) - expected).max() <= 1
+
+
+@pytest.mark.usefixtures("both")
+@pytest.mark.parametrize("image_size", [(90, 60), (30, 60), (40, 100), (40, 21)])
+def test_bicubic_on_bytes_is_clamped_as_pillows(image_size):
+    image = picture(40, 60) // 128 * 255
+    expected = Image.fromarray(image).resize(image_size[::-1], Image.Resampling.BICUBIC)
+    found = resize_image(image, image_size, filter="bicubic")
+    assert np.abs(found.astype(int) - expected).max() <= 1
+
+
+def test_area_is_opencvs_and_grows_by_lines():
+    image = picture(40, 60)
+    for pixels, given in (("bytes", image), ("floats", image.astype(np.float32))):
+        smaller = cv2.resize(given, (45, 30), interpolation=cv2.INTER_AREA)
+        np.testing.assert_array_equal(
+            resize_image(image, (30, 45), filter="area", pixels=pixels), smaller
+        )
+        larger = cv2.resize(given, (70, 50), interpolation=cv2.INTER_LINEAR)
+        np.testing.assert_array_equal(
+            resize_image(image, (50, 70), filter="area", pixels=pixels), larger
+        )
+
+
+def test_floats_are_resized_again():
+    """As MegaLoc resizes what a wrapper has resized."""
+    image = picture(48, 64)
+    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float()
+    for size in ((40, 50), (42, 56)):
+        tensor = torch.nn.functional.interpolate(
+            tensor, size, mode="bilinear", antialias=True, align_corners=False
+        )
+    once = resize_image(image, (40, 50), pixels="floats")
+    twice = resize_image(once, (42, 56), pixels="floats")
+    np.testing.assert_allclose(twice, tensor[0].permute(1, 2, 0), atol=2e-3)  # as above
 
 
 def test_resize_to_the_same_size_changes_nothing():
@@ -105,7 +202,7 @@ def test_where_nothing_can_be_kept_it_compiles_all_the_same(monkeypatch, error):
 
     expected = resize_image(picture(60, 80), (28, 42))
     monkeypatch.setattr(numba, "njit", keeps_nothing)
-    monkeypatch.setattr(resize, "_compiled", resize._compiled.__wrapped__)
+    monkeypatch.setattr(resize, "_machine_code", resize._machine_code.__wrapped__)
     np.testing.assert_array_equal(resize_image(picture(60, 80), (28, 42)), expected)
 
 

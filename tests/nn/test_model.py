@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import vit
 from crisalad_jax.nn.config import PRESETS
@@ -195,7 +196,7 @@ def test_describe_is_attention_across_images_after_their_tokens(params) -> None:
 
 def test_bytes_are_normalised_and_floats_are_taken_as_they_are(params) -> None:
     images = jnp.asarray(pictures(2))
-    floats = jax.vmap(lambda image: normalise(image, "imagenet"))(images)
+    floats = jax.vmap(lambda image: normalise(image, PreprocessingConfig()))(images)
     np.testing.assert_allclose(
         describe(params, floats, CONFIG), describe(params, images, CONFIG), atol=TOLERANCE
     )
@@ -264,7 +265,7 @@ def test_images_that_do_not_fit_raise_while_tracing(params, shape, message: str)
 def test_transport_masses_by_scaling_a_matrix_in_float64(params):
     """Sinkhorn's algorithm as it is usually written: columns, then rows, three times."""
     images = pictures(2)
-    pixels = jax.vmap(lambda image: normalise(image, "imagenet"))(images)
+    pixels = jax.vmap(lambda image: normalise(image, PreprocessingConfig()))(images)
     patches = np.asarray(vit(params.backbone, pixels, CONFIG.backbone).patches, np.float64)
     network = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params.aggregator.score)
     hidden = np.maximum(patches @ network.fc1.weight + network.fc1.bias, 0)

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 
+from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.costs import part_costs
-from crisalad_jax.nn.pixels import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.training.recipes import recipe
 

@@ -60,6 +60,8 @@ class ComparisonConfig:
     epochs: int | None = None
     """Number of epochs; None is the recipe's, or `EPOCHS` from nothing."""
     image_size: tuple[int, int] | None = None
+    resize: tuple[str, ...] = ()
+    """Words that change how images are resized, as `ModelConfig.resized` takes them."""
     batch_size: int = 16
     """Number of images described together."""
     grouping: str = "single"
@@ -218,8 +220,10 @@ def _drafts(config: ComparisonConfig) -> Iterator[Variant]:
         else:
             training = row_training(name, config.preset, from_nothing=from_nothing)
             labels, run = (name, *row_labels(training)), name
-        if config.image_size is not None:
-            model = dataclasses.replace(training.model, image_size=config.image_size)
+        if config.image_size is not None or config.resize:
+            way = training.model.preprocessing.changed_by(config.resize)
+            size = config.image_size or training.model.image_size
+            model = dataclasses.replace(training.model, image_size=size, preprocessing=way)
             training = dataclasses.replace(training, model=model)
         learns = training.model.aggregator.learns
         yield Variant(name, labels, run, training, learns, rerank, None, training.model)
@@ -262,7 +266,7 @@ def _checked(draft: Variant, path: pathlib.Path, config: ComparisonConfig) -> Mo
         raise InputError(
             f"{path}: weights of another method than {draft.name}: found {'; '.join(wrong)}"
         )
-    return model.resized(config.image_size)
+    return model.resized(config.image_size, config.resize)
 
 
 def _places(config: ComparisonConfig) -> tuple[Places, int]:

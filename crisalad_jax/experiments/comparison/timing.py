@@ -58,7 +58,7 @@ def describing(params: Crisalad, config: ModelConfig, batch_size: int) -> Callab
     """Make a call that describes a batch, each image alone, with the programs of `evaluate`."""
     devices = devices_for(batch_size)
     shared = devices.replicate(params)
-    pixels = np.random.default_rng(0).integers(0, 256, (batch_size, *config.image_size, 3))
+    pixels = np.random.default_rng(0).integers(0, 256, (batch_size, *config.input_size, 3))
     images = devices.shard_batch(pixels.astype(np.uint8))
     mask = self_mask(batch_size)
 

@@ -179,13 +179,12 @@ def _recall(grouping: GroupingResult, k: int) -> _Cell:
 
 
 def _facts(benchmark: Benchmark, config: ModelConfig, verdicts: Verdicts) -> list[tuple[str, str]]:
-    height, width = config.image_size
     unmatched = int((~verdicts.matched).sum())
     note = f", {unmatched} of them without a positive" if unmatched else ""
     return [
         ("Queries", f"{len(benchmark.queries):,}{note}"),
         ("Database", f"{len(benchmark.database):,} images"),
         ("Positive", benchmark.rule),
-        ("Images", f"resized to {height} x {width} pixels"),
+        ("Images", config.images_in_words),
         ("Descriptor", f"{config.descriptor_dim:,} numbers"),
     ]

@@ -8,7 +8,6 @@ import matplotlib.colors
 import numpy as np
 
 from crisalad_jax.data.images import read_image
-from crisalad_jax.data.resize import resize_image
 from crisalad_jax.experiments.report.embedding import Drawing, drawing
 from crisalad_jax.experiments.report.query_selection import Shown
 from crisalad_jax.experiments.report.sections import Subject
@@ -24,6 +23,7 @@ from crisalad_jax.experiments.report.transport import (
 )
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, transport_masses
+from crisalad_jax.retrieval.photographs import prepare_image
 
 
 class Kept(NamedTuple):
@@ -98,14 +98,15 @@ def transport_section(
 def transport_of(
     paths: list[pathlib.Path], params: Crisalad, config: ModelConfig
 ) -> list[Transported]:
-    """Read photographs and compute their transport at the model's image size."""
-    images = [read_image(path) for path in paths]
-    batch = np.stack([resize_image(image, config.image_size) for image in images])
-    masses = np.asarray(transport_masses(params, batch, config), np.float32)
-    return [
-        Transported(image, mass.reshape(*config.grid, -1), config.token_shape.tokens)
-        for image, mass in zip(images, masses, strict=True)
-    ]
+    """Read photographs and compute their transport, one by one: their sizes may differ."""
+    transported = []
+    for path in paths:
+        image = read_image(path)
+        prepared = prepare_image(image, config)
+        grid = config.backbone.grid((prepared.shape[0], prepared.shape[1]))
+        (mass,) = np.asarray(transport_masses(params, prepared[None], config), np.float32)
+        transported.append(Transported(image, mass.reshape(*grid, -1), config.token_shape.tokens))
+    return transported
 
 
 def _gradient() -> str:

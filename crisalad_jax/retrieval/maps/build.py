@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.images import list_images, names_in
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions, read_positions, utm_positions
@@ -185,6 +186,7 @@ def index(
     *,
     weights: str | os.PathLike[str],
     image_size: tuple[int, int] | None = None,
+    resize: Sequence[str] = (),
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
     positions: Positions | str | os.PathLike[str] | None = None,
     store: str | None = None,
@@ -204,6 +206,8 @@ def index(
         out: the map's folder.
         weights: the file that the parameters are from, which queries load by default.
         image_size: height and width in pixels. None is the map's, and of a new map the model's.
+        resize: words that change how images are resized; see `ModelConfig.resized`. None are the
+            map's way, and of a new map the model's.
         compute_dtype: type of the matrix products. None is the map's, and of a new map the model's.
         positions: where images were taken, or a table of it; None is what @UTM names say.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
@@ -239,7 +243,7 @@ def index(
     paths = list_images(images)
     known = _positions(positions, images, names_in(images, paths))
     if description is None:
-        config = config.resized(image_size)
+        config = config.resized(image_size, resize)
         if compute_dtype is not None:
             config = dataclasses.replace(config, compute_dtype=compute_dtype)
         description = describe_map(
@@ -252,7 +256,8 @@ def index(
         )
     else:
         check_model(description, out, model_hash(params, config), weights)
-        _check_settings(description, out, image_size, compute_dtype, dtype, store)
+        way = config.preprocessing.changed_by(resize) if resize else None
+        _check_settings(description, out, image_size, way, compute_dtype, dtype, store)
     with open_for_appending(out, description) as target:
         result = index_images(
             target,
@@ -289,12 +294,19 @@ def _check_settings(
     description: MapDescription,
     folder: pathlib.Path,
     image_size: tuple[int, int] | None,
+    way: PreprocessingConfig | None,
     compute_dtype: str | None,
     dtype: str | None,
     store: str | None,
 ) -> None:
     """Check that the given settings agree with those of an existing map."""
     store = store and store_name(store, folder, description.dtype)
+    there = description.config
+    if way is not None and way != there.preprocessing:
+        raise InputError(
+            f"{folder}: found images at {way.in_words(image_size or there.image_size)}, expected "
+            f"{there.images_in_words} as in the map"
+        )
     for name, given, there in (
         ("image size", image_size, description.config.image_size),
         ("compute dtype", compute_dtype, description.config.compute_dtype),

@@ -341,6 +341,7 @@ class Map:
             "axes": self.axes,
             "descriptor": f"{description.descriptor_length} numbers, {description.dtype}",
             "image_size": list(description.config.image_size),
+            "resize": description.config.images_in_words,
             "grouping": description.grouping,
             "store": description.store,
             "model": description.model,

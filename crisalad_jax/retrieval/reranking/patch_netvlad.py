@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from crisalad_jax.nn.aggregators.netvlad import NetVlad, shares
-from crisalad_jax.nn.backbones.vit import PATCH_SIZE
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import at_least_float32, l2_normalise
 from crisalad_jax.nn.model import Crisalad, Images, unit_features
@@ -37,8 +36,8 @@ def windows_of(config: ModelConfig) -> list[tuple[int, float, Grid]]:
         if min(rows, columns) > side
     ]
     if not fitting:
-        smallest = PATCH_SIZE * (WINDOWS[0][0] + 1)
-        height, width = config.image_size
+        smallest = config.backbone.patch_size * (WINDOWS[0][0] + 1)
+        height, width = config.input_size
         raise InputError(
             f"patch-netvlad: found images of {height} x {width}, expected at least {smallest} x "
             f"{smallest}, of which 2 x 2 of the smallest windows fit"

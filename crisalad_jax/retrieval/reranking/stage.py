@@ -5,7 +5,7 @@ import math
 import pathlib
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any, Self
 
@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.data.loader import ImageCache, image_batches
+from crisalad_jax.data.loader import ImageBatch, ImageCache
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.retrieval.reranking import patch_netvlad, transvpr
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.devices import devices_for
@@ -81,6 +82,12 @@ class Reranking:
                 f"rerank: found a model with aggregator {own.aggregator.part_name}, expected "
                 f"{aggregator}, whose local features {self.name} compares (--rerank-weights takes "
                 "another model than the first stage's)"
+            )
+        rule = own.preprocessing.size_rule
+        if rule != "fixed":
+            raise InputError(
+                f"rerank: found a model with size rule {rule}, expected fixed: {self.name} "
+                "compares equally many local features of each image"
             )
         method.shape(own)
         if database is not None and self.top > database:
@@ -162,16 +169,12 @@ class Reranker:
         def describe(images: Any) -> Any:
             return self._method.describe(shared, devices.shard_batch(images), self._config)
 
+        def read(paths: Sequence[pathlib.Path]) -> Iterator[ImageBatch]:
+            return photograph_batches(self._config, paths, batch_size=batch_size, cache=cache)
+
         def side(name: str, paths: Sequence[pathlib.Path]) -> _Features:
-            return _Features(
-                paths,
-                describe,
-                self._method.shape(self._config),
-                pathlib.Path(self._folder.name) / name,
-                self._config.image_size,
-                batch_size,
-                cache,
-            )
+            file = pathlib.Path(self._folder.name) / name
+            return _Features(paths, read, describe, self._method.shape(self._config), file)
 
         devices = devices_for(batch_size)
         shared = devices.replicate(reranking.params)
@@ -246,15 +249,12 @@ class _Features:
     def __init__(
         self,
         paths: Sequence[pathlib.Path],
+        read: Callable[[Sequence[pathlib.Path]], Iterator[ImageBatch]],
         describe: Callable[[Any], Any],
         shape: tuple[int, int],
         file: pathlib.Path,
-        image_size: tuple[int, int],
-        batch_size: int,
-        cache: ImageCache | None,
     ) -> None:
-        self.paths, self._describe, self._file = paths, describe, file
-        self._image_size, self._batch_size, self._cache = image_size, batch_size, cache
+        self.paths, self._read, self._describe, self._file = paths, read, describe, file
         self.features = np.memmap(file, np.float16, "w+", shape=(len(paths), *shape))
         self._known: Bool[np.ndarray, " image"] = np.zeros(len(paths), bool)
 
@@ -274,12 +274,7 @@ class _Features:
                 f"{self._file.parent}: found {free / 2**30:.1f} GiB free, expected "
                 f"{needed / 2**30:.1f} GiB for the local features of {len(missing)} images"
             )
-        batches = image_batches(
-            [self.paths[i] for i in missing],
-            image_size=self._image_size,
-            batch_size=self._batch_size,
-            cache=self._cache,
-        )
+        batches = self._read([self.paths[i] for i in missing])
         with progress_bar(label, len(missing), "images", quiet=quiet) as bar:
             for batch in batches:
                 rows = missing[batch.indices[batch.valid]]

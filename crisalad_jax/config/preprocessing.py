@@ -1,0 +1,180 @@
+"""How a photograph becomes a network's input: its size, the filter, and what pixels are less."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from crisalad_jax.config.checks import check_types, require
+from crisalad_jax.config.fields import free_field
+
+Size = tuple[int, int]
+"""Height and width in pixels."""
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+
+WORDS: Mapping[str, Mapping[str, Any]] = {
+    **{name: {"size_rule": name} for name in ("fixed", "shorter-side", "longer-side", "native")},
+    **{name: {"filter": name} for name in ("bilinear", "bicubic", "area")},
+    "antialias": {"antialias": True},
+    "no-antialias": {"antialias": False},
+    **{name: {"pixels": name} for name in ("bytes", "floats")},
+    "round": {"round_to_patch": True},
+}
+"""Words of the flag --resize, and the fields that they set."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PreprocessingConfig:
+    """How a photograph becomes a network's input.
+
+    Published models differ in it, and a descriptor moves by 1e-3 to 6e-2 with another filter. The
+    defaults are the chain of torchvision on Pillow's images: `Resize`, `ToTensor`, `Normalize`.
+
+    A tensor is resized before it is normalised by some authors, and after it by others. Both give
+    the same numbers, because resizing is linear and its weights sum to 1: there is no field for it.
+
+    Example:
+        >>> chain = PreprocessingConfig(filter="bicubic", pixels="floats")
+        >>> chain.target_size((480, 640), (322, 322))
+        (322, 322)
+    """
+
+    size_rule: Literal["fixed", "shorter-side", "longer-side", "native"] = free_field("fixed")
+    """What size an image gets. "fixed" is `ModelConfig.image_size`, whatever the aspect ratio. The
+    others keep the aspect ratio: "shorter-side" gives the shorter side the length of that of
+    `image_size`, "longer-side" shrinks images until the longer side is at most that of
+    `image_size` and never enlarges, and "native" leaves images as they are. Their sides are then
+    rounded to the nearest multiples of the patch size, where the backbone takes no others."""
+    filter: Literal["bilinear", "bicubic", "area"] = free_field("bilinear")
+    """Filter of the resize; "area" is OpenCV's INTER_AREA, which hloc takes."""
+    antialias: bool = free_field(True)
+    """Whether the filter widens where an image shrinks, as Pillow's always does."""
+    pixels: Literal["bytes", "floats"] = free_field("bytes")
+    """What is resized: "bytes" are rounded after each pass, as Pillow does; "floats" are neither
+    rounded nor clamped, as torch does."""
+    round_to_patch: bool = free_field(False)
+    """Whether images of a fixed size that is no multiple of the patch size are resized once more,
+    to the nearest one (halves to the even number), bilinear and antialiased. MegaLoc does so."""
+    normalisation: Literal["mean-deviation", "local-contrast"] = "mean-deviation"
+    """How pixels are normalised: by `mean` and `deviation`, or by those of each neighbourhood."""
+    mean: tuple[float, float, float] = IMAGENET_MEAN
+    """Mean of red, green and blue, of pixels from 0 to 1; by default ImageNet's."""
+    deviation: tuple[float, float, float] = IMAGENET_DEVIATION
+    """What pixels from 0 to 1, less the mean, are divided by; by default ImageNet's. A network
+    that takes pixels from 0 to 255 less a mean, as hloc's NetVLAD, has a deviation of 1/255."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_types(self)
+        require(
+            all(0 < value < math.inf for value in self.deviation),
+            f"PreprocessingConfig.deviation: found {self.deviation}, expected numbers above 0",
+        )
+        require(
+            all(map(math.isfinite, self.mean)),
+            f"PreprocessingConfig.mean: found {self.mean}, expected finite numbers",
+        )
+        require(
+            self.normalisation == "mean-deviation" or self.pixels == "bytes",
+            f"PreprocessingConfig.pixels: found {self.pixels} with normalisation "
+            f"{self.normalisation}, which is of bytes alone, expected bytes",
+        )
+
+    @property
+    def rounds(self) -> bool:
+        """Whether sides are rounded to multiples of the patch size."""
+        return self.round_to_patch or self.size_rule != "fixed"
+
+    def target_size(self, size: Size, image_size: Size) -> Size:
+        """Return the size that an image gets by `size_rule`, before sides are rounded.
+
+        Args:
+            size: height and width of the image.
+            image_size: height and width of the model, `ModelConfig.image_size`.
+
+        Returns:
+            Height and width in pixels. torchvision cuts the fraction off the other side, and hloc
+            rounds it; so do the rules that are theirs.
+
+        Example:
+            >>> rule = PreprocessingConfig(size_rule="shorter-side")
+            >>> rule.target_size((480, 640), (512, 512))
+            (512, 682)
+        """
+        if self.size_rule == "fixed":
+            return image_size
+        height, width = size
+        shorter, longer = min(size), max(size)
+        if self.size_rule == "shorter-side":
+            short = min(image_size)
+            long = int(short * longer / shorter)
+            return (short, long) if height <= width else (long, short)
+        most = max(image_size)
+        if self.size_rule == "longer-side" and longer > most:
+            scale = most / longer
+            return max(1, round(height * scale)), max(1, round(width * scale))
+        return height, width
+
+    def rounded_size(self, size: Size, side_multiple: int) -> Size:
+        """Round sides to the nearest multiples, where they are to be rounded.
+
+        Args:
+            size: height and width of `target_size`.
+            side_multiple: number of pixels that sides have to be multiples of.
+
+        Returns:
+            Height and width of the network's input.
+
+        Example:
+            >>> PreprocessingConfig(size_rule="native").rounded_size((240, 320), 14)
+            (238, 322)
+        """
+        if not self.rounds:
+            return size
+        height, width = (max(1, round(side / side_multiple)) * side_multiple for side in size)
+        return height, width
+
+    def for_training(self) -> "PreprocessingConfig":
+        """Return the chain of training: the same filter on bytes, at a fixed size."""
+        return dataclasses.replace(self, size_rule="fixed", pixels="bytes")
+
+    def changed_by(self, words: Sequence[str]) -> "PreprocessingConfig":
+        """Return this chain with the fields that some of `WORDS` set.
+
+        Raises:
+            InputError: an unknown word, or two for one field.
+
+        Example:
+            >>> PreprocessingConfig().changed_by(["native", "bicubic"]).filter
+            'bicubic'
+        """
+        changes: dict[str, Any] = {}
+        for word in words:
+            require(word in WORDS, f"--resize: found {word!r}, expected some of {', '.join(WORDS)}")
+            for field, value in WORDS[word].items():
+                require(
+                    changes.setdefault(field, value) == value,
+                    f"--resize: found {' '.join(words)}, expected one of "
+                    f"{', '.join(each for each, sets in WORDS.items() if field in sets)}",
+                )
+        return dataclasses.replace(self, **changes)
+
+    def in_words(self, image_size: Size) -> str:
+        """Describe the resize of a model of this image size in a few words.
+
+        Example:
+            >>> PreprocessingConfig().in_words((224, 224))
+            '224 x 224, bilinear, antialiased, on bytes'
+        """
+        size = {
+            "fixed": " x ".join(map(str, image_size)),
+            "shorter-side": f"shorter side {min(image_size)}",
+            "longer-side": f"longer side at most {max(image_size)}",
+            "native": "native size",
+        }[self.size_rule]
+        if self.filter == "area":
+            how = "area"
+        else:
+            how = f"{self.filter}, {'' if self.antialias else 'not '}antialiased"
+        return f"{size}, {how}, on {self.pixels}"

@@ -1,0 +1,64 @@
+"""Prepare a decoded photograph for a network: resize it, and normalise what is no bytes."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
+from crisalad_jax.data.resize import Pixels, resize_image
+from crisalad_jax.utils.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Preparation:
+    """All that decides how photographs are prepared; caches keep images by it."""
+
+    image_size: Size
+    preprocessing: PreprocessingConfig = PreprocessingConfig()
+    side_multiple: int = 1
+    """Number of pixels that sides are rounded to multiples of; see `ModelConfig.side_multiple`."""
+
+    def __post_init__(self) -> None:
+        """Check the size."""
+        if min(self.image_size) < 1:
+            raise InputError(
+                f"image_size: found {self.image_size}, expected a height and width of at least 1"
+            )
+
+    @property
+    def dtype(self) -> type[np.generic]:
+        """Type of what is prepared: uint8 pixels, or float32 that are normalised."""
+        return np.uint8 if self.preprocessing.pixels == "bytes" else np.float32
+
+    def size_of(self, size: Size) -> Size:
+        """Return the height and width that an image of `size` gets."""
+        first = self.preprocessing.target_size(size, self.image_size)
+        return self.preprocessing.rounded_size(first, self.side_multiple)
+
+    def prepare(self, image: Pixels, check: Callable[[Size], None] | None = None) -> Pixels:
+        """Resize an image, and normalise floats.
+
+        Args:
+            image: 8-bit RGB.
+            check: raises InputError for a size that the model cannot describe, before any work.
+
+        Returns:
+            8-bit pixels, or normalised float32.
+        """
+        how = self.preprocessing
+        height, width = image.shape[:2]
+        first = how.target_size((height, width), self.image_size)
+        last = how.rounded_size(first, self.side_multiple)
+        if check is not None:
+            check(last)
+        if how.size_rule == "fixed" or first != (height, width):
+            image = resize_image(
+                image, first, filter=how.filter, antialias=how.antialias, pixels=how.pixels
+            )
+        if last != first:
+            image = resize_image(image, last, pixels=how.pixels)
+        if how.pixels == "bytes":
+            return image
+        mean, deviation = (np.array(each, np.float32) for each in (how.mean, how.deviation))
+        return (image / np.float32(255) - mean) / deviation
