@@ -2,15 +2,7 @@
 
 from collections.abc import Iterator
 
-from crisalad_jax.checkpoints.layouts.base import (
-    Layout,
-    Lines,
-    Reader,
-    State,
-    register_head,
-    register_layout,
-)
-from crisalad_jax.checkpoints.layouts.dinov2 import accepts_parts, vit_config, vit_lines, vit_of
+from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import (
     CONV,
     FIRST,
@@ -21,11 +13,8 @@ from crisalad_jax.checkpoints.layouts.forms import (
     torch_attention,
     transformer_layer,
 )
+from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.nn.aggregators.boq import BoqConfig
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
-
-_BACKBONE = "backbone.dino."
 
 
 @register_head("boq")
@@ -54,28 +43,11 @@ def infer_boq(state: State) -> BoqConfig:
     )
 
 
-def _infer(state: State) -> ModelConfig:
-    return ModelConfig(
-        image_size=(322, 322),
-        backbone=vit_config(Reader(state, _BACKBONE)),
-        aggregator=infer_boq(state),
-        cross_image=CrossImageConfig(layers=0),
-    )
-
-
-def _lines(config: ModelConfig) -> Lines:
-    assert isinstance(config.aggregator, BoqConfig)
-    yield from vit_lines(vit_of(config), _BACKBONE)
-    yield from boq_lines(config.aggregator)
-
-
-register_layout(
-    Layout(
-        "boq-dinov2",
-        "BoQ-DINOv2 .pth",
-        lambda config: accepts_parts(config, "boq", "none", cross_image=False),
-        _lines,
-        lambda state: f"{_BACKBONE}cls_token" in state or f"{_BACKBONE}pos_embed" in state,
-        _infer,
-    )
+register_over_dinov2(
+    "boq-dinov2",
+    "BoQ-DINOv2 .pth",
+    "boq",
+    infer_boq,
+    prefix="backbone.dino.",
+    image_size=(322, 322),
 )

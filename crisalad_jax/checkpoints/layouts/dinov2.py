@@ -64,6 +64,11 @@ def parts_in_words(config: ModelConfig) -> str:
     return f"{words}, backbone {backbone.part_name}, {encoder} encoder{projection}"
 
 
+def has_vit(state: State, prefix: str) -> bool:
+    """Return whether there is a vision transformer under a prefix."""
+    return f"{prefix}cls_token" in state or f"{prefix}pos_embed" in state
+
+
 def vit_of(config: ModelConfig) -> ViTConfig:
     """Return the backbone of a model that `accepts_parts` accepted."""
     assert isinstance(config.backbone, ViTConfig)
@@ -209,7 +214,7 @@ register_layout(
         "DINOv2 .pth",
         accepts_bare_backbone,
         lambda config: vit_lines(vit_of(config), ""),
-        lambda state: "cls_token" in state or "pos_embed" in state,
+        lambda state: has_vit(state, ""),
         _infer,
     )
 )

@@ -8,9 +8,14 @@ from crisalad_jax.checkpoints.layouts.base import (
     head_lines,
     register_layout,
 )
-from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines, infer_encoder
 from crisalad_jax.checkpoints.layouts.dino_salad import infer_salad
-from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words, vit_config, vit_lines
+from crisalad_jax.checkpoints.layouts.dinov2 import (
+    has_vit,
+    parts_in_words,
+    vit_config,
+    vit_lines,
+)
+from crisalad_jax.checkpoints.layouts.encoder import encoder_lines, infer_encoder
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, affine
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -50,7 +55,7 @@ register_layout(
         "our torch reference",
         _accepts,
         _lines,
-        lambda state: f"{_BACKBONE}cls_token" in state or f"{_BACKBONE}pos_embed" in state,
+        lambda state: has_vit(state, _BACKBONE),
         _infer,
         under="state_dict",
     )
