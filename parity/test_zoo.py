@@ -4,6 +4,9 @@ The bound on descriptors, 2e-5 of their norm, is forty times what float32 makes 
 filter, axis or norm shows at 1e-3 and more.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,12 +14,16 @@ import pytest
 
 from crisalad_jax import describe
 from crisalad_jax.checkpoints.layouts import infer, to_params, to_state
+from crisalad_jax.nn.aggregators.edtformer import decode
+from crisalad_jax.nn.backbones import Features
+from crisalad_jax.nn.model import Crisalad, extract_features
 from parity import zoo
 
 BOUND = 2e-5
 LAYOUTS = {
     "boq_dinov2_12288": "boq-dinov2",
     "dinomix_vitb14": "dino-mix",
+    "edtformer": "edtformer",
     "megaloc": "megaloc",
     "salad_cm": "dino-salad",
     "supervlad": "supervlad",
@@ -56,6 +63,32 @@ def test_descriptors_are_the_public_codes(name: str) -> None:
     expected = golden["descriptor"]
     # Another image's descriptor is far: the bound tells images apart.
     assert np.linalg.norm(expected - expected[::-1]) > 1e-2
+
+
+def edtformer(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Array]:
+    tokens = jnp.concatenate([features.class_token[:, None], features.patches], axis=1)
+    answers = decode(params.aggregator, features, config.aggregator.heads)
+    return {"features": tokens[..., ::8], "decoded": answers[..., ::8]}
+
+
+STEPS: dict[str, Callable[[Crisalad, Features, Any], dict[str, jax.Array]]] = {
+    "edtformer": edtformer,
+}
+"""Functions from a backbone's features to what the golden files have on the way."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STEPS)
+def test_steps_are_the_public_codes(name: str) -> None:
+    state, golden = zoo.random_state(name), zoo.golden(name)
+    layout, config = infer(state, source=name)
+    params, _ = to_params(state, config, layout, source=name)
+    params = jax.tree.map(jnp.asarray, params)
+    features = extract_features(params, golden["images"], config)
+    found = STEPS[name](params, features, config)
+    assert found.keys() == golden.keys() - {"images", "descriptor"}
+    for key, array in found.items():
+        compare(array, golden[key])
 
 
 @pytest.mark.slow

@@ -35,6 +35,7 @@ def register_over_dinov2(
     prefix: str,
     mark: str | None = None,
     head: Callable[[Any], Lines] | None = None,
+    first: int = 0,
     image_size: tuple[int, int] = (224, 224),
     adapter: str = "none",
     encoder: bool | None = False,
@@ -55,6 +56,7 @@ def register_over_dinov2(
         prefix: their names of the backbone begin with it.
         mark: a name that tells the family from others of the same prefix.
         head: yields the aggregator's table; by default the registered one.
+        first: number of that table's lines that are before the backbone's.
         image_size: height and width in pixels that the family's models are evaluated at.
         adapter: kind of the adapters.
         encoder: whether there is a cross-image encoder; None where the file tells.
@@ -72,8 +74,10 @@ def register_over_dinov2(
         return accepts_parts(config, aggregator, adapter, cross_image=across, projection=projects)
 
     def lines(config: ModelConfig) -> Lines:
+        of_head = list(head_lines(config) if head is None else head(config.aggregator))
+        yield from of_head[:first]
         yield from vit_lines(vit_of(config), prefix, mask_token=mask_token, norm=norm)
-        yield from head_lines(config) if head is None else head(config.aggregator)
+        yield from of_head[first:]
         yield from encoder_lines(config.cross_image)
         if projection is not None:
             yield from affine("projection", projection, LINEAR)

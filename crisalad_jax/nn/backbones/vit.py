@@ -91,6 +91,10 @@ class ViT:
     norm: LayerNorm
 
 
+Carry = Float[Array, "image token dim"] | tuple[Array, Array]
+"""Tokens that run through the blocks, with those on the path of side adapters if there is one."""
+
+
 @BACKBONES.register("vit")
 @dataclasses.dataclass(frozen=True)
 class ViTConfig(Backbone):
@@ -248,13 +252,19 @@ def vit(
     its parameters once more. Blocks after the last level are not run.
 
     Raises:
-        InputError: while tracing, levels that are not in order or more than there are blocks, or
-            several levels of a facet or without the last block.
+        InputError: while tracing, levels that are not in order or more than there are blocks,
+            several levels of a facet or without the last block, or other tokens than the last
+            block's of a path of adapters beside the blocks.
     """
     levels = (config.depth,) if request.levels is None else request.levels
     require(
         levels[0] > 0 and levels[-1] <= config.depth and list(levels) == sorted(set(levels)),
         f"levels: found {levels}, expected numbers of blocks in order, 1 to {config.depth}",
+    )
+    require(
+        config.adapter.kind != "side" or request.facet != "token" or levels == (config.depth,),
+        f"levels: found {levels} with adapters beside the blocks, expected the last alone, "
+        f"{config.depth}",
     )
     tokens = jax.vmap(lambda image: embed(params, image, config))(images)
     outputs = []
@@ -355,20 +365,38 @@ def run_blocks(
     *,
     remat: str = "dots",
 ) -> Float[Array, "image token dim"]:
-    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`."""
+    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`.
 
-    def body(
-        carry: Float[Array, "image token dim"], layer: Block
-    ) -> tuple[Float[Array, "image token dim"], None]:
-        return block(layer, carry, grid, config), None
+    Side adapters have a path beside the blocks, from which the tokens come. After every block its
+    adapter takes the sum of both paths.
+    """
+    side = config.adapter.kind == "side"
+
+    def body(carry: Carry, layer: Block) -> tuple[Carry, None]:
+        if isinstance(carry, jax.Array):
+            return block(layer, carry, grid, config), None
+        tokens, beside = carry
+        tokens = block(dataclasses.replace(layer, adapter=None), tokens, grid, config)
+        return (tokens, _beside(layer, tokens + beside, grid, config)), None
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=choose("remat", remat, _POLICIES))
     stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
+    carry: Carry = (tokens, tokens) if side else tokens
     with jax.named_scope("blocks"):
         for stack in stacks:
-            tokens, _ = jax.lax.scan(body, tokens, stack)
-    return tokens
+            carry, _ = jax.lax.scan(body, carry, stack)
+    return carry if isinstance(carry, jax.Array) else carry[1]
+
+
+def _beside(
+    layer: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "image token dim"]:
+    """Apply a block's side adapter, with its skip."""
+    assert layer.adapter is not None
+    with jax.named_scope("adapter"):
+        update = config.adapter.alpha * at_least_float32(adapter(layer.adapter, tokens, grid))
+        return (at_least_float32(tokens) + update).astype(tokens.dtype)
 
 
 def block(
