@@ -24,6 +24,7 @@ LAYOUTS = {
     "boq_dinov2_12288": "boq-dinov2",
     "dinomix_vitb14": "dino-mix",
     "edtformer": "edtformer",
+    "image_merged": "image",
     "megaloc": "megaloc",
     "salad_cm": "dino-salad",
     "supervlad": "supervlad",

@@ -56,8 +56,13 @@ class ModelConfig:
         """Check that the parts fit each other."""
         resolve_names(self)
         self.check_image_size(self.image_size)
-        self.aggregator.features(self.backbone.depth)
+        request = self.aggregator.features(self.backbone.depth)
         name = self.aggregator.part_name
+        require(
+            request.insertion is None or self.backbone.inserts,
+            f"backbone: found {self.backbone.part_name} for aggregator {name}, expected one "
+            "through whose blocks tokens can run, such as vit",
+        )
         require(
             self.aggregator.learns or not self.cross_image.layers,
             f"CrossImageConfig.layers: found {self.cross_image.layers} for aggregator {name}, with "

@@ -280,7 +280,7 @@ def test_an_unknown_layout_is_named() -> None:
         table(MODEL, "timm")
     assert set(LAYOUTS) == {
         *("dinov2", "huggingface", "dino-salad", "cricavpr", "boq-dinov2", "megaloc", "megaloc-v1"),
-        *("supervlad", "dino-mix", "edtformer", "reference"),
+        *("supervlad", "dino-mix", "edtformer", "image", "reference"),
     }
 
 

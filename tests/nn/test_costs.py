@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import pytest
 
 from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
@@ -181,6 +182,8 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
         EdtFormerConfig(width=24, heads=2, queries=7, channels=20, rows=3),
         edtformer_by_hand(),
     ),
+    # The blocks do all the work.
+    "aggregation-tokens": (AggregationTokensConfig(tokens=3, insertion=1), 0),
 }
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
+from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
@@ -54,6 +55,7 @@ PARTS: dict[str, Aggregator] = {
     "supervlad": SuperVladConfig(clusters=3),
     "transvpr": TransVprConfig(levels=2, dim=16),
     "edtformer": EdtFormerConfig(width=16, heads=2, queries=3, channels=16, rows=2),
+    "aggregation-tokens": AggregationTokensConfig(tokens=3, insertion=1),
 }
 METHODS = [
     # tests/test_model.py and others have enough of these.

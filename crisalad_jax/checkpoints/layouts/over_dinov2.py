@@ -1,6 +1,8 @@
 """Layouts of models that are a head over DINOv2, told by what they differ in."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from crisalad_jax.checkpoints.layouts.base import (
@@ -38,6 +40,7 @@ def register_over_dinov2(
     first: int = 0,
     image_size: tuple[int, int] = (224, 224),
     adapter: str = "none",
+    backbone: Mapping[str, Any] = MappingProxyType({}),
     encoder: bool | None = False,
     projection: str | None = None,
     mask_token: bool = True,
@@ -59,6 +62,7 @@ def register_over_dinov2(
         first: number of that table's lines that are before the backbone's.
         image_size: height and width in pixels that the family's models are evaluated at.
         adapter: kind of the adapters.
+        backbone: fields of the backbone's configuration that no shape tells.
         encoder: whether there is a cross-image encoder; None where the file tells.
         projection: their name of the projection; None without one.
         mask_token: see `vit_lines`, and so is `norm`.
@@ -86,7 +90,7 @@ def register_over_dinov2(
         dim = 0 if projection is None else Reader(state).size(f"{projection}.weight", 0)
         return ModelConfig(
             image_size=image_size,
-            backbone=vit_config(Reader(state, prefix)),
+            backbone=dataclasses.replace(vit_config(Reader(state, prefix)), **backbone),
             aggregator=infer_head(state),
             cross_image=CrossImageConfig(layers=0) if encoder is False else infer_encoder(state),
             projection=ProjectionConfig(dim=dim),

@@ -1,6 +1,7 @@
 """The backbone's parts that no golden file reaches; the rest is in parity/test_goldens.py."""
 
 import dataclasses
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,15 +32,17 @@ def images(*size: int, seed: int = 0) -> jax.Array:
 
 
 @pytest.mark.parametrize("grid", [(5, 5), (4, 6), (9, 3), (12, 12), (2, 2), (37, 41)])
-@pytest.mark.parametrize("registers", [0, 4])
-def test_positions_equal_torch_interpolate(grid: tuple[int, int], registers: int) -> None:
+@pytest.mark.parametrize(("registers", "resize"), [(0, "dinov2"), (4, "dinov2"), (4, "plain")])
+def test_positions_equal_torch_interpolate(
+    grid: tuple[int, int], registers: int, resize: Literal["dinov2", "plain"]
+) -> None:
     """DINOv2's call: scale factors with an offset of 0.1, or antialiased to a size."""
     positions = jax.random.normal(jax.random.key(0), (5, 5, 8))
-    config = dataclasses.replace(CONFIG, registers=registers)
+    config = dataclasses.replace(CONFIG, registers=registers, position_resize=resize)
     maps = torch.tensor(np.asarray(positions)).permute(2, 0, 1)[None]
     if grid == (5, 5):
         expected = maps
-    elif registers:
+    elif registers and resize == "dinov2":
         expected = torch.nn.functional.interpolate(maps, size=grid, mode="bicubic", antialias=True)
     else:
         scale = tuple((side + 0.1) / 5 for side in grid)
@@ -91,7 +94,7 @@ def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
     )
     cut = dataclasses.replace(params, blocks=parts)
     ours, theirs = vit(cut, images(1, 28, 42), CONFIG), vit(params, images(1, 28, 42), CONFIG)
-    for a, b in zip(ours, theirs, strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
 
 
@@ -100,9 +103,8 @@ def test_an_untrained_adapter_leaves_the_backbone_unchanged() -> None:
     bare_blocks = dataclasses.replace(params.blocks, adapter=None)
     bare = dataclasses.replace(params, blocks=bare_blocks)
     config = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="none"))
-    for a, b in zip(
-        vit(params, images(1, 28, 42), CONFIG), vit(bare, images(1, 28, 42), config), strict=True
-    ):
+    ours, theirs = vit(params, images(1, 28, 42), CONFIG), vit(bare, images(1, 28, 42), config)
+    for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
