@@ -18,8 +18,8 @@ import pytest
 
 from crisalad_jax.checkpoints.layouts import to_params, to_state
 from crisalad_jax.checkpoints.layouts.base import head_lines
-from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines
 from crisalad_jax.checkpoints.layouts.dinov2 import adapter_lines
+from crisalad_jax.checkpoints.layouts.encoder import encoder_lines
 from crisalad_jax.checkpoints.layouts.forms import Entry, Extra
 from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
 from crisalad_jax.nn.aggregators.base import to_descriptor

@@ -32,7 +32,7 @@ from transformers import (
 )
 
 from crisalad_jax.checkpoints.layouts import to_state
-from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines
+from crisalad_jax.checkpoints.layouts.encoder import encoder_lines
 from crisalad_jax.checkpoints.torch_io import read_checkpoint, write_checkpoint
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig

@@ -27,7 +27,7 @@ class Contents(NamedTuple):
 def write_safetensors(
     path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
 ) -> None:
-    """Write arrays in C order and texts as a safetensors file, whole or not at all.
+    """Write arrays and texts as a safetensors file, whole or not at all.
 
     Raises:
         InputError: the file cannot be written.
@@ -46,7 +46,7 @@ def write_sealed(
 
     Args:
         path: the file.
-        arrays: in C order, by name.
+        arrays: by name.
         form: the format and its version, the one key of the metadata: safetensors keeps no order of
             several.
         value: the object, as JSON values.
@@ -66,8 +66,10 @@ def _write(
     arrays: Mapping[str, np.ndarray],
     metadata: Mapping[str, str],
 ) -> None:
+    # The library writes the memory as it lies, whatever the order of the axes.
+    arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     try:
-        safetensors.numpy.save_file(dict(arrays), temporary, metadata=dict(metadata))
+        safetensors.numpy.save_file(arrays, temporary, metadata=dict(metadata))
     except safetensors.SafetensorError as error:  # a full disk too
         raise InputError(f"{path}: cannot be written: {error}") from error
     # The library creates files that only their owner can read: widen their mode.

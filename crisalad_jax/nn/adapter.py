@@ -1,7 +1,7 @@
-"""The adapters beside a block's MLP: the paper's (section 3.2) and two others of its Table 2.
+"""The adapters of a block: the paper's (section 3.2), two others of its Table 2, and EDTformer's.
 
 All project the tokens down, act on them, and project them up again. The up-projection starts at 0,
-so that an untrained adapter changes nothing.
+so that an untrained adapter adds nothing. All but EDTformer's are beside the block's MLP.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ from crisalad_jax.nn.layers import (
     batch_norm,
     conv,
     depthwise_conv,
+    gelu,
     init_batch_norm,
     init_conv,
     init_depthwise_conv,
@@ -35,16 +36,17 @@ BATCH_NORM_EPSILON = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class AdapterConfig:
-    """The adapter beside the MLP of every block (paper section 3.2 and Table 2).
+    """The adapter of every block (paper section 3.2 and Table 2).
 
     Example:
         >>> AdapterConfig(kind="none").kind
         'none'
     """
 
-    kind: Literal["depthwise", "multi-resolution", "mlp", "none"] = "depthwise"
+    kind: Literal["depthwise", "multi-resolution", "mlp", "side", "none"] = "depthwise"
     """Kind of adapter: the paper's depthwise-separable convolution, CricaVPR's multi-resolution
-    one, or a plain MLP; none leaves it out."""
+    one, or a plain MLP; or EDTformer's, on a path of their own beside all blocks (side); none
+    leaves it out."""
     bottleneck: float = 0.5
     """Width of the adapter over the width of the backbone."""
     kernel_size: int = 3
@@ -119,7 +121,15 @@ class MlpAdapter:
     up: Linear
 
 
-Adapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter
+@pytree_dataclass
+class SideAdapter:
+    """EDTformer's adapter: an MLP with GELU, on a path beside the blocks (Jin et al. 2025)."""
+
+    down: Linear
+    up: Linear
+
+
+Adapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter | SideAdapter
 
 
 def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter | None:
@@ -136,6 +146,8 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
     up = jax.tree.map(jnp.zeros_like, init_linear(up_key, width, dim, bias=bias))
     if kind == "mlp":
         return MlpAdapter(down, up)
+    if kind == "side":
+        return SideAdapter(down, up)
     if kind == "depthwise":
         return DepthwiseAdapter(
             down=down,
@@ -171,9 +183,13 @@ def adapter(
 
     The last `grid[0] * grid[1]` tokens are patches in row order. The convolutions are the identity
     on the class and register tokens before them. With the skip these tokens therefore count twice,
-    as in CricaVPR. The MLP adapter has neither convolutions nor skip.
+    as in CricaVPR. The MLP and side adapters have neither convolutions nor skip, and the latter has
+    GELU.
     """
-    hidden = jax.nn.relu(checkpoint_name(linear(params.down, tokens), "down"))
+    narrow = checkpoint_name(linear(params.down, tokens), "down")
+    if isinstance(params, SideAdapter):
+        return linear(params.up, gelu(narrow))
+    hidden = jax.nn.relu(narrow)
     if isinstance(params, MlpAdapter):
         return linear(params.up, hidden)
     *batch, count, width = hidden.shape

@@ -77,11 +77,11 @@ def attention(
 
 def cross_attention(
     params: Attention,
-    queries: Float[Array, "query dim"],
+    queries: Float[Array, "*batch_or_none query dim"],
     x: Float[Array, "*batch token dim"],
     heads: int,
 ) -> Float[Array, "*batch query dim"]:
-    """Attend from queries, shared by a whole batch, to the tokens of `x`.
+    """Attend from queries, of each sequence or shared by a whole batch, to the tokens of `x`.
 
     Scores, softmax and parameters are those of `attention`.
     """
@@ -92,10 +92,10 @@ def cross_attention(
     offered = linear(Linear(weight[:, dim:], bias[dim:]), x)
     offered = offered.reshape(*batch, tokens, 2 * heads, dim // heads)
     keys, values = jnp.split(jnp.moveaxis(offered, -3, -2), 2, axis=-3)
-    columns = jnp.moveaxis(asked.reshape(-1, heads, dim // heads), 0, -1)
-    columns = jnp.broadcast_to(columns, (*batch, *columns.shape))
+    columns = jnp.moveaxis(asked.reshape(*asked.shape[:-1], heads, dim // heads), -3, -1)
+    columns = jnp.broadcast_to(columns, (*batch, *columns.shape[-3:]))
     mixed = jnp.moveaxis(_mix(columns, keys, values, None, None), -1, -3)
-    return linear(params.proj, mixed.reshape(*batch, len(queries), dim))
+    return linear(params.proj, mixed.reshape(*batch, queries.shape[-2], dim))
 
 
 def _wide(x: Array) -> Any:

@@ -65,6 +65,11 @@ class ModelConfig:
             f"backbone: found {self.backbone.part_name}, which has no class token, expected one "
             f"that has, for aggregator {name}",
         )
+        require(
+            request.insertion is None or self.backbone.inserts,
+            f"backbone: found {self.backbone.part_name} for aggregator {name}, expected one "
+            "through whose blocks tokens can run, such as vit",
+        )
         self._check_size_rule()
         self.check_image_size(self.input_size)
         require(

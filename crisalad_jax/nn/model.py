@@ -349,6 +349,9 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
     if images.dtype == jnp.uint8:
         images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
     request = config.aggregator.features(config.backbone.depth)
+    if request.insertion is not None:
+        inserted = config.aggregator.inserted(params.aggregator)
+        request = dataclasses.replace(request, inserted=inserted)
     pixels = images.astype(config.compute_dtype)
     with jax.named_scope("backbone"):
         return config.backbone.apply(params.backbone, pixels, request, remat=config.remat)

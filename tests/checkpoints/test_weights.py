@@ -21,7 +21,7 @@ import safetensors.numpy
 
 import crisalad_jax
 from crisalad_jax.checkpoints import weights
-from crisalad_jax.checkpoints.safetensors_io import write_sealed
+from crisalad_jax.checkpoints.safetensors_io import write_safetensors, write_sealed
 from crisalad_jax.checkpoints.weights import (
     is_ours,
     load_extras,
@@ -731,3 +731,12 @@ def test_sources_that_are_none_are_passed_over(tmp_path, shared, parts):
     rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(told)})
     (note,) = notes_of(path)
     assert note.startswith(f"{path}: found no checksum")
+
+
+def test_an_array_in_another_order_is_written_as_it_reads(tmp_path) -> None:
+    """The library writes memory: columns first, it would be another array."""
+    array = np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3))
+    write_safetensors(tmp_path / "a.safetensors", {"a": array, "b": np.float32(3)}, {})
+    found = safetensors.numpy.load_file(tmp_path / "a.safetensors")
+    np.testing.assert_array_equal(found["a"], array)
+    assert found["b"].shape == ()

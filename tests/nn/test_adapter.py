@@ -65,7 +65,7 @@ def test_cricavprs_adapter_has_its_parameter_count() -> None:
     assert sum(counted) == 761_472
 
 
-@pytest.mark.parametrize("kind", ["depthwise", "multi-resolution", "mlp"])
+@pytest.mark.parametrize("kind", ["depthwise", "multi-resolution", "mlp", "side"])
 def test_an_untrained_adapter_adds_nothing(kind: str) -> None:
     config = ViTConfig(dim=32, heads=2, adapter=AdapterConfig(kind=kind))
     params = init_adapter(jax.random.key(0), config.dim, config.adapter)

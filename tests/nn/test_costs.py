@@ -12,11 +12,13 @@ import jax.numpy as jnp
 import pytest
 
 from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
 from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
@@ -121,6 +123,18 @@ def mixvpr_by_hand() -> int:
     return 3 * 2 * DIM * PATCHES**2 + PATCHES * DIM * 20 + 20 * PATCHES * 3
 
 
+def edtformer_by_hand() -> int:
+    """Of width 24, 7 queries, 20 channels, 3 rows and 2 layers, over the class token as well.
+
+    What the queries say to each other, and ask, does not depend on the image in the first layer.
+    """
+    width, queries, tokens = 24, 7, PATCHES + 1
+    asking = tokens * 2 * width**2 + 2 * queries * tokens * width + queries * width**2
+    among = queries * 4 * width**2 + 2 * queries**2 * width
+    layers = 2 * asking + among + queries * width**2
+    return tokens * DIM * width + layers + queries * width * 20 + 20 * queries * 3
+
+
 AGGREGATORS: dict[str, tuple[Any, int]] = {
     "salad": (SMALL.aggregator, salad_by_hand()),
     "salad, 10 iterations": (
@@ -164,6 +178,12 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
         TransVprConfig(levels=3, dim=24),
         PATCHES * 3 * DIM * 3 + PATCHES * 3 * DIM + 3 * DIM * 24,
     ),
+    "edtformer": (
+        EdtFormerConfig(width=24, heads=2, queries=7, channels=20, rows=3),
+        edtformer_by_hand(),
+    ),
+    # The blocks do all the work.
+    "aggregation-tokens": (AggregationTokensConfig(tokens=3, insertion=1), 0),
 }
 
 

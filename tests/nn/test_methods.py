@@ -10,11 +10,13 @@ import pytest
 
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
+from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
 from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
@@ -52,6 +54,8 @@ PARTS: dict[str, Aggregator] = {
     "boq": BoqConfig(channels=16, queries=3, rows=2),
     "supervlad": SuperVladConfig(clusters=3),
     "transvpr": TransVprConfig(levels=2, dim=16),
+    "edtformer": EdtFormerConfig(width=16, heads=2, queries=3, channels=16, rows=2),
+    "aggregation-tokens": AggregationTokensConfig(tokens=3, insertion=1),
 }
 METHODS = [
     # tests/test_model.py and others have enough of these.

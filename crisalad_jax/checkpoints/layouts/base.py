@@ -14,6 +14,7 @@ from crisalad_jax.utils.pytree import named_leaves
 
 State = Mapping[str, np.ndarray]
 Lines = Iterator[Entry | Extra | Absent]
+Stored = Literal["torch", "safetensors", "matlab"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Layout:
     """Prefix of all names, as torch's DataParallel adds it."""
     under: str | None = None
     """Key of the file's dictionary that holds the state; None: the file is the state."""
-    stored: Literal["torch", "safetensors", "matlab"] = "torch"
+    stored: Stored = "torch"
     """Kind of the family's files."""
 
 

@@ -2,16 +2,8 @@
 
 from collections.abc import Iterator
 
-from crisalad_jax.checkpoints.layouts.base import (
-    Layout,
-    Lines,
-    Reader,
-    State,
-    register_head,
-    register_layout,
-)
+from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.cnn import Names
-from crisalad_jax.checkpoints.layouts.dinov2 import accepts_parts, vit_config, vit_lines, vit_of
 from crisalad_jax.checkpoints.layouts.forms import (
     CONV,
     FIRST,
@@ -23,12 +15,9 @@ from crisalad_jax.checkpoints.layouts.forms import (
     transformer_layer,
 )
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
+from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
-
-_BACKBONE = "backbone.dino."
 
 
 @register_head("boq")
@@ -57,30 +46,13 @@ def infer_boq(state: State) -> BoqConfig:
     )
 
 
-def _infer(state: State) -> ModelConfig:
-    return ModelConfig(
-        image_size=(322, 322),
-        backbone=vit_config(Reader(state, _BACKBONE)),
-        aggregator=infer_boq(state),
-        cross_image=CrossImageConfig(layers=0),
-    )
-
-
-def _lines(config: ModelConfig) -> Lines:
-    assert isinstance(config.aggregator, BoqConfig)
-    yield from vit_lines(vit_of(config), _BACKBONE)
-    yield from boq_lines(config.aggregator)
-
-
-register_layout(
-    Layout(
-        "boq-dinov2",
-        "BoQ-DINOv2 .pth",
-        lambda config: accepts_parts(config, "boq", "none", cross_image=False),
-        _lines,
-        lambda state: f"{_BACKBONE}cls_token" in state or f"{_BACKBONE}pos_embed" in state,
-        _infer,
-    )
+register_over_dinov2(
+    "boq-dinov2",
+    "BoQ-DINOv2 .pth",
+    "boq",
+    infer_boq,
+    prefix="backbone.dino.",
+    image_size=(322, 322),
 )
 
 register_over_cnn(

@@ -2,21 +2,10 @@
 
 from collections.abc import Iterator
 
-from crisalad_jax.checkpoints.layouts.base import (
-    Layout,
-    Lines,
-    Reader,
-    State,
-    register_head,
-    register_layout,
-)
-from crisalad_jax.checkpoints.layouts.dinov2 import accepts_parts, vit_config, vit_lines, vit_of
+from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, POINTWISE, SAME, Entry, affine
+from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.nn.aggregators.salad import SaladConfig
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
-
-_BACKBONE = "backbone.model."
 
 
 @register_head("salad")
@@ -44,28 +33,11 @@ def infer_salad(state: State, prefix: str = "aggregator.") -> SaladConfig:
     )
 
 
-def _infer(state: State) -> ModelConfig:
-    return ModelConfig(
-        image_size=(322, 322),
-        backbone=vit_config(Reader(state, _BACKBONE)),
-        aggregator=infer_salad(state),
-        cross_image=CrossImageConfig(layers=0),
-    )
-
-
-def _lines(config: ModelConfig) -> Lines:
-    assert isinstance(config.aggregator, SaladConfig)
-    yield from vit_lines(vit_of(config), _BACKBONE)
-    yield from salad_lines(config.aggregator)
-
-
-register_layout(
-    Layout(
-        "dino-salad",
-        "DINO-SALAD .ckpt",
-        lambda config: accepts_parts(config, "salad", "none", cross_image=False),
-        _lines,
-        lambda state: f"{_BACKBONE}cls_token" in state or f"{_BACKBONE}pos_embed" in state,
-        _infer,
-    )
+register_over_dinov2(
+    "dino-salad",
+    "DINO-SALAD .ckpt",
+    "salad",
+    infer_salad,
+    prefix="backbone.model.",
+    image_size=(322, 322),
 )

@@ -31,6 +31,9 @@ from crisalad_jax.utils.errors import InputError
 HEAD_WIDTH = 64
 """Width of an attention head in every DINOv2; no shape shows the number of heads."""
 
+SIDE_ALPHA = 0.5
+"""Weight of EDTformer's adapters, which no shape shows."""
+
 
 def accepts_bare_backbone(config: ModelConfig) -> str | None:
     """Accept DINOv2 alone, whose descriptor is its class token."""
@@ -62,6 +65,11 @@ def parts_in_words(config: ModelConfig) -> str:
     if isinstance(backbone, ViTConfig):
         return f"{words}, adapter {backbone.adapter.kind}, {encoder} encoder{projection}"
     return f"{words}, backbone {backbone.part_name}, {encoder} encoder{projection}"
+
+
+def has_vit(state: State, prefix: str) -> bool:
+    """Return whether there is a vision transformer under a prefix."""
+    return f"{prefix}cls_token" in state or f"{prefix}pos_embed" in state
 
 
 def vit_of(config: ModelConfig) -> ViTConfig:
@@ -97,6 +105,11 @@ def vit_lines(
             yield from affine(f"{ours}.mlp.{name}", f"{theirs}.mlp.{name}", LINEAR)
         yield Entry((f"{ours}.ls2",), (f"{theirs}.ls2.gamma",), SAME)
         yield from adapter_lines(config, f"{ours}.adapter", f"{theirs}.adapter")
+    if config.adapter.kind == "side":
+        for i in range(config.depth):
+            ours, theirs = f"backbone.blocks.{i}.adapter", f"{prefix}adapters.{i}"
+            yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR)
+            yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR)
     if norm:
         yield from affine("backbone.norm", f"{prefix}norm", SAME)
     else:
@@ -105,8 +118,13 @@ def vit_lines(
 
 
 def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:
-    """Yield one block's adapter, under CricaVPR's names, and similar names for other kinds."""
+    """Yield one block's adapter, under CricaVPR's names, and similar names for other kinds.
+
+    Side adapters are in no block.
+    """
     kind = config.adapter.kind
+    if kind in ("none", "side"):
+        return
     if kind == "multi-resolution":
         for branch in ("branch1", "branch2.0", "branch2.1", "branch3.0", "branch3.1"):
             here, there = f"{ours}.{branch}", f"{theirs}.{branch}"
@@ -117,32 +135,17 @@ def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:
             count = "num_batches_tracked"
             yield Extra(f"{here}.norm.{count}", f"{there}.bn.{count}", (), np.int64)
     bias = kind != "depthwise"
-    if kind != "none":
-        yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=bias)
+    yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=bias)
     if kind == "depthwise":
         yield from affine(f"{ours}.depthwise", f"{theirs}.depthwise", DEPTHWISE)
         yield from affine(f"{ours}.pointwise", f"{theirs}.pointwise", POINTWISE)
-    if kind != "none":
-        yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR, bias=bias)
+    yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR, bias=bias)
 
 
 def vit_config(read: Reader) -> ViTConfig:
     """Infer a backbone from facebookresearch/dinov2's names."""
     gated = read.has("blocks.0.mlp.w12.weight")
     width = read.size("cls_token", 2)
-    if read.has("blocks.0.adapter.branch1.conv.weight"):
-        kind = "multi-resolution"
-    elif read.has("blocks.0.adapter.depthwise.weight"):
-        kind = "depthwise"
-    else:
-        kind = "mlp" if read.has("blocks.0.adapter.D_fc1.weight") else "none"
-    adapter = AdapterConfig(kind=kind)
-    if kind != "none":
-        down = read.size("blocks.0.adapter.D_fc1.weight", 0)
-        adapter = dataclasses.replace(adapter, bottleneck=down / width)
-    if kind == "depthwise":
-        side = read.size("blocks.0.adapter.depthwise.weight", 2)
-        adapter = dataclasses.replace(adapter, kernel_size=side)
     return backbone_config(
         dim=width,
         depth=read.count("blocks."),
@@ -150,8 +153,24 @@ def vit_config(read: Reader) -> ViTConfig:
         gated=gated,
         registers=read.size("register_tokens", 1) if read.has("register_tokens") else 0,
         positions=read.size("pos_embed", 1),
-        adapter=adapter,
+        adapter=_adapter_config(read, width),
     )
+
+
+def _adapter_config(read: Reader, width: int) -> AdapterConfig:
+    """Infer the kind and the sizes of the adapters; how much they weigh is as published."""
+    if read.has("adapters.0.D_fc1.weight"):
+        down = read.size("adapters.0.D_fc1.weight", 0)
+        return AdapterConfig(kind="side", bottleneck=down / width, alpha=SIDE_ALPHA)
+    if not read.has("blocks.0.adapter.D_fc1.weight"):
+        return AdapterConfig(kind="none")
+    adapter = AdapterConfig("mlp", read.size("blocks.0.adapter.D_fc1.weight", 0) / width)
+    if read.has("blocks.0.adapter.branch1.conv.weight"):
+        return dataclasses.replace(adapter, kind="multi-resolution")
+    if not read.has("blocks.0.adapter.depthwise.weight"):
+        return adapter
+    side = read.size("blocks.0.adapter.depthwise.weight", 2)
+    return dataclasses.replace(adapter, kind="depthwise", kernel_size=side)
 
 
 def backbone_config(
@@ -209,7 +228,7 @@ register_layout(
         "DINOv2 .pth",
         accepts_bare_backbone,
         lambda config: vit_lines(vit_of(config), ""),
-        lambda state: "cls_token" in state or "pos_embed" in state,
+        lambda state: has_vit(state, ""),
         _infer,
     )
 )

@@ -19,6 +19,7 @@ from crisalad_jax.checkpoints.layouts.cnn import Names, vgg_numbers
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, SAME, Entry, Extra, Form
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.checkpoints.matlab_io import AVERAGE
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -27,6 +28,10 @@ from crisalad_jax.nn.projection import ProjectionConfig
 
 _DIM = VggConfig().dim
 _AVERAGE_SIDE = 224
+_LARGEST = (768, 1024)
+"""Size of hloc's images, of which the longer side counts."""
+_MEAN = (123.68, 116.779, 103.939)
+"""Mean of red, green and blue of the network that NetVLAD starts from, VGG-16 of MatConvNet."""
 _SCORES, _WHITENING = "net.layers[30]", "net.layers[33]"
 
 
@@ -44,6 +49,18 @@ _WHITENING_COLUMNS = Form(lambda w: (_by_cluster(w.T),), lambda w: (_by_channel(
 _SCORES_1D = Form(lambda w: (w[:, :, 0].T,), lambda w: (w.T[:, :, None],))
 _OPPOSITE = Form(lambda c: (-c.T,), lambda c: (-c.T,))
 """MATLAB's file holds the centres with the other sign."""
+
+
+def _chain(mean: tuple[float, float, float]) -> PreprocessingConfig:
+    """Return hloc's chain: sides of at most 1,024, and pixels of 0 to 255 less a mean."""
+    red, green, blue = mean
+    return PreprocessingConfig(
+        size_rule="longer-side",
+        filter="area",
+        pixels="floats",
+        mean=(red / 255, green / 255, blue / 255),
+        deviation=(1 / 255, 1 / 255, 1 / 255),
+    )
 
 
 def _hloc_lines(config: NetVladConfig) -> Iterator[Entry]:
@@ -66,7 +83,8 @@ register_over_cnn(
     head=_hloc_lines,
     projection="whiten",
     projection_form=_WHITENING_COLUMNS,
-    image_size=lambda state: (480, 640),
+    image_size=lambda state: _LARGEST,
+    preprocessing=_chain(_MEAN),
 )
 
 
@@ -92,10 +110,21 @@ def _matlab_lines(config: ModelConfig) -> Lines:
     yield Entry(("projection.bias",), (f"{_WHITENING}.weights[1]",), SAME)
 
 
+def _mean_of(state: State) -> tuple[float, float, float]:
+    """Return the average image's first pixel, which hloc subtracts from all, or else `_MEAN`."""
+    image = state[AVERAGE]
+    if image.ndim != 3 or not image.any():
+        return _MEAN
+    # Rounded, because the file has it in float32.
+    red, green, blue = (round(float(value), 3) for value in image[0, 0])
+    return red, green, blue
+
+
 def _matlab_infer(state: State) -> ModelConfig:
     read = Reader(state)
     return ModelConfig(
-        image_size=(480, 640),
+        image_size=_LARGEST,
+        preprocessing=_chain(_mean_of(state)),
         backbone=VggConfig(),
         aggregator=NetVladConfig(clusters=read.size(f"{_SCORES}.weights[0]", 1)),
         cross_image=CrossImageConfig(layers=0),

@@ -13,6 +13,7 @@ from crisalad_jax.checkpoints.layouts.base import (
 )
 from crisalad_jax.checkpoints.layouts.cnn import Names, cnn_lines, infer_cnn
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, Form, affine
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import Aggregator
 from crisalad_jax.nn.backbones.stages import StagedBackbone
 from crisalad_jax.nn.config import ModelConfig
@@ -36,6 +37,7 @@ def register_over_cnn(
     projection_form: Form = LINEAR,
     module: str = "",
     under: str | None = None,
+    preprocessing: PreprocessingConfig = PreprocessingConfig(),
 ) -> None:
     """Register the layout of one family of models.
 
@@ -53,6 +55,7 @@ def register_over_cnn(
         projection_form: form of the projection's weight.
         module: see `name`.
         under: see `name`.
+        preprocessing: how the family's models resize and normalise images.
     """
     expected = f"aggregator {aggregator}, backbone "
     expected += " or ".join(kind.part_name for kind in backbones) + ", no encoder"
@@ -81,6 +84,7 @@ def register_over_cnn(
         dim = 0 if projection is None else Reader(state).size(f"{projection}.weight", 0)
         return ModelConfig(
             image_size=image_size(state),
+            preprocessing=preprocessing,
             backbone=backbone,
             aggregator=infer_head(state),
             cross_image=CrossImageConfig(layers=0),

@@ -9,9 +9,9 @@ from crisalad_jax.checkpoints.layouts.base import (
     register_layout,
 )
 from crisalad_jax.checkpoints.layouts.cnn import Names, cnn_lines
-from crisalad_jax.checkpoints.layouts.cricavpr import encoder_lines, infer_encoder
 from crisalad_jax.checkpoints.layouts.dino_salad import infer_salad
-from crisalad_jax.checkpoints.layouts.dinov2 import vit_config, vit_lines
+from crisalad_jax.checkpoints.layouts.dinov2 import has_vit, vit_config, vit_lines
+from crisalad_jax.checkpoints.layouts.encoder import encoder_lines, infer_encoder
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, affine
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
@@ -54,7 +54,7 @@ register_layout(
         "our torch reference",
         _accepts,
         _lines,
-        lambda state: f"{_BACKBONE}cls_token" in state or f"{_BACKBONE}pos_embed" in state,
+        lambda state: has_vit(state, _BACKBONE),
         _infer,
         under="state_dict",
     )

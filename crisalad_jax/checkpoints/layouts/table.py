@@ -81,20 +81,8 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
             for.
     """
     lines = [line for line in table(config, layout) if isinstance(line, Extra)]
-    if layout != "reference":
-        shapes = public_shapes(config, layout)
-        blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
-        _, read_back = infer(blank, source=f"layout {layout}")
-        wrong = differences(_told(with_free_fields_of(config, read_back)), _told(config))
-        if wrong:
-            raise InputError(
-                f"layout {layout}: cannot tell these apart from the published ones: "
-                f"{'; '.join(wrong)} (layout reference can)"
-            )
-    for line in lines:
-        array = (extras or {}).get(line.name)
-        if array is None:
-            continue
+    given = [(line, (extras or {})[line.name]) for line in lines if line.name in (extras or {})]
+    for line, array in given:
         if (array.shape, array.dtype) != (line.shape, np.dtype(line.dtype)):
             raise InputError(
                 f"extra.{line.name}: found {array.dtype} {array.shape}, expected "
@@ -102,6 +90,18 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
             )
         if not np.isfinite(array).all():
             raise InputError(f"extra.{line.name}: holds NaN or infinity")
+    if layout == "reference":
+        return
+    shapes = public_shapes(config, layout)
+    blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
+    blank |= {line.theirs: array for line, array in given}
+    _, read_back = infer(blank, source=f"layout {layout}")
+    wrong = differences(_told(with_free_fields_of(config, read_back)), _told(config))
+    if wrong:
+        raise InputError(
+            f"layout {layout}: cannot tell these apart from the published ones: "
+            f"{'; '.join(wrong)} (layout reference can)"
+        )
 
 
 def _told(config: ModelConfig) -> ModelConfig:

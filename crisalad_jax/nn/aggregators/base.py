@@ -80,6 +80,13 @@ class Aggregator(Part, abc.ABC):
         """
         return None
 
+    def inserted(self, params: Any) -> Float[Array, "inserted dim"] | None:
+        """Return tokens of its own that run through the backbone's blocks; by default None.
+
+        `features` says after which block they are inserted, and `Features.inserted` has them.
+        """
+        return None
+
     @abc.abstractmethod
     def apply(
         self, params: Any, features: Features, grid: tuple[int, int], *, key: Keys | None

@@ -17,6 +17,8 @@ class Features(NamedTuple):
     """One vector for the whole image; of width 0 where the backbone has none."""
     patches: Float[Array, "*batch patch dim"]
     """One vector for each patch, in row order."""
+    inserted: Float[Array, "*batch inserted dim"] | None = None
+    """One vector for each of `FeatureRequest.inserted`; None without them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +35,11 @@ class FeatureRequest:
     """Whether tokens go through the last layer norm."""
     class_token: bool = False
     """Whether the class token is used, which not every backbone has."""
+    insertion: int | None = None
+    """Number of blocks after which the aggregator's own tokens are put in front of all others.
+    None where it has none."""
+    inserted: Float[Array, "inserted dim"] | None = None
+    """Those tokens, the same for every image; `Aggregator.inserted` returns them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +57,8 @@ class Backbone(Part, abc.ABC):
     """Side of a patch in pixels; sides of images are multiples of it."""
     class_token: ClassVar[bool] = True
     """Whether its features have a class token."""
+    inserts: ClassVar[bool] = False
+    """Whether an aggregator's own tokens can run through its blocks."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:

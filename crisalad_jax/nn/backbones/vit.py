@@ -9,7 +9,7 @@ import itertools
 import math
 import operator
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -91,17 +91,25 @@ class ViT:
     norm: LayerNorm
 
 
+Carry = Float[Array, "image token dim"] | tuple[Array, Array]
+"""Tokens that run through the blocks, with those on the path of side adapters if there is one."""
+
+
 @BACKBONES.register("vit")
 @dataclasses.dataclass(frozen=True)
 class ViTConfig(Backbone):
     """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
 
+    inserts: ClassVar[bool] = True
     heads: int = 12
     mlp_ratio: float = 4.0
     ffn: Literal["mlp", "swiglu"] = "mlp"
     registers: int = 0
     position_grid: int = 37
     """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
+    position_resize: Literal["dinov2", "plain"] = "dinov2"
+    """Resizing of that grid to an image's: as DINOv2's models do, which antialias where there are
+    registers; or plain, never antialiased."""
     position_init: Literal["random", "sincos"] = free_field("random")
     """Initialisation of the position embeddings where no weights are loaded."""
     layer_scale_init: float = free_field(1.0)
@@ -248,17 +256,25 @@ def vit(
     its parameters once more. Blocks after the last level are not run.
 
     Raises:
-        InputError: while tracing, levels that are not in order or more than there are blocks, or
-            several levels of a facet or without the last block.
+        InputError: while tracing, levels that are not in order or more than there are blocks,
+            several levels of a facet or without the last block, or, of adapters on a path beside
+            the blocks, other tokens than the last block's, or inserted ones.
     """
     levels = (config.depth,) if request.levels is None else request.levels
     require(
         levels[0] > 0 and levels[-1] <= config.depth and list(levels) == sorted(set(levels)),
         f"levels: found {levels}, expected numbers of blocks in order, 1 to {config.depth}",
     )
+    require(
+        config.adapter.kind != "side" or request.facet != "token" or levels == (config.depth,),
+        f"levels: found {levels} with adapters beside the blocks, expected the last alone, "
+        f"{config.depth}",
+    )
     tokens = jax.vmap(lambda image: embed(params, image, config))(images)
     outputs = []
-    if request.facet == "token" and levels[-1] == config.depth:
+    if request.inserted is not None:
+        outputs.append(_with_inserted(params, tokens, grid_of(images[0]), config, request, remat))
+    elif request.facet == "token" and levels[-1] == config.depth:
         for part in _cut_at(params.blocks, levels):
             shorter = dataclasses.replace(params, blocks=part)
             tokens = run_blocks(shorter, tokens, grid_of(images[0]), config, remat=remat)
@@ -272,9 +288,36 @@ def vit(
         outputs.append(_facet(params, tokens, grid_of(images[0]), config, levels[0], request.facet))
     if request.norm:
         outputs = [layer_norm(params.norm, level, epsilon=NORM_EPSILON) for level in outputs]
-    patches = [level[:, 1 + config.registers :] for level in outputs]
+    front = 0 if request.inserted is None else len(request.inserted)
+    patches = [level[:, front + 1 + config.registers :] for level in outputs]
     joined = patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1)
-    return Features(outputs[-1][:, 0], joined)
+    inserted = None if request.inserted is None else outputs[-1][:, :front]
+    return Features(outputs[-1][:, front], joined, inserted)
+
+
+def _with_inserted(
+    params: ViT,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: ViTConfig,
+    request: FeatureRequest,
+    remat: str,
+) -> Float[Array, "image all dim"]:
+    """Run all blocks, with the requested tokens in front after the first `request.insertion`."""
+    assert request.insertion is not None
+    assert request.inserted is not None
+    require(
+        config.adapter.kind != "side" and request.levels is None and request.facet == "token",
+        "features: found inserted tokens with levels, a facet or adapters beside the blocks, "
+        "expected none of these",
+    )
+    before, after = _cut_at(params.blocks, (request.insertion, config.depth))
+    tokens = run_blocks(
+        dataclasses.replace(params, blocks=before), tokens, grid, config, remat=remat
+    )
+    front = jnp.broadcast_to(request.inserted, (len(tokens), *request.inserted.shape))
+    tokens = jnp.concatenate([front.astype(tokens.dtype), tokens], axis=1)
+    return run_blocks(dataclasses.replace(params, blocks=after), tokens, grid, config, remat=remat)
 
 
 def _cut_at(
@@ -355,20 +398,38 @@ def run_blocks(
     *,
     remat: str = "dots",
 ) -> Float[Array, "image token dim"]:
-    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`."""
+    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`.
 
-    def body(
-        carry: Float[Array, "image token dim"], layer: Block
-    ) -> tuple[Float[Array, "image token dim"], None]:
-        return block(layer, carry, grid, config), None
+    Side adapters have a path beside the blocks, from which the tokens come. After every block its
+    adapter takes the sum of both paths.
+    """
+    side = config.adapter.kind == "side"
+
+    def body(carry: Carry, layer: Block) -> tuple[Carry, None]:
+        if isinstance(carry, jax.Array):
+            return block(layer, carry, grid, config), None
+        tokens, beside = carry
+        tokens = block(dataclasses.replace(layer, adapter=None), tokens, grid, config)
+        return (tokens, _beside(layer, tokens + beside, grid, config)), None
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=choose("remat", remat, _POLICIES))
     stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
+    carry: Carry = (tokens, tokens) if side else tokens
     with jax.named_scope("blocks"):
         for stack in stacks:
-            tokens, _ = jax.lax.scan(body, tokens, stack)
-    return tokens
+            carry, _ = jax.lax.scan(body, carry, stack)
+    return carry if isinstance(carry, jax.Array) else carry[1]
+
+
+def _beside(
+    layer: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+) -> Float[Array, "image token dim"]:
+    """Apply a block's side adapter, with its skip."""
+    assert layer.adapter is not None
+    with jax.named_scope("adapter"):
+        update = config.adapter.alpha * at_least_float32(adapter(layer.adapter, tokens, grid))
+        return (at_least_float32(tokens) + update).astype(tokens.dtype)
 
 
 def block(
@@ -411,12 +472,13 @@ def interpolate_positions(
     Bicubic interpolation is linear and separable: two small matrix products, whose constants are
     computed while tracing. One set of weights therefore serves every image size. Models without
     registers use torch's bicubic (a = -0.75) with the scale (size + 0.1) / grid. Models with
-    registers use its antialiased one (a = -0.5) at the exact scale.
+    registers use its antialiased one (a = -0.5) at the exact scale, but see `position_resize`.
     """
     side = positions.shape[0]
     if grid == (side, side):
         return positions
-    weights = _antialias_weights if config.registers else _bicubic_weights
+    antialias = config.registers and config.position_resize == "dinov2"
+    weights = _antialias_weights if antialias else _bicubic_weights
     rows, columns = (jnp.asarray(weights(side, size), positions.dtype) for size in grid)
     precision = jax.lax.Precision.HIGHEST
     return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision=precision)

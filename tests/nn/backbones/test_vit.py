@@ -1,6 +1,7 @@
 """The backbone's parts that no golden file reaches; the rest is in parity/test_goldens.py."""
 
 import dataclasses
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from crisalad_jax.nn.backbones.base import FeatureRequest
 from crisalad_jax.nn.backbones.vit import (
     SwiGlu,
     ViTConfig,
+    block,
     embed,
     feed_forward,
     init_vit,
@@ -20,6 +22,7 @@ from crisalad_jax.nn.backbones.vit import (
     run_blocks,
     vit,
 )
+from crisalad_jax.utils.errors import InputError
 
 CONFIG = ViTConfig(dim=16, depth=3, heads=2, position_grid=5)
 
@@ -29,15 +32,17 @@ def images(*size: int, seed: int = 0) -> jax.Array:
 
 
 @pytest.mark.parametrize("grid", [(5, 5), (4, 6), (9, 3), (12, 12), (2, 2), (37, 41)])
-@pytest.mark.parametrize("registers", [0, 4])
-def test_positions_equal_torch_interpolate(grid: tuple[int, int], registers: int) -> None:
+@pytest.mark.parametrize(("registers", "resize"), [(0, "dinov2"), (4, "dinov2"), (4, "plain")])
+def test_positions_equal_torch_interpolate(
+    grid: tuple[int, int], registers: int, resize: Literal["dinov2", "plain"]
+) -> None:
     """DINOv2's call: scale factors with an offset of 0.1, or antialiased to a size."""
     positions = jax.random.normal(jax.random.key(0), (5, 5, 8))
-    config = dataclasses.replace(CONFIG, registers=registers)
+    config = dataclasses.replace(CONFIG, registers=registers, position_resize=resize)
     maps = torch.tensor(np.asarray(positions)).permute(2, 0, 1)[None]
     if grid == (5, 5):
         expected = maps
-    elif registers:
+    elif registers and resize == "dinov2":
         expected = torch.nn.functional.interpolate(maps, size=grid, mode="bicubic", antialias=True)
     else:
         scale = tuple((side + 0.1) / 5 for side in grid)
@@ -89,7 +94,7 @@ def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
     )
     cut = dataclasses.replace(params, blocks=parts)
     ours, theirs = vit(cut, images(1, 28, 42), CONFIG), vit(params, images(1, 28, 42), CONFIG)
-    for a, b in zip(ours, theirs, strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
 
 
@@ -98,9 +103,8 @@ def test_an_untrained_adapter_leaves_the_backbone_unchanged() -> None:
     bare_blocks = dataclasses.replace(params.blocks, adapter=None)
     bare = dataclasses.replace(params, blocks=bare_blocks)
     config = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="none"))
-    for a, b in zip(
-        vit(params, images(1, 28, 42), CONFIG), vit(bare, images(1, 28, 42), config), strict=True
-    ):
+    ours, theirs = vit(params, images(1, 28, 42), CONFIG), vit(bare, images(1, 28, 42), config)
+    for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
@@ -130,6 +134,43 @@ def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
         for c in (dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=0.0)), config)
     ]
     np.testing.assert_allclose(more[1] - more[0], 2 * (out[1] - out[0]), atol=1e-5)
+
+
+SIDE = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="side", alpha=0.5))
+
+
+def test_side_adapters_take_the_sum_of_both_paths() -> None:
+    """The trunk is that of no adapters; y = z + alpha A(z) of z = x + y, a block at a time."""
+    params = init_vit(jax.random.key(0), SIDE)
+    up = params.blocks.adapter.up
+    up = dataclasses.replace(up, weight=jax.random.normal(jax.random.key(1), up.weight.shape))
+    changed = dataclasses.replace(params.blocks.adapter, up=up)
+    params = dataclasses.replace(params, blocks=dataclasses.replace(params.blocks, adapter=changed))
+    tokens = jax.random.normal(jax.random.key(2), (1, 1 + 6, 16))
+    trunk, beside = tokens, tokens
+    for i in range(CONFIG.depth):
+        layer = jax.tree.map(lambda leaf, i=i: leaf[i], params.blocks)
+        trunk = block(dataclasses.replace(layer, adapter=None), trunk, (2, 3), CONFIG)
+        t = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf)), layer.adapter)
+        z = torch.tensor(np.asarray(trunk + beside))
+        hidden = torch.nn.functional.gelu(z @ t.down.weight + t.down.bias)
+        beside = (z + 0.5 * (hidden @ t.up.weight + t.up.bias)).numpy()
+    found = run_blocks(params, tokens, (2, 3), SIDE)
+    # Sums of up to 16 numbers of order 10, three blocks deep.
+    np.testing.assert_allclose(found, beside, rtol=1e-5, atol=2e-5)
+    cut = SIDE.split_blocks(params, 1)
+    np.testing.assert_array_equal(run_blocks(cut, tokens, (2, 3), SIDE), found)
+
+
+def test_side_adapters_have_tokens_after_the_last_block_alone() -> None:
+    params = jax.eval_shape(lambda: init_vit(jax.random.key(0), SIDE))
+    for levels in ((1,), (2, 3)):
+        with pytest.raises(InputError, match="beside the blocks, expected the last alone, 3"):
+            jax.eval_shape(
+                lambda p, x, levels=levels: vit(p, x, SIDE, FeatureRequest(levels)),
+                params,
+                images(1, 28, 42),
+            )
 
 
 def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None:

@@ -1,0 +1,83 @@
+"""ImAge: learnt tokens that the backbone's last blocks aggregate into (Lu et al., 2025)."""
+
+import dataclasses
+
+import jax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn.layers import Keys, at_least_float32
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class AggregationTokens:
+    """The tokens as they enter the backbone's blocks."""
+
+    tokens: Float[Array, "token dim"]
+
+
+@AGGREGATORS.register("aggregation-tokens", tiny={"insertion": -2})
+@dataclasses.dataclass(frozen=True)
+class AggregationTokensConfig(Aggregator):
+    """ImAge's learnt tokens, which run through the backbone's last blocks (Lu et al., 2025).
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig, ModelConfig
+        >>> alone = CrossImageConfig(layers=0)
+        >>> part = AggregationTokensConfig(tokens=8)
+        >>> ModelConfig(aggregator=part, cross_image=alone).descriptor_dim
+        6144
+    """
+
+    tokens: int = 8
+    """Number of learnt tokens."""
+    insertion: int = -4
+    """Block before which they are put in front of all others, from 0, or from the end where
+    negative."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "tokens")
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request that the tokens run through the blocks from `insertion`.
+
+        Raises:
+            InputError: there is no such block.
+        """
+        require(
+            -depth <= self.insertion < depth,
+            f"AggregationTokensConfig.insertion: found {self.insertion}, expected {-depth} to "
+            f"{depth - 1} for a backbone of {depth} blocks",
+        )
+        return FeatureRequest(insertion=self.insertion % depth)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of the tokens."""
+        return TokenShape(0, self.tokens, dim)
+
+    def init(
+        self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]
+    ) -> AggregationTokens:
+        """Draw tokens of deviation 1e-6, as published."""
+        return AggregationTokens(1e-6 * jax.random.normal(key, (self.tokens, backbone.dim)))
+
+    def inserted(self, params: AggregationTokens) -> Float[Array, "token dim"]:
+        """Return the tokens."""
+        return params.tokens
+
+    def apply(
+        self,
+        params: AggregationTokens,
+        features: Features,
+        grid: tuple[int, int],
+        *,
+        key: Keys | None,
+    ) -> Tokens:
+        """Return the tokens as the backbone's last layer norm leaves them."""
+        assert features.inserted is not None
+        return Tokens.of_local(at_least_float32(features.inserted))

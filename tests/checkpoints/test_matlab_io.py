@@ -1,0 +1,111 @@
+"""NetVLAD's MATLAB file, against scipy's reader and hloc's torch module."""
+
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.io
+
+from crisalad_jax import describe
+from crisalad_jax.checkpoints.layouts import infer, to_params
+from crisalad_jax.checkpoints.layouts.cnn import vgg_numbers
+from crisalad_jax.checkpoints.matlab_io import AVERAGE, read_matlab, write_matlab
+from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint
+from crisalad_jax.utils.errors import InputError
+from parity import zoo
+
+MEAN = (123.68, 116.779, 103.939)
+
+
+def matlab_state(hloc: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The numbers of hloc's module as MATLAB's file has them, by hloc's own comments."""
+    average = np.broadcast_to(np.float32(MEAN), (224, 224, 3))
+    state = {AVERAGE: np.ascontiguousarray(average)}
+    for _, number in vgg_numbers():
+        layer = f"net.layers[{number}]"
+        state[f"{layer}.weights[0]"] = hloc[f"backbone.{number}.weight"].transpose(2, 3, 1, 0)
+        state[f"{layer}.weights[1]"] = hloc[f"backbone.{number}.bias"]
+    state["net.layers[30].weights[0]"] = hloc["netvlad.score_proj.weight"][:, :, 0].T
+    state["net.layers[30].weights[1]"] = -hloc["netvlad.centers"]
+    state["net.layers[33].weights[0]"] = hloc["whiten.weight"].T
+    state["net.layers[33].weights[1]"] = hloc["whiten.bias"]
+    return state
+
+
+def tiny() -> dict[str, np.ndarray]:
+    """A network of two layers, which no model has: the file's form alone."""
+    rng = np.random.default_rng(0)
+    return {
+        AVERAGE: rng.uniform(0, 255, (2, 3, 3)).astype(np.float32),
+        "net.layers[0].weights[0]": rng.normal(size=(3, 3, 3, 4)).astype(np.float32),
+        "net.layers[0].weights[1]": rng.normal(size=4).astype(np.float32),
+        "net.layers[2].weights[0]": rng.normal(size=(5, 4)).astype(np.float32),
+        "net.layers[2].weights[1]": rng.normal(size=4).astype(np.float32),
+    }
+
+
+def test_a_written_file_is_what_scipy_and_we_read(tmp_path: pathlib.Path) -> None:
+    path, state = tmp_path / "net.mat", tiny()
+    write_matlab(path, state)
+    network = scipy.io.loadmat(path, struct_as_record=False, squeeze_me=True)["net"]
+    assert len(network.layers) == 3
+    for number, i in ((0, 0), (0, 1), (2, 0), (2, 1)):
+        expected = state[f"net.layers[{number}].weights[{i}]"]
+        np.testing.assert_array_equal(network.layers[number].weights[i], expected)
+    np.testing.assert_array_equal(network.meta.normalization.averageImage, state[AVERAGE])
+    found = read_matlab(path)
+    assert found.keys() == state.keys()
+    for name, array in state.items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == np.float32
+
+
+def test_what_is_no_network(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "other.mat"
+    scipy.io.savemat(path, {"dbStruct": {"whichSet": "test"}})
+    with pytest.raises(InputError, match=r"other.mat: found no 'net', expected a MATLAB file of a"):
+        read_matlab(path)
+    path.write_bytes(b"no MATLAB at all, but text of some length" * 10)
+    with pytest.raises(InputError, match=r"other.mat: not a whole MATLAB file"):
+        read_matlab(path)
+    with pytest.raises(InputError, match=r"none.mat: found no such file"):
+        read_matlab(tmp_path / "none.mat")
+
+
+def test_every_cut_is_told(tmp_path: pathlib.Path) -> None:
+    write_matlab(tmp_path / "net.mat", tiny())
+    whole = (tmp_path / "net.mat").read_bytes()
+    for size in range(8, len(whole) - 8, len(whole) // 40):
+        (tmp_path / "cut.mat").write_bytes(whole[:size])
+        with pytest.raises(InputError, match=r"cut\.mat"):
+            read_matlab(tmp_path / "cut.mat")
+
+
+@pytest.mark.slow
+def test_matlabs_file_is_hlocs_module_and_goes_back(tmp_path: pathlib.Path) -> None:
+    """At full size: 150 million numbers."""
+    name = "netvlad_vgg16_hloc"
+    hloc, golden = zoo.random_state(name), zoo.golden(name)
+    state = matlab_state(hloc)
+    shapes = zoo.layout(f"{name}_mat")
+    assert {k: v.size for k, v in state.items()} == {k: np.prod(s) for k, s in shapes.items()}
+    write_matlab(tmp_path / "Pitts30K_struct.mat", state)
+    read = read_checkpoint(tmp_path / "Pitts30K_struct.mat")
+    assert read.layout == "netvlad-matlab"
+    layout, config = infer(hloc, source="hloc")
+    assert (layout, read.config) == ("netvlad-hloc", config)
+    params, _ = to_params(hloc, config, layout, source="hloc")
+    jax.tree.map(np.testing.assert_array_equal, read.params, params)
+    found = describe(jax.tree.map(jnp.asarray, params), golden["images"], config)
+    # Forty times what float32 makes here, as in parity/test_zoo.py.
+    error = np.linalg.norm(found - golden["descriptor"])
+    assert error < 2e-5 * np.linalg.norm(golden["descriptor"])
+
+    convert(tmp_path / "Pitts30K_struct.mat", tmp_path / "ours.safetensors")
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.mat")
+    back = read_matlab(tmp_path / "back.mat")
+    assert back.keys() == state.keys()
+    for key, array in state.items():
+        np.testing.assert_array_equal(back[key], array)
