@@ -231,8 +231,8 @@ class _Transfer:
         ):
             for chunk in chunks:
                 file.write(chunk)
+                file.flush()  # what has arrived outlives a kill
                 bar.advance(len(chunk) / _MEGABYTE)
-            file.flush()
             os.fsync(file.fileno())
 
     def _check_no_page(self, response: Any, first: bytes) -> None:
