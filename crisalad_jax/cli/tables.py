@@ -5,6 +5,9 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
+from crisalad_jax.checkpoints.cache import is_cached
+from crisalad_jax.checkpoints.published import Published
+from crisalad_jax.checkpoints.published.base import GITHUB
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.training.summary import ModelSummary
@@ -62,6 +65,25 @@ def summary_table(summary: ModelSummary, name: str) -> Table:
     table.add_section()
     parameters = sum(cost.parameters for cost in summary.parts)
     table.add_row("all", f"{parameters:,}", f"{sum(cost.macs for cost in summary.parts):,}")
+    return table
+
+
+def models_table(models: Sequence[Published]) -> Table:
+    """Make a table of published models for the terminal; those in the cache have a star."""
+    table = Table("name", "descriptor", "parameters", "images", "licence", "on GitHub")
+    for column in table.columns[1:3]:
+        column.justify = "right"
+    for column in (table.columns[0], *table.columns[2:]):
+        column.overflow = "fold"
+    for model in models:
+        table.add_row(
+            f"{model.name} *" if is_cached(model) else model.name,
+            f"{model.descriptor:,}",
+            f"{model.parameters:,}",
+            model.images,
+            model.licence.name,
+            model.repository.removeprefix(GITHUB),
+        )
     return table
 
 
