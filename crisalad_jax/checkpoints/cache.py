@@ -12,6 +12,8 @@ import urllib.parse
 from collections.abc import Mapping
 from typing import Any
 
+import jax
+
 from crisalad_jax.checkpoints.published import Published
 from crisalad_jax.checkpoints.torch_io import read_checkpoint
 from crisalad_jax.checkpoints.weights import save_weights
@@ -210,10 +212,13 @@ def _convert(model: Published, published: pathlib.Path, *, fresh: bool) -> None:
         if record is not None:
             _check_same(model, record, digest)
         checkpoint = read_checkpoint(published)
-        found = f"{checkpoint.layout}, {checkpoint.config.descriptor_dim} numbers"
-        expected = f"{model.layout}, {model.descriptor} numbers"
-        if found != expected:
-            raise InputError(f"{published}: found {found}, expected {expected}")
+        parameters = sum(leaf.size for leaf in jax.tree.leaves(checkpoint.params))
+        found = checkpoint.config.descriptor_dim, parameters
+        if found != (model.descriptor, model.parameters):
+            raise InputError(
+                f"{published}: found descriptors of {found[0]} numbers and {found[1]} parameters "
+                f"({checkpoint.layout}), expected {model.descriptor} and {model.parameters}"
+            )
     except InputError as error:
         if fresh:
             published.unlink()

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import rich.box
 from rich.table import Table
 from rich.text import Text
 
@@ -70,16 +71,18 @@ def summary_table(summary: ModelSummary, name: str) -> Table:
 
 def models_table(models: Sequence[Published]) -> Table:
     """Make a table of published models for the terminal; those in the cache have a star."""
-    table = Table("name", "descriptor", "parameters", "images", "licence", "on GitHub")
-    for column in table.columns[1:3]:
-        column.justify = "right"
-    for column in (table.columns[0], *table.columns[2:]):
-        column.overflow = "fold"
+    # Without lines between the columns, longer names fit.
+    table = Table(box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("name", no_wrap=True)
+    table.add_column("descriptor", justify="right")
+    table.add_column("parameters", justify="right", no_wrap=True)
+    for name in ("images", "licence", "on GitHub"):
+        table.add_column(name, overflow="fold")
     for model in models:
         table.add_row(
             f"{model.name} *" if is_cached(model) else model.name,
             f"{model.descriptor:,}",
-            f"{model.parameters:,}",
+            f"{model.parameters / 1e6:,.1f} M",
             model.images,
             model.licence.name,
             model.repository.removeprefix(GITHUB),

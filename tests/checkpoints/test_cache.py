@@ -217,7 +217,7 @@ def test_faults_leave_no_model(model, server, tmp_path):
                     CONFIG, backbone=dataclasses.replace(CONFIG.backbone, dim=128, heads=2)
                 ),
             ),
-            "found huggingface, 128 numbers, expected huggingface, 64 numbers",
+            r"found descriptors of 128 numbers and \d+ parameters \(huggingface\), expected 64 and",
         ),
     ],
     ids=["cut", "empty", "of no layout", "of another size"],

@@ -51,15 +51,15 @@ def runs(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[str, st
 
 def test_the_table_has_every_model_and_marks_those_in_the_cache(capfd, tmp_path):
     out, _ = runs(capfd, "models")
-    rows = {row.split("│")[1].strip(): row for row in out.splitlines() if "│" in row}
-    assert rows.keys() - {""} == PUBLISHED.keys()
-    for words in ("8,448", "228,639,553", "MIT", "gmberton/MegaLoc"):
+    rows = {row.split()[0]: row for row in out.splitlines() if row[1:2].strip()}
+    assert rows.keys() >= PUBLISHED.keys()
+    for words in ("8,448", "228.6 M", "MIT", "gmberton/MegaLoc"):
         assert words in rows["megaloc"]
     assert "no licence file" in rows["tiny-model"]
     assert f"{len(PUBLISHED)} models; * in the cache, {tmp_path / 'cache'}" in out
     runs(capfd, "info", "--weights", "tiny-model")
     out, _ = runs(capfd, "models")
-    assert "│ tiny-model * " in out
+    assert " tiny-model * " in out
     assert out.count(" * ") == 2  # with the line that explains it
 
 

@@ -1,4 +1,4 @@
-"""BoQ (Ali-bey et al., CVPR 2024)."""
+"""BoQ (Ali-bey et al., CVPR 2024), on DINOv2 and on ResNet-50."""
 
 from crisalad_jax.checkpoints.published.base import (
     MIT,
@@ -10,17 +10,21 @@ from crisalad_jax.checkpoints.published.base import (
 
 _REPOSITORY = "amaralibey/Bag-of-Queries"
 
-register_published(
-    Published(
-        name="boq-dinov2",
-        layout="boq-dinov2",
-        descriptor=12288,
-        parameters=95_205_792,
-        images="322 x 322, bicubic",
-        licence=MIT,
-        repository=github(_REPOSITORY),
-        file="dinov2_12288.pth",
-        url=release(_REPOSITORY, "v1.0", "dinov2_12288.pth"),
-        paper="Ali-bey et al., CVPR 2024",
+for _name, _file, _descriptor, _parameters, _images in (
+    ("boq-dinov2", "dinov2_12288.pth", 12288, 95_205_792, "322 x 322, bicubic"),
+    ("boq-resnet50", "resnet50_16384.pth", 16384, 23_875_040, "384 x 384, bicubic"),
+):
+    register_published(
+        Published(
+            name=_name,
+            layout=_name,
+            descriptor=_descriptor,
+            parameters=_parameters,
+            images=_images,
+            licence=MIT,
+            repository=github(_REPOSITORY),
+            file=_file,
+            url=release(_REPOSITORY, "v1.0", _file),
+            paper="Ali-bey et al., CVPR 2024",
+        )
     )
-)
