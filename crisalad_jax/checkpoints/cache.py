@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 
+from crisalad_jax.checkpoints.layouts import LAYOUTS
 from crisalad_jax.checkpoints.published import Published
 from crisalad_jax.checkpoints.torch_io import read_checkpoint
 from crisalad_jax.checkpoints.weights import save_weights
@@ -162,8 +163,8 @@ def _check_obtainable(model: Published) -> None:
 
 def _check_torch(model: Published) -> None:
     """Check that what reads the file is installed, before it is downloaded."""
-    plain = model.file.endswith((".safetensors", ".mat"))
-    if not plain and importlib.util.find_spec("torch") is None:
+    is_torch = LAYOUTS[model.layout].stored == "torch"
+    if is_torch and importlib.util.find_spec("torch") is None:
         raise InputError(
             f"{model.name}: found no torch, expected it to read {model.file}: pip install "
             "'crisalad-jax[convert]'"

@@ -343,7 +343,7 @@ def test_a_file_without_an_address_is_put_there_by_hand(model, monkeypatch, tmp_
 
 
 def test_torch_is_asked_for_before_a_download(model, server, monkeypatch, tmp_path):
-    register(model, monkeypatch, file="tiny.pth")
+    register(model, monkeypatch, layout="dinov2", file="tiny.pth")
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.setattr(cache.importlib.util, "find_spec", lambda name: None)
     fails("tiny-model", r"found no torch, expected it to read tiny\.pth: pip install")

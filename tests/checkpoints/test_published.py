@@ -41,6 +41,8 @@ STORED = {
     "mixvpr-4096": "zoo/layouts/mixvpr_resnet50_4096",
     "conv-ap-4096": "zoo/layouts/convap_resnet50_4096",
     "netvlad-nanne": "zoo/layouts/netvlad_vgg16_nanne",
+    "netvlad-hloc": "zoo/layouts/netvlad_vgg16_hloc_mat",
+    "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc_mat",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
     "transvpr-msls": "zoo/layouts/transvpr",
@@ -122,6 +124,12 @@ def test_patch_netvlads_sizes_differ_in_their_projection():
             model = published_model(f"patch-netvlad-{name}-{size}")
             assert model.descriptor == size
             assert model.parameters == known.parameters + rows * (size - known.descriptor)
+
+
+def test_every_model_is_checked_above():
+    families = ("cosplace-", "eigenplaces-", "patch-netvlad-")
+    others = {name for name in PUBLISHED if not name.startswith(families)}
+    assert others <= STORED.keys() | SIZED.keys()
 
 
 def test_the_table_is_sound():

@@ -1,6 +1,7 @@
-"""NetVLAD in torch (Arandjelovic et al., CVPR 2016), and Patch-NetVLAD (Hausler et al., 2021)."""
+"""NetVLAD (Arandjelovic et al., CVPR 2016) of torch and MATLAB, and Patch-NetVLAD (CVPR 2021)."""
 
 from crisalad_jax.checkpoints.published.base import (
+    APACHE,
     MIT,
     NO_LICENCE,
     Published,
@@ -24,6 +25,26 @@ register_published(
         "Google Drive",
     )
 )
+
+for _name, _file in (
+    ("netvlad-hloc", "Pitts30K_struct.mat"),
+    ("netvlad-hloc-tokyo", "TokyoTM_struct.mat"),
+):
+    register_published(
+        Published(
+            name=_name,
+            layout="netvlad-matlab",
+            descriptor=4096,
+            parameters=149_002_048,
+            images="longer side at most 1,024",
+            licence=APACHE,
+            repository=github("cvg/Hierarchical-Localization"),
+            file=_file,
+            url=f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{_file}",
+            paper="Arandjelovic et al., CVPR 2016",
+            note="the licence is of hloc's code, which reads the file",
+        )
+    )
 
 _HOST = "https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main"
 
