@@ -55,40 +55,6 @@ class Checkpoint(NamedTuple):
     """Public layout of the file; None for a file of this package."""
 
 
-class Model(NamedTuple):
-    """A model's parameters and configuration."""
-
-    params: Crisalad
-    config: ModelConfig
-
-
-def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
-    """Load a model from a file of this package or a public checkpoint.
-
-    Args:
-        path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
-            DINO-SALAD, CricaVPR or another layout in `docs/methods.md`; torch files need torch.
-        verify: whether to check the bytes of a file of this package against its checksum.
-
-    Returns:
-        (params, config).
-
-    Raises:
-        InputError: what `read_checkpoint` raises.
-
-    Example:
-        >>> import jax
-        >>> from crisalad_jax import init_crisalad, load, recipe, save_weights
-        >>> config = recipe("tiny").model
-        >>> params = init_crisalad(jax.random.key(0), config)
-        >>> save_weights(folder / "weights.safetensors", params, config)
-        >>> load(folder / "weights.safetensors").config == config
-        True
-    """
-    checkpoint = read_checkpoint(path, verify=verify)
-    return Model(checkpoint.params, checkpoint.config)
-
-
 def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
     """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
 

@@ -27,6 +27,7 @@ _COMMANDS = {
     "demo": "Render a small city, train a tiny model on it, and show Recall@K before and after.",
     "train": "Train on places in the GSV-Cities layout; go on with the run that is there.",
     "convert": "Convert a public torch checkpoint to a file of this package, or back.",
+    "models": "List the models that others published, which --weights takes by name.",
     "evaluate": "Print what a model recalls of an evaluation set under each grouping.",
     "compare": "Train or load methods, evaluate them alike, and table that (Table 1).",
     "ablate": "Train CriSALAD with one part changed at a time (Tables 2 and 3).",

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import jax
 import rich.console
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.nn.config import ModelConfig
@@ -60,6 +61,11 @@ def check_json(path: pathlib.Path | None) -> None:
         check_target(path)
 
 
+def find_given(weights: pathlib.Path | None, *, quiet: bool = False) -> pathlib.Path | None:
+    """Return the file that an optional flag means, as `find_weights` does; None where not given."""
+    return None if weights is None else find_weights(weights, quiet=quiet)
+
+
 def load_model(
     weights: pathlib.Path | None,
     *,
@@ -69,23 +75,25 @@ def load_model(
     resize: Sequence[str] = (),
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
     verify: bool = True,
+    quiet: bool = False,
 ) -> tuple[Crisalad, ModelConfig, str]:
     """Load a model from a file, or initialise an untrained preset without one.
 
     Args:
-        weights: the file.
+        weights: the file, or a published model's name.
         preset: the size of the untrained model.
         seed: draws the parameters of the untrained model.
         image_size: height and width in pixels; None is the model's.
         resize: words that change how images are resized; see `ModelConfig.resized`.
         compute_dtype: type of the matrix products; None is the model's.
         verify: whether to check the file's bytes against its checksum.
+        quiet: no progress bar of a download.
 
     Returns:
         (params, config, name); the name stands in tables and titles.
 
     Raises:
-        InputError: what `load_weights`, `recipe` and `ModelConfig.resized` raise.
+        InputError: what `find_weights`, `load_weights`, `recipe` and `ModelConfig.resized` raise.
     """
     if weights is None:
         config = recipe(preset).model
@@ -93,6 +101,7 @@ def load_model(
         params = init_crisalad(jax.random.key(seed), config)
         name = f"untrained {preset}, seed {seed}"
     else:
+        weights = find_weights(weights, quiet=quiet)
         params, config = load_weights(weights, verify=verify)
         name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
     if compute_dtype is not None:

@@ -14,7 +14,8 @@ class Compare(ComparisonFlags):
     cosplace, mixvpr, eigenplaces, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is
     a method too, and any registered part, as NAME or KIND:NAME: CriSALAD with it in place."""
     weights: tuple[str, ...] = ()
-    """NAME=FILE, for each method that is not to be trained: its weights."""
+    """NAME=FILE, for each method that is not to be trained: its weights, or a published model's
+    name (`crisalad models`)."""
     rerank: int = 20
     """So many first retrievals Patch-NetVLAD and TransVPR rank anew."""
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import rich.console
 
-from crisalad_jax.cli.common import console, say
+from crisalad_jax.cli.common import console, find_given, say
 
 if TYPE_CHECKING:
     from crisalad_jax.experiments.comparison import ComparisonConfig
@@ -24,8 +24,8 @@ class ComparisonFlags:
     train: pathlib.Path | None = None
     """Training set, in the layout of GSV-Cities."""
     backbone: pathlib.Path | None = None
-    """Train from this backbone, as the recipes say: a file of this package or a public checkpoint.
-    None trains all from nothing, by the recipe scratch."""
+    """Train from this backbone, as the recipes say: a file of this package, a public checkpoint, or
+    a published model's name. None trains all from nothing, by the recipe scratch."""
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14."""
     seeds: int = 3
@@ -61,7 +61,7 @@ def settings_of(flags: ComparisonFlags) -> dict[str, Any]:
     return {
         "test": tuple(map(str, flags.test)),
         "train": text(flags.train),
-        "backbone": text(flags.backbone),
+        "backbone": text(find_given(flags.backbone, quiet=flags.quiet)),
         "preset": flags.preset,
         "epochs": flags.epochs,
         "image_size": flags.image_size,

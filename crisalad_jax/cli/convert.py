@@ -12,19 +12,28 @@ from crisalad_jax.cli.common import say
 from crisalad_jax.training.summary import model_words
 
 
+def _sources() -> str:
+    files = ", ".join(layout.holds for layout in LAYOUTS.values())
+    return f"{files}, or a file of this package."
+
+
+def _layouts() -> str:
+    return (
+        f"{', '.join(LAYOUTS)}, for a source of this package; by default the one its parts came "
+        "from (huggingface if the target is a .safetensors)."
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class Convert:
     """Convert a public torch checkpoint to a file of this package, or such a file back."""
 
-    source: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC")]
-    """DINOv2 .pth, Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth, BoQ-DINOv2
-    .pth, MegaLoc .safetensors, the torch reference, or a file of this package."""
+    source: Annotated[
+        tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC", help=_sources())
+    ]
     target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST")]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
-    layout: str | None = None
-    """dinov2, huggingface, dino-salad, cricavpr, boq-dinov2, megaloc or reference, for a source of
-    this package; by default the one its parts came from (huggingface if the target is a
-    .safetensors)."""
+    layout: Annotated[str | None, tyro.conf.arg(help=_layouts())] = None
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
 

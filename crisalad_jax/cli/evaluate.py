@@ -5,6 +5,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     check_json,
@@ -36,7 +37,8 @@ class Evaluate:
     """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
     folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     weights: pathlib.Path | None = None
-    """A .safetensors file of this package; none evaluates an untrained model of --preset."""
+    """A .safetensors file of this package, or a published model's name (`crisalad models`); none
+    evaluates an untrained model of --preset."""
     preset: str = "b14"
     """Model to start untrained where there are no weights."""
     image_size: tuple[int, int] | None = None
@@ -72,7 +74,7 @@ class Evaluate:
     """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad, of
     a model with NetVLAD, or transvpr (docs/methods.md). Adds a row to each of the table."""
     rerank_weights: pathlib.Path | None = None
-    """Model that makes these features; by default the first stage's."""
+    """Model that makes these features, as --weights; by default the first stage's."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -115,6 +117,7 @@ def run(arguments: Evaluate) -> None:
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
         verify=arguments.verify,
+        quiet=arguments.quiet,
     )
     rerank = _reranking(arguments, config)
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
@@ -208,7 +211,8 @@ def _reranking(arguments: Evaluate, config: ModelConfig) -> Reranking | None:
         return None
     rerank = parse_reranking(arguments.rerank)
     if arguments.rerank_weights is not None:
-        own_params, own_config = load_weights(arguments.rerank_weights)
+        own = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
+        own_params, own_config = load_weights(own)
         rerank = dataclasses.replace(rerank, params=own_params, config=own_config)
     rerank.check(config)
     return rerank

@@ -13,7 +13,7 @@ class Export:
     """Write a model as a StableHLO program that scripts without this package can run."""
 
     weights: pathlib.Path
-    """A .safetensors file of this package."""
+    """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
     out: pathlib.Path
     """New folder for the program, its manifest.json and its weights."""
     image_size: tuple[int, int] | None = None

@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.cli.common import load_model, say
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
@@ -14,7 +15,7 @@ class Extract:
     """Write a descriptor of every image in a folder, in sorted path order."""
 
     weights: pathlib.Path
-    """A .safetensors file of this package."""
+    """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
     images: pathlib.Path
     """Folder, searched with its subfolders."""
     out: pathlib.Path
@@ -67,8 +68,9 @@ def run(arguments: Extract) -> None:
         database=arguments.database,
         k=arguments.k,
     )
+    weights = find_weights(arguments.weights, quiet=arguments.quiet)
     params, config, _ = load_model(
-        arguments.weights,
+        weights,
         image_size=arguments.image_size,
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
@@ -79,7 +81,7 @@ def run(arguments: Extract) -> None:
         config,
         arguments.images,
         arguments.out,
-        weights=arguments.weights,
+        weights=weights,
         grouping=arguments.grouping,
         batch_size=arguments.batch_size,
         seed=arguments.seed,

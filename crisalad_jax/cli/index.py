@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import say
 from crisalad_jax.retrieval.maps.build import Indexed, index
@@ -14,7 +15,8 @@ class Index:
     """Make a map of a folder of images, or append to it those that it lacks."""
 
     weights: pathlib.Path
-    """A .safetensors file of this package; of a map that is there, the same model's."""
+    """A .safetensors file of this package, or a published model's name (`crisalad models`); of a
+    map that is there, the same model's."""
     images: pathlib.Path
     """Folder, searched with its subfolders; the map names images by their paths in it."""
     out: pathlib.Path
@@ -49,13 +51,14 @@ class Index:
 
 def run(arguments: Index) -> None:
     """Index the images, and print what became of them."""
-    params, config = load_weights(arguments.weights)
+    weights = find_weights(arguments.weights, quiet=arguments.quiet)
+    params, config = load_weights(weights)
     result = index(
         params,
         config,
         arguments.images,
         arguments.out,
-        weights=arguments.weights,
+        weights=weights,
         image_size=arguments.image_size,
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,

@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import Any
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     check_json,
@@ -30,7 +31,7 @@ class Info:
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14."""
     weights: pathlib.Path | None = None
-    """Describe the model in this file instead."""
+    """Describe the model in this file of this package instead, or a published one, by its name."""
     map: pathlib.Path | None = None
     """Describe the map in this folder instead."""
     verify: bool = False
@@ -64,7 +65,7 @@ def run(arguments: Info) -> None:
 
 def _model(arguments: Info) -> dict[str, Any]:
     if arguments.weights is not None:
-        _, config = load_weights(arguments.weights)
+        _, config = load_weights(find_weights(arguments.weights))
         name, trainable = str(arguments.weights), arguments.trainable
     else:
         defaults = recipe(arguments.preset)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from crisalad_jax.cli.common import STDOUT, console, say, talk_beside
+from crisalad_jax.cli.common import STDOUT, console, find_given, say, talk_beside
 from crisalad_jax.cli.tables import answers_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import json_lines, query, write_answers
@@ -31,7 +31,7 @@ class Query:
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""
     weights: pathlib.Path | None = None
-    """The model that made the map, by default where it was then."""
+    """The model that made the map, as a file or a published name; by default where it was then."""
     k: int = 5
     """Answers to each query."""
     json: pathlib.Path | None = None
@@ -61,7 +61,7 @@ def run(arguments: Query) -> None:
     with Map.open(arguments.map, verify=arguments.verify) as places:
         answers = query(
             places,
-            places.load_params(arguments.weights),
+            places.load_params(find_given(arguments.weights, quiet=arguments.quiet)),
             arguments.images,
             k=arguments.k,
             batch_size=arguments.batch_size,

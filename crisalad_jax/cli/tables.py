@@ -2,9 +2,13 @@
 
 from collections.abc import Sequence
 
+import rich.box
 from rich.table import Table
 from rich.text import Text
 
+from crisalad_jax.checkpoints.cache import is_cached
+from crisalad_jax.checkpoints.published import Published
+from crisalad_jax.checkpoints.published.base import GITHUB
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.training.summary import ModelSummary
@@ -62,6 +66,27 @@ def summary_table(summary: ModelSummary, name: str) -> Table:
     table.add_section()
     parameters = sum(cost.parameters for cost in summary.parts)
     table.add_row("all", f"{parameters:,}", f"{sum(cost.macs for cost in summary.parts):,}")
+    return table
+
+
+def models_table(models: Sequence[Published]) -> Table:
+    """Make a table of published models for the terminal; those in the cache have a star."""
+    # Without lines between the columns, longer names fit.
+    table = Table(box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("name", no_wrap=True)
+    table.add_column("descriptor", justify="right")
+    table.add_column("parameters", justify="right", no_wrap=True)
+    for name in ("images", "licence", "on GitHub"):
+        table.add_column(name, overflow="fold")
+    for model in models:
+        table.add_row(
+            f"{model.name} *" if is_cached(model) else model.name,
+            f"{model.descriptor:,}",
+            f"{model.parameters / 1e6:,.1f} M",
+            model.images,
+            model.licence.name,
+            model.repository.removeprefix(GITHUB),
+        )
     return table
 
 

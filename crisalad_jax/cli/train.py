@@ -29,11 +29,11 @@ class Train:
     val_images: pathlib.Path | None = None
     """Folder of the images that a .mat file or .npy lists at --val name; by default beside them."""
     weights: pathlib.Path | None = None
-    """Weights of a whole model to start from; none starts from random ones."""
+    """Weights of a whole model to start from, or a published model's name (`crisalad models`); none
+    starts from random ones."""
     backbone: pathlib.Path | None = None
-    """Start from this backbone alone: a file of this package or a public checkpoint (DINOv2 .pth,
-    Hugging Face Dinov2 .safetensors, DINO-SALAD .ckpt, CricaVPR .pth, BoQ-DINOv2 .pth,
-    MegaLoc .safetensors)."""
+    """Start from this backbone alone: a file of this package, any checkpoint that `convert` reads,
+    or a published model's name, as in dinov2-vitb14."""
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
     recipe: str | None = None

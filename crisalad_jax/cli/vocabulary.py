@@ -4,8 +4,9 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import say
+from crisalad_jax.cli.common import find_given, say
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
@@ -30,9 +31,11 @@ class Vocabulary:
     out: pathlib.Path
     """A .safetensors file."""
     weights: pathlib.Path | None = None
-    """A model of AnyLoc, NetVLAD or a part of yours with a vocabulary, for another one."""
+    """A model of AnyLoc, NetVLAD or a part of yours with a vocabulary, for another one; a file, or
+    a published model's name."""
     backbone: pathlib.Path | None = None
-    """Any checkpoint that `convert` reads, of which the backbone is taken."""
+    """Any checkpoint that `convert` reads, or a published model's name, as in dinov2-vitg14: the
+    backbone is taken."""
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14: the size of --backbone; without one the backbone is random."""
     aggregator: str | None = None
@@ -96,7 +99,7 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
         return start_vocabulary(
             arguments.aggregator or "anyloc",
             arguments.preset,
-            backbone=arguments.backbone,
+            backbone=find_given(arguments.backbone, quiet=arguments.quiet),
             fields=fields,
             image_size=arguments.image_size,
             resize=arguments.resize,
@@ -105,7 +108,8 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
     for name in ("backbone", "aggregator", *fields):
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name}: found beside --weights, expected only one of the two")
-    params, config = load_weights(arguments.weights)
+    weights = find_weights(arguments.weights, quiet=arguments.quiet)
+    params, config = load_weights(weights)
     if not needs_vocabulary(config):
         raise InputError(
             f"{arguments.weights}: found aggregator {config.aggregator.part_name}, expected one "

@@ -42,8 +42,8 @@ def train(
         out: folder of the run; see `fit`.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
         validation_images: folder of the images that a .mat file or .npy lists at `validation` name.
-        weights: a whole model to start from.
-        backbone: a checkpoint to start the backbone from.
+        weights: a whole model to start from, or a published one's name.
+        backbone: a checkpoint to start the backbone from, or a published model's name.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
         num_workers: number of processes that read the training images; 0 for threads.
         shard_state: keep what trains and its moments in shards, one a device.
@@ -70,7 +70,12 @@ def train(
         raise InputError("--val-images: found no --val, expected it beside --val")
 
     def read() -> tuple:
-        initial = read_start(config, weights=weights, backbone=backbone)
+        initial = read_start(
+            config,
+            weights=weights,
+            backbone=backbone,
+            quiet=quiet or not distributed.is_primary(),
+        )
         places = read_places(
             pathlib.Path(data), cities=config.cities, min_images=config.min_images_of_place
         )

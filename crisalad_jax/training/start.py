@@ -5,6 +5,7 @@ import os
 
 import jax
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.loader import OnBadImage
@@ -22,13 +23,16 @@ def read_start(
     *,
     weights: str | os.PathLike[str] | None = None,
     backbone: str | os.PathLike[str] | None = None,
+    quiet: bool = False,
 ) -> Crisalad | None:
     """Read the parameters that a run starts from.
 
     Args:
         config: the run's.
-        weights: a whole model of this package.
-        backbone: a checkpoint of which the backbone alone is taken, public or of this package.
+        weights: a whole model of this package, or a published model's name.
+        backbone: a checkpoint of which the backbone alone is taken, public or of this package, or a
+            published model's name.
+        quiet: no progress bar of a download.
 
     Returns:
         All parameters; None for random ones, with neither file.
@@ -39,10 +43,11 @@ def read_start(
     if weights is not None:
         if backbone is not None:
             raise InputError("--backbone: found beside --weights, expected only one of the two")
-        params, _ = load_weights(weights, expected=config.model)
+        params, _ = load_weights(find_weights(weights, quiet=quiet), expected=config.model)
         return params
     if backbone is None:
         return None
+    backbone = find_weights(backbone, quiet=quiet)
     check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     fresh = init_crisalad(jax.random.key(config.seed), config.model)
     pretrained = read_backbone(backbone, config.model.backbone, fresh.backbone)

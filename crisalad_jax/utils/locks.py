@@ -4,10 +4,12 @@ import contextlib
 import os
 import pathlib
 import socket
+import time
 from collections.abc import Iterator
 
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import told_of
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.signals import held_signals
 from crisalad_jax.utils.temporaries import (
     LOCK,
@@ -18,6 +20,10 @@ from crisalad_jax.utils.temporaries import (
 )
 
 
+class BusyFolderError(InputError):
+    """Another process writes into a folder."""
+
+
 @contextlib.contextmanager
 def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Hold the lock of a folder, which is made if needed, while the block writes into it.
@@ -26,31 +32,60 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
     blocks the next one.
 
     Raises:
-        InputError: another process holds it; the message says which, on which host. Or the folder
-            cannot be made or written to.
+        BusyFolderError: another process holds it; the message says which, on which host.
+        InputError: the folder cannot be made or written to.
     """
     folder = pathlib.Path(folder)
     with contextlib.ExitStack() as stack:
         with held_signals():
             stack.enter_context(made_folder(folder))
             descriptor = _locked(folder, stack)
-            stack.enter_context(in_use(folder / LOCK))
+            stack.enter_context(in_use(_lock_of(folder)))
         _sign(descriptor)
         yield
+
+
+@contextlib.contextmanager
+def next_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold the lock of a folder as `one_writer`, after the process that holds it now.
+
+    Raises:
+        InputError: the folder cannot be made or written to.
+    """
+    with contextlib.ExitStack() as stack:
+        waits = False
+        while True:
+            try:
+                stack.enter_context(one_writer(folder))
+                break
+            except BusyFolderError:
+                if not waits:
+                    tell(f"{folder}: waiting for another process{_holder(_lock_of(folder))}")
+                waits = True
+                time.sleep(_POLL)
+        yield
+
+
+_POLL = 0.2
+"""Seconds between two looks at a lock that another process holds."""
+
+
+def _lock_of(folder: str | os.PathLike[str]) -> pathlib.Path:
+    return pathlib.Path(folder) / LOCK
 
 
 def _locked(folder: pathlib.Path, stack: contextlib.ExitStack) -> int:
     """Lock a folder until the stack is closed; return the descriptor of its lock."""
     import fcntl
 
-    path = folder / LOCK
+    path = _lock_of(folder)
     try:
         while True:
             file = stack.enter_context(path.open("a+", encoding="utf-8"))
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise InputError(
+                raise BusyFolderError(
                     f"{folder}: found another process that writes here{_holder(path)}, "
                     "expected to be the only one"
                 ) from error

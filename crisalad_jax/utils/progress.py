@@ -15,7 +15,7 @@ class Bar:
         """Wrap a task of rich's `progress`; without it nothing is drawn. See `progress_bar`."""
         self._progress, self._task = progress, task
 
-    def advance(self, count: int, note: str = "") -> None:
+    def advance(self, count: float, note: str = "") -> None:
         """Advance by `count` units, and show a short note behind the bar."""
         if self._progress is not None:
             self._progress.update(self._task, advance=count, note=note)
@@ -34,7 +34,9 @@ class _Lines(Bar):
 
 
 @contextlib.contextmanager
-def progress_bar(label: str, total: int, unit: str, *, quiet: bool, done: int = 0) -> Iterator[Bar]:
+def progress_bar(
+    label: str, total: float, unit: str, *, quiet: bool, done: float = 0
+) -> Iterator[Bar]:
     """Show the progress of long work while the block runs; without rich, only its messages.
 
     Args:
@@ -70,4 +72,5 @@ def progress_bar(label: str, total: int, unit: str, *, quiet: bool, done: int = 
         console=rich.console.Console(stderr=True),
     )
     with progress:
-        yield Bar(progress, progress.add_task(label, total=total, completed=done, note=""))
+        task = progress.add_task(label, total=total, completed=done, note="")  # pyright: ignore
+        yield Bar(progress, task)

@@ -104,6 +104,7 @@ def spoil(path: pathlib.Path, how: str) -> None:
 POSITIONAL = {
     ("convert", "source"): "SRC",
     ("convert", "target"): "DST",
+    ("models", "name"): "NAME",
     ("query", "images"): "IMAGE",
 }
 SPOILT = pytest.mark.parametrize("how", ["empty", "cut", "text"])

@@ -8,12 +8,14 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 
 import pytest
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.locks import next_writer, one_writer
+from crisalad_jax.utils.notes import Note
 
 LOCK = ".crisalad-lock"
 REFUSED = "found another process that writes here"
@@ -225,3 +227,22 @@ def test_a_folder_that_cannot_be_locked_is_one_line(tmp_path):
             pass
         assert str(error.value) == f"{tmp_path / name}: {words}"
     assert sorted(os.listdir(tmp_path)) == ["file", "out"]
+
+
+def test_the_next_writer_waits_and_tells_of_the_first(tmp_path):
+    folder = tmp_path / "out"
+    with held(folder) as process:
+        assert process.stdin is not None
+        # Ends the holder while this process waits.
+        threading.Timer(0.3, process.stdin.close).start()
+        words = rf"out: waiting for another process \(process {process.pid} on "
+        second = next_writer(folder)
+        with pytest.warns(Note, match=words):
+            second.__enter__()
+        assert process.wait(10) == 0
+        assert not is_free(folder)
+        second.__exit__(None, None, None)
+    assert is_free(folder)
+    with pytest.raises(ZeroDivisionError), next_writer(folder):
+        raise ZeroDivisionError
+    assert is_free(folder)

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import jax
 import numpy as np
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
@@ -242,7 +243,7 @@ def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
                 f"{', '.join(config.names)}"
             )
         run = method_of(name, config.preset).recipe if config.kind == "compare" else name
-        path = pathlib.Path(file)
+        path = find_weights(file)
         if files.setdefault(run, path) != path:
             raise InputError(
                 f"--weights: found {files[run]} and {path} for {run}, expected one file: methods "

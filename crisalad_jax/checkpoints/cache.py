@@ -1,0 +1,229 @@
+"""The cache of published models: each is downloaded once, checked, and kept as a weight file.
+
+A model has a folder in `cache_folder() / "models"`, with the published file, the file of weights
+that was made of it, and a record of the published file's size and SHA-256 after its first download.
+"""
+
+import contextlib
+import importlib.util
+import os
+import pathlib
+import urllib.parse
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+from crisalad_jax.checkpoints.layouts import LAYOUTS
+from crisalad_jax.checkpoints.published import Published
+from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.utils.checksums import sha256_of
+from crisalad_jax.utils.download import MissingFileError, download
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.locks import next_writer
+from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.version import VERSION
+
+CACHE, OFFLINE, MIRROR = "CRISALAD_CACHE", "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
+"""Variables of the environment: the cache's folder, whether to use no network, and where to look
+for files by their names before their published addresses."""
+_RECORD = "record.json"
+
+
+def cache_folder() -> pathlib.Path:
+    """Return the folder of the cache, which need not be there yet.
+
+    It is what `CRISALAD_CACHE` names, else `crisalad_jax` in the user's cache, which
+    `XDG_CACHE_HOME` may name.
+    """
+    own = os.environ.get(CACHE)
+    if own:
+        return pathlib.Path(own).expanduser()
+    user = os.environ.get("XDG_CACHE_HOME")
+    return (pathlib.Path(user) if user else pathlib.Path.home() / ".cache") / "crisalad_jax"
+
+
+def is_offline() -> bool:
+    """Return whether the environment forbids the network."""
+    return os.environ.get(OFFLINE, "").lower() not in ("", "0", "false", "no")
+
+
+def is_cached(model: Published) -> bool:
+    """Return whether the cache has a published model's weights."""
+    return _weights(model).is_file()
+
+
+def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
+    """Return a published model's weights in the cache; download and convert them the first time.
+
+    Of two processes one downloads, and the other waits for it. Each time the published file's size
+    and time of change are compared with the record, and its SHA-256 where these differ. The weights
+    have a checksum of their own, which `load_weights` checks.
+
+    Args:
+        model: the published model.
+        quiet: no progress bar.
+
+    Returns:
+        A file of this package.
+
+    Raises:
+        InputError: what `download` and `read_checkpoint` raise; the file is not the one that was
+            downloaded first, or no such model; it is not here and the network is forbidden, or it
+            has no address of its own; torch is needed and not installed; or the cache cannot be
+            written to.
+    """
+    if _is_ready(model):
+        return _weights(model)
+    published = _folder(model) / model.file
+    if not published.is_file():
+        _check_obtainable(model)
+    with next_writer(_folder(model)):
+        if not _is_ready(model):
+            _check_torch(model)
+            fresh = not published.is_file()
+            if fresh:
+                _download(model, published, quiet=quiet)
+            _convert(model, published, fresh=fresh)
+    return _weights(model)
+
+
+def _folder(model: Published) -> pathlib.Path:
+    return cache_folder() / "models" / model.name
+
+
+def _weights(model: Published) -> pathlib.Path:
+    return _folder(model) / f"{model.name}.safetensors"
+
+
+def _is_ready(model: Published) -> bool:
+    """Return whether the weights are here, of the published file that the record is of.
+
+    Raises:
+        InputError: the published file was changed.
+    """
+    record, published = _record(model), _folder(model) / model.file
+    if record is None or not _weights(model).is_file():
+        return False
+    if not published.is_file():  # removed for the room
+        return True
+    if record["stamp"] != _stamp(published):  # as after a copy of the folder
+        _check_same(model, record, sha256_of(published))
+        with contextlib.suppress(InputError):  # where the cache is for reading alone
+            write_json(_folder(model) / _RECORD, record | {"stamp": _stamp(published)})
+    return record["version"] == VERSION
+
+
+def _record(model: Published) -> dict[str, Any] | None:
+    """Read what is known of the published file; None before its first download."""
+    path = _folder(model) / _RECORD
+    if not path.exists():
+        return None
+    record = read_json(path, "the record of a download", must=lambda _: True)
+    wrong = not isinstance(record, dict) or {"url", "sha256", "stamp", "version"} - record.keys()
+    if wrong:
+        raise InputError(f"{path}: found no record of a download, expected one, or no such file")
+    return record
+
+
+def _stamp(path: pathlib.Path) -> list[int]:
+    """Return a file's size in bytes and time of change in nanoseconds."""
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _check_same(model: Published, record: Mapping[str, Any], digest: str) -> None:
+    """Check that a published file is the one that was downloaded first."""
+    if digest != record["sha256"]:
+        folder = _folder(model)
+        raise InputError(
+            f"{folder / model.file}: found SHA-256 {digest[:12]}..., expected "
+            f"{str(record['sha256'])[:12]}... as at the first download: the file was changed "
+            f"(without {folder} it is downloaded anew)"
+        )
+
+
+def _check_obtainable(model: Published) -> None:
+    """Check that a file may be downloaded, before a folder is made for it."""
+    if is_offline():
+        raise InputError(
+            f"{model.name}: found none in the cache {cache_folder()}, expected it there: {OFFLINE} "
+            "forbids the network"
+        )
+    if not _addresses(model):
+        raise InputError(
+            f"{model.name}: found no address of its own for {model.file}, expected it as "
+            f"{_folder(model) / model.file} (download it by hand from {model.repository}: "
+            f"{model.note})"
+        )
+    _check_torch(model)
+
+
+def _check_torch(model: Published) -> None:
+    """Check that what reads the file is installed, before it is downloaded."""
+    is_torch = LAYOUTS[model.layout].stored == "torch"
+    if is_torch and importlib.util.find_spec("torch") is None:
+        raise InputError(
+            f"{model.name}: found no torch, expected it to read {model.file}: pip install "
+            "'crisalad-jax[convert]'"
+        )
+
+
+def _addresses(model: Published) -> list[str]:
+    """Return where to look for the file: the mirror, if there is one, and its published address."""
+    addresses = [] if model.url is None else [model.url]
+    mirror = os.environ.get(MIRROR)
+    if not mirror:
+        return addresses
+    if not mirror.startswith(("http://", "https://", "file://")):
+        raise InputError(
+            f"{MIRROR}: found {mirror!r}, expected https://HOST/PATH or file:///FOLDER"
+        )
+    return [f"{mirror.rstrip('/')}/{urllib.parse.quote(model.file)}", *addresses]
+
+
+def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> None:
+    """Download the published file, from the mirror if that has it."""
+    addresses = _addresses(model)
+    for address in addresses:
+        try:
+            download(address, target, label=model.name, quiet=quiet)
+            return
+        except MissingFileError as error:
+            if address == addresses[-1]:
+                raise InputError(
+                    f"{model.name}: {error}; it may have moved: {model.repository}"
+                ) from error
+            tell(f"{address}: found no such file; looking at {model.url}")
+        except InputError as error:
+            raise InputError(f"{model.name}: {error}") from error
+
+
+def _convert(model: Published, published: pathlib.Path, *, fresh: bool) -> None:
+    """Make the weights of the published file, and record both.
+
+    Raises:
+        InputError: the file is not the one of the record, or not the model. Then it is removed, if
+            it is `fresh`: downloaded just now.
+    """
+    record, digest = _record(model), sha256_of(published)
+    try:
+        if record is not None:
+            _check_same(model, record, digest)
+        checkpoint = read_checkpoint(published)
+        parameters = sum(leaf.size for leaf in jax.tree.leaves(checkpoint.params))
+        found = checkpoint.config.descriptor_dim, parameters
+        if found != (model.descriptor, model.parameters):
+            raise InputError(
+                f"{published}: found descriptors of {found[0]} numbers and {found[1]} parameters "
+                f"({checkpoint.layout}), expected {model.descriptor} and {model.parameters}"
+            )
+    except InputError as error:
+        if fresh:
+            published.unlink()
+        raise InputError(f"{model.name}: {error}") from error
+    save_weights(_weights(model), checkpoint.params, checkpoint.config, extras=checkpoint.extras)
+    known = {"url": model.url, "file": model.file, "sha256": digest, "stamp": _stamp(published)}
+    write_json(_folder(model) / _RECORD, known | {"version": VERSION})

@@ -1,0 +1,92 @@
+"""Load a model from a file, or a published one by its name."""
+
+import os
+import pathlib
+import re
+from typing import NamedTuple
+
+from crisalad_jax.checkpoints.cache import cached_weights
+from crisalad_jax.checkpoints.published import PUBLISHED
+from crisalad_jax.checkpoints.published.base import nearest_names
+from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
+
+
+class Model(NamedTuple):
+    """A model's parameters and configuration."""
+
+    params: Crisalad
+    config: ModelConfig
+
+
+def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
+    """Load a model from a file of this package, a public checkpoint, or a published one by name.
+
+    Args:
+        path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
+            DINO-SALAD, CricaVPR or another layout in `docs/methods.md`; torch files need torch. Or
+            the name of a published model, as `crisalad models` lists them: it is downloaded once
+            into the cache.
+        verify: whether to check the bytes of a file of this package against its checksum.
+
+    Returns:
+        (params, config).
+
+    Raises:
+        InputError: what `read_checkpoint` and `find_weights` raise.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import init_crisalad, load, recipe, save_weights
+        >>> config = recipe("tiny").model
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> save_weights(folder / "weights.safetensors", params, config)
+        >>> load(folder / "weights.safetensors").config == config
+        True
+    """
+    checkpoint = read_checkpoint(find_weights(path), verify=verify)
+    return Model(checkpoint.params, checkpoint.config)
+
+
+def find_weights(weights: str | os.PathLike[str], *, quiet: bool = False) -> pathlib.Path:
+    """Return the file that is meant by a path, or by the name of a published model.
+
+    A published model is downloaded the first time, and its licence told each time. A file of the
+    same name in the working directory is taken instead, with a note.
+
+    Args:
+        weights: a path, or a name of `crisalad models`.
+        quiet: no progress bar.
+
+    Returns:
+        The path; for a name, a file of this package in the cache.
+
+    Raises:
+        InputError: what `cached_weights` raises; or there is neither such a file nor such a name.
+            The message has the nearest names. Other missing files are for the reader to tell.
+
+    Example:
+        >>> find_weights("megalok")
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: megalok: found no such file, ...; nearest: megaloc...
+    """
+    path = pathlib.Path(weights)
+    name = os.fspath(weights)
+    model = PUBLISHED.get(name)
+    if os.path.isfile(path):
+        if model is not None:
+            tell(f"{name}: found a file of this name here, and took that, not the published model")
+        return path
+    if model is not None:
+        tell(f"{name}: {model.licence.words} ({model.repository})")
+        return cached_weights(model, quiet=quiet)
+    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name) and not os.path.lexists(path):
+        raise InputError(
+            f"{name}: found no such file, and no published model of this name, expected one of the "
+            f"two (`crisalad models` lists them{nearest_names(name)})"
+        )
+    return path

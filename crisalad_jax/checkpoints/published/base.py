@@ -1,0 +1,113 @@
+"""What is known of a published model: its file's address and layout, its licence, its images."""
+
+import dataclasses
+import difflib
+
+from crisalad_jax.utils.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Licence:
+    """The licence of a repository that publishes a model."""
+
+    name: str
+    """SPDX identifier, or words where the repository has no licence."""
+    commercial: bool | None
+    """Whether it allows commercial use; None where nothing is said."""
+
+    @property
+    def words(self) -> str:
+        """The licence, and what a user has to know of it."""
+        if self.commercial is None:
+            return f"{self.name}: its authors have not said who may use it"
+        return f"licence {self.name}" + ("" if self.commercial else ": no commercial use")
+
+
+MIT = Licence("MIT", commercial=True)
+APACHE = Licence("Apache-2.0", commercial=True)
+BSD = Licence("BSD-3-Clause", commercial=True)
+GPL = Licence("GPL-3.0", commercial=True)
+NO_LICENCE = Licence("no licence file", commercial=None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Published:
+    """A published model."""
+
+    name: str
+    """Name for `--weights` and `load`, of small letters, digits and hyphens."""
+    layout: str
+    """Layout of the file."""
+    descriptor: int
+    """Numbers in a descriptor."""
+    parameters: int
+    """Number of parameters, as `crisalad info` counts them."""
+    images: str
+    """How its authors resize images, in words."""
+    licence: Licence
+    repository: str
+    """Address of the page that publishes the file."""
+    file: str
+    """Name of the file, also at a mirror."""
+    url: str | None
+    """Address of the file; None where it has none of its own, as in a folder or an archive."""
+    paper: str
+    """Authors, venue and year."""
+    note: str = ""
+    """What is not certain of these facts, or has to be done by hand."""
+
+
+PUBLISHED: dict[str, Published] = {}
+"""Published models by name."""
+
+
+def register_published(model: Published) -> None:
+    """Register a published model under its name."""
+    PUBLISHED[model.name] = model
+
+
+GITHUB = "https://github.com/"
+
+
+def github(repository: str) -> str:
+    """Return the address of a repository of GitHub, OWNER/NAME."""
+    return f"{GITHUB}{repository}"
+
+
+def release(repository: str, version: str, file: str) -> str:
+    """Return the address of a file of a release on GitHub."""
+    return f"{github(repository)}/releases/download/{version}/{file}"
+
+
+def drive(identifier: str) -> str:
+    """Return the address at which Google Drive sends a file, of any size, without asking."""
+    host = "https://drive.usercontent.google.com"
+    return f"{host}/download?id={identifier}&export=download&confirm=t"
+
+
+def published_model(name: str) -> Published:
+    """Look a published model up.
+
+    Raises:
+        InputError: there is no such model; the message has the nearest names.
+
+    Example:
+        >>> published_model("megaloc").layout
+        'megaloc'
+    """
+    if name not in PUBLISHED:
+        raise InputError(
+            f"{name}: found no published model of this name, expected one of `crisalad models`"
+            f"{nearest_names(name)}"
+        )
+    return PUBLISHED[name]
+
+
+def nearest_names(name: str) -> str:
+    """Return the published names most like this one, as the end of a message."""
+    plain = name.lower().replace("_", "-")
+    # The first part of a name is its family, which is what a user is most likely to know.
+    near = difflib.get_close_matches(plain, PUBLISHED, n=3, cutoff=0.6)
+    near += [each for each in PUBLISHED if each.startswith(plain.partition("-")[0])]
+    near = list(dict.fromkeys(near))[:3]
+    return f"; nearest: {', '.join(near)}" if near else ""

@@ -1,0 +1,58 @@
+"""`crisalad models`."""
+
+import dataclasses
+import pathlib
+from typing import Annotated, Any
+
+import tyro
+
+from crisalad_jax.checkpoints.cache import cache_folder, is_cached
+from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
+from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
+from crisalad_jax.cli.tables import models_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Models:
+    """List the models that others published, which --weights takes by name, or tell of one."""
+
+    name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
+    """Tell all that is known of this one."""
+    json: pathlib.Path | None = None
+    """File for the list as JSON; - prints it."""
+
+
+def run(arguments: Models) -> None:
+    """Print the table of models or the facts of one, and write them as JSON if asked for."""
+    check_json(arguments.json)
+    talk_beside(arguments.json)
+    if arguments.name is None:
+        models = tuple(PUBLISHED.values())
+        console.print(models_table(models))
+        say(f"{len(models)} models; * in the cache, {cache_folder()}")
+        values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
+    else:
+        values = _facts(published_model(arguments.name))
+        width = max(map(len, values))
+        say("\n".join(f"{name:<{width}}  {_cell(value)}" for name, value in values.items()))
+    if arguments.json is not None:
+        write_or_print_json(arguments.json, values)
+
+
+def _facts(model: Published) -> dict[str, Any]:
+    """Return what is known of a model, by name."""
+    facts = dataclasses.asdict(model)
+    licence = facts.pop("licence")
+    return facts | {
+        "licence": licence["name"],
+        "commercial": licence["commercial"],
+        "cached": is_cached(model),
+    }
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "not said"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:,}" if isinstance(value, int) else value or "-"

@@ -1,0 +1,411 @@
+"""Published models by name: downloaded once, checked ever after, with faults on the way."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+import re
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+import crisalad_jax as cj
+import crisalad_jax.utils.download
+from crisalad_jax.checkpoints import cache
+from crisalad_jax.checkpoints.cache import cache_folder, cached_weights, is_cached
+from crisalad_jax.checkpoints.layouts import public_shapes
+from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
+from crisalad_jax.checkpoints.published.base import MIT, NO_LICENCE
+from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.utils.download import Patience
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
+from tests.conftest import assert_equal
+from tests.file_server import FileServer, file_server
+
+CONFIG = ModelConfig(
+    aggregator="class-token",
+    backbone=ViTConfig(
+        dim=64, depth=1, heads=1, position_grid=3, adapter=AdapterConfig(kind="none")
+    ),
+    cross_image=CrossImageConfig(layers=0),
+)
+ROOT = pathlib.Path(__file__).parents[2]
+FILE = "tiny_model.safetensors"
+# Long enough for loopback on a loaded machine where nothing stalls.
+QUICK = Patience(timeout=5.0, least=1, attempts=2, pause=0.01)
+
+
+def state_bytes(seed: int, config: ModelConfig = CONFIG) -> bytes:
+    """A file as Hugging Face has it, which needs no torch."""
+    generator = np.random.default_rng(seed)
+    shapes = public_shapes(config, "huggingface")
+    arrays = {
+        name: generator.normal(0, 0.02, shape).astype(np.float32) for name, shape in shapes.items()
+    }
+    return safetensors.numpy.save(arrays, metadata={"format": "pt"})
+
+
+DATA = state_bytes(0)
+
+
+@pytest.fixture
+def server() -> Iterator[FileServer]:
+    with file_server() as server:
+        server.files[f"/{FILE}"] = DATA
+        yield server
+
+
+@pytest.fixture
+def model(server: FileServer, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Published:
+    """A published model on the server; the working directory is an empty folder."""
+    for name in (cache.OFFLINE, cache.MIRROR, "http_proxy", "HTTP_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(cache.CACHE, str(tmp_path / "cache"))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    # The stalls and pauses of the default would last for minutes.
+    monkeypatch.setattr(crisalad_jax.utils.download, "Patience", lambda: QUICK)
+    tiny = Published(
+        name="tiny-model",
+        layout="huggingface",
+        descriptor=64,
+        parameters=88_640,
+        images="56 x 56",
+        licence=MIT,
+        repository="https://example.org/tiny",
+        file=FILE,
+        url=server.url(f"/{FILE}"),
+        paper="Nobody, 2026",
+    )
+    monkeypatch.setitem(PUBLISHED, tiny.name, tiny)
+    return tiny
+
+
+def register(model: Published, monkeypatch: pytest.MonkeyPatch, **changes: object) -> Published:
+    changed = dataclasses.replace(model, **changes)  # pyright: ignore
+    monkeypatch.setitem(PUBLISHED, changed.name, changed)
+    return changed
+
+
+def contents(folder: pathlib.Path) -> list[str]:
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def fails(name: str, words: str) -> str:
+    """One line that begins with the model's name."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Note)
+        with pytest.raises(InputError, match=words) as error:
+            cj.load(name)
+    assert "\n" not in str(error.value)
+    assert str(error.value).startswith(f"{name}: ")
+    return str(error.value)
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_a_name_loads_what_its_file_holds_and_downloads_once(model, server, tmp_path):
+    assert not is_cached(model)
+    (tmp_path / FILE).write_bytes(DATA)
+    expected = read_checkpoint(tmp_path / FILE)
+    for _ in range(2):
+        loaded = cj.load("tiny-model")
+        assert loaded.config == expected.config == CONFIG
+        assert_equal(loaded.params, expected.params)
+    assert [path for path, _ in server.asked] == [f"/{FILE}"]
+    assert is_cached(model)
+    folder = tmp_path / "cache" / "models" / "tiny-model"
+    assert contents(folder) == ["record.json", "tiny-model.safetensors", FILE]
+    record = json.loads((folder / "record.json").read_text())
+    assert record["sha256"] == hashlib.sha256(DATA).hexdigest()
+    assert record["stamp"][0] == len(DATA)
+    assert (record["url"], record["file"]) == (model.url, FILE)
+
+
+@pytest.mark.parametrize(
+    ("licence", "words"),
+    [
+        (MIT, "tiny-model: licence MIT (https://example.org/tiny)"),
+        (
+            Licence("CC-BY-NC-4.0", commercial=False),
+            "tiny-model: licence CC-BY-NC-4.0: no commercial use (https://example.org/tiny)",
+        ),
+        (
+            NO_LICENCE,
+            "tiny-model: no licence file: its authors have not said who may use it "
+            "(https://example.org/tiny)",
+        ),
+    ],
+)
+def test_the_licence_is_told_each_time(model, monkeypatch, licence, words):
+    register(model, monkeypatch, licence=licence)
+    for _ in range(2):
+        with pytest.warns(Note, match=f"^{re.escape(words)}$"):
+            cj.load("tiny-model")
+
+
+def test_a_file_of_the_same_name_is_taken(model, server, tmp_path):
+    pathlib.Path("tiny-model").write_bytes(state_bytes(1))
+    with pytest.warns(Note, match="tiny-model: found a file of this name here"):
+        assert find_weights("tiny-model") == pathlib.Path("tiny-model")
+    pathlib.Path("tiny-model").unlink()
+    pathlib.Path("tiny-model").mkdir()  # no file of weights
+    with pytest.warns(Note, match="licence MIT"):
+        assert find_weights("tiny-model").parent.parent == tmp_path / "cache" / "models"
+    assert find_weights("folder/none.safetensors") == pathlib.Path("folder/none.safetensors")
+
+
+@pytest.mark.usefixtures("model")
+def test_an_unknown_name_is_told_with_the_nearest(server):
+    fails("tiny-modell", r"found no such file, and no published model .*nearest: tiny-model\)$")
+    assert server.asked == []
+
+
+def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
+    monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path / "own"))
+    assert cache_folder() == tmp_path / "own"
+    monkeypatch.delenv("CRISALAD_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache_folder() == tmp_path / "xdg" / "crisalad_jax"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert cache_folder() == tmp_path / "home" / ".cache" / "crisalad_jax"
+
+
+# Faults. Those of single answers are in tests/utils/test_download.py.
+
+
+def test_faults_leave_no_model(model, server, tmp_path):
+    server.statuses = [404]
+    fails("tiny-model", "found HTTP 404 .*it may have moved: https://example.org/tiny")
+    server.statuses = [500, 503]
+    fails("tiny-model", "found HTTP 503")
+    server.files[f"/{FILE}"] = b"<html>quota</html>"
+    fails("tiny-model", "found a page of HTML")
+    assert not (tmp_path / "cache").exists()
+    server.files[f"/{FILE}"], server.length = DATA, len(DATA) + 1
+    fails("tiny-model", r"tiny_model\.safetensors: found .*, expected the whole file")
+    assert not is_cached(model)
+    server.length = None
+    with pytest.warns(Note, match="licence MIT"):
+        assert cj.load("tiny-model").config == CONFIG
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (DATA[:-100], "not a whole safetensors file"),
+        (b"", "not a whole safetensors file"),
+        (safetensors.numpy.save({"x": np.zeros(3, np.float32)}), "found no checkpoint that we"),
+        (
+            state_bytes(
+                0,
+                dataclasses.replace(
+                    CONFIG, backbone=dataclasses.replace(CONFIG.backbone, dim=128, heads=2)
+                ),
+            ),
+            r"found descriptors of 128 numbers and \d+ parameters \(huggingface\), expected 64 and",
+        ),
+    ],
+    ids=["cut", "empty", "of no layout", "of another size"],
+)
+def test_a_file_that_is_not_the_model_is_not_kept(model, server, tmp_path, data, words):
+    server.files[f"/{FILE}"] = data  # a server that says it is whole
+    fails("tiny-model", words)
+    assert not (tmp_path / "cache").exists()
+    server.files[f"/{FILE}"] = DATA
+    with pytest.warns(Note, match="licence MIT"):
+        cj.load("tiny-model")
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_the_server_has_another_file_later(model, server, tmp_path):
+    cj.load("tiny-model")
+    folder = tmp_path / "cache" / "models" / "tiny-model"
+    for name in (FILE, "tiny-model.safetensors"):
+        (folder / name).unlink()
+    server.files[f"/{FILE}"], server.etag = state_bytes(1), '"2"'
+    fails("tiny-model", "found SHA-256 .*expected .*as at the first download: the file was changed")
+    assert contents(folder) == ["record.json"]
+    server.files[f"/{FILE}"] = DATA
+    assert cj.load("tiny-model").config == CONFIG
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_changed_bytes_in_the_cache_are_told(model, server, tmp_path):
+    weights = cached_weights(model, quiet=True)
+    published = weights.with_name(FILE)
+    for path, words in ((published, "the file was changed"), (weights, "other bytes than were")):
+        whole, status = path.read_bytes(), path.stat()
+        path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        with pytest.raises(InputError, match=words) as error:
+            cj.load("tiny-model")
+        assert str(path) in str(error.value)
+        path.write_bytes(whole)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+        cj.load("tiny-model")
+    record = weights.with_name("record.json")
+    record.write_text(record.read_text().replace(model.file, "others"))
+    with pytest.raises(InputError, match=r"record\.json: found other bytes"):
+        cj.load("tiny-model")
+    assert len(server.asked) == 1
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_what_can_be_made_again_is(model, server):
+    weights = cached_weights(model, quiet=True)
+    published = weights.with_name(FILE)
+    os.utime(published)  # as a copy of the folder may have it
+    before = weights.stat().st_mtime_ns
+    assert cached_weights(model).stat().st_mtime_ns == before
+    weights.unlink()
+    assert cached_weights(model).read_bytes()  # converted anew
+    published.unlink()  # for its room
+    assert cj.load("tiny-model").config == CONFIG
+    assert len(server.asked) == 1
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_another_version_converts_anew(model, server, monkeypatch):
+    weights = cached_weights(model, quiet=True)
+    before = weights.stat().st_mtime_ns
+    monkeypatch.setattr(cache, "VERSION", "9.9")
+    assert cached_weights(model).stat().st_mtime_ns > before
+    assert json.loads(weights.with_name("record.json").read_text())["version"] == "9.9"
+    assert len(server.asked) == 1
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_offline_only_the_cache_is_used(model, server, monkeypatch, tmp_path):
+    monkeypatch.setenv("CRISALAD_OFFLINE", "1")
+    fails("tiny-model", "found none in the cache .*CRISALAD_OFFLINE forbids the network")
+    assert not (tmp_path / "cache").exists()
+    monkeypatch.setenv("CRISALAD_OFFLINE", "0")
+    cj.load("tiny-model")
+    monkeypatch.setenv("CRISALAD_OFFLINE", "1")
+    cj.load("tiny-model")
+    assert len(server.asked) == 1
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.parametrize("kind", ["http", "file"])
+def test_a_mirror_is_asked_first(model, server, monkeypatch, tmp_path, kind):
+    (tmp_path / "files").mkdir()
+    if kind == "http":
+        monkeypatch.setenv("CRISALAD_MIRROR", server.url("/mirror/"))
+    else:
+        monkeypatch.setenv("CRISALAD_MIRROR", (tmp_path / "files").as_uri())
+    with pytest.warns(Note, match=f"{FILE}: found no such file; looking at {model.url}"):
+        cj.load("tiny-model")
+    published = cached_weights(model).with_name(FILE)
+    for path in published.parent.iterdir():
+        path.unlink()
+    server.files = {f"/mirror/{FILE}": DATA}
+    (tmp_path / "files" / FILE).write_bytes(DATA)
+    server.asked.clear()
+    with pytest.warns(Note, match="licence MIT"):
+        cj.load("tiny-model")
+    assert [path for path, _ in server.asked] == ([f"/mirror/{FILE}"] if kind == "http" else [])
+
+
+def test_a_mirror_that_is_no_address(model, server, monkeypatch):
+    monkeypatch.setenv("CRISALAD_MIRROR", "/folder")
+    with pytest.raises(InputError, match=r"CRISALAD_MIRROR: found '/folder', expected https://"):
+        cached_weights(model)
+    assert server.asked == []
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_a_file_without_an_address_is_put_there_by_hand(model, monkeypatch, tmp_path):
+    register(model, monkeypatch, url=None, note="one of a folder")
+    path = tmp_path / "cache" / "models" / "tiny-model" / FILE
+    error = fails("tiny-model", "found no address of its own .*one of a folder")
+    assert str(path) in error
+    path.parent.mkdir(parents=True)
+    path.write_bytes(DATA[:-1])
+    fails("tiny-model", "not a whole safetensors file")
+    assert path.exists()  # the user's
+    path.write_bytes(DATA)
+    assert cj.load("tiny-model").config == CONFIG
+
+
+def test_torch_is_asked_for_before_a_download(model, server, monkeypatch, tmp_path):
+    register(model, monkeypatch, layout="dinov2", file="tiny.pth")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setattr(cache.importlib.util, "find_spec", lambda name: None)
+    fails("tiny-model", r"found no torch, expected it to read tiny\.pth: pip install")
+    assert server.asked == []
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.usefixtures("model")
+def test_a_file_in_place_of_the_cache(tmp_path):
+    (tmp_path / "cache").write_text("")
+    with (
+        pytest.warns(Note, match="licence MIT"),
+        pytest.raises(InputError, match="cannot make this folder: "),
+    ):
+        cj.load("tiny-model")
+
+
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_of_two_at_once_one_downloads(model, server):
+    server.waits = 0.3
+    found: list[pathlib.Path] = []
+    threads = [
+        threading.Thread(target=lambda: found.append(cached_weights(model, quiet=True)))
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(server.asked) == 1
+    assert found == [cached_weights(model)] * 2
+
+
+PROGRAM = """
+import dataclasses, sys
+from crisalad_jax.checkpoints.cache import cached_weights
+from crisalad_jax.checkpoints.published import PUBLISHED
+model = PUBLISHED["megaloc"]
+print("ready", flush=True)
+cached_weights(dataclasses.replace(model, url=sys.argv[1], file=sys.argv[2]), quiet=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+def test_a_killed_download_is_gone_on_with_by_the_next_process(
+    model, server, monkeypatch, tmp_path
+):
+    server.stalls = 1
+    program = [sys.executable, "-c", PROGRAM, model.url, FILE]
+    folder = tmp_path / "cache" / "models" / "megaloc"
+    with subprocess.Popen(program, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        part = folder / f"{FILE}.part"
+        for _ in range(500):
+            if part.exists() and part.stat().st_size == 10:
+                break
+            time.sleep(0.02)
+        process.kill()
+    assert not (folder / FILE).exists()
+    again = dataclasses.replace(model, name="megaloc")
+    assert cached_weights(again, quiet=True).is_file()
+    assert [wanted for _, wanted in server.asked] == [None, "bytes=10-"]
+    assert (folder / FILE).read_bytes() == DATA

@@ -1,0 +1,169 @@
+"""The table of published models against the layouts of their files."""
+
+import dataclasses
+import functools
+import json
+import pathlib
+import re
+from urllib.parse import urlsplit
+
+import jax
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.layouts import LAYOUTS, infer
+from crisalad_jax.checkpoints.published import PUBLISHED, published_model
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vgg import VggConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.utils.errors import InputError
+
+KEY = jax.random.key(0)
+PARITY = pathlib.Path(__file__).parents[2] / "parity"
+# The stored names and shapes of published files, by the models that have them.
+STORED = {
+    **{name: f"layouts/{name.replace('-', '_')}" for name in PUBLISHED if "dinov2-vit" in name},
+    "salad": "layouts/dino_salad",
+    "cricavpr": "layouts/CricaVPR",
+    "salad-cm": "zoo/layouts/salad_cm",
+    "megaloc": "zoo/layouts/megaloc",
+    "megaloc-v1": "zoo/layouts/megaloc_v1_torch",
+    "boq-dinov2": "zoo/layouts/boq_dinov2_12288",
+    "boq-resnet50": "zoo/layouts/boq_resnet50_16384",
+    "dino-mix": "zoo/layouts/dinomix_vitb14",
+    "supervlad": "zoo/layouts/supervlad",
+    "supervlad-crossimage": "zoo/layouts/supervlad_crossimage",
+    "supervlad-1-cluster": "zoo/layouts/supervlad",
+    "cosplace-vgg16-512": "zoo/layouts/cosplace_vgg16_512",
+    "cosplace-resnet18-512": "zoo/layouts/cosplace_resnet18_512",
+    "cosplace-resnet50-2048": "zoo/layouts/cosplace_resnet50_2048",
+    "mixvpr-4096": "zoo/layouts/mixvpr_resnet50_4096",
+    "conv-ap-4096": "zoo/layouts/convap_resnet50_4096",
+    "netvlad-nanne": "zoo/layouts/netvlad_vgg16_nanne",
+    "netvlad-hloc": "zoo/layouts/netvlad_vgg16_hloc_mat",
+    "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc_mat",
+    "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
+    "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
+    "transvpr-msls": "zoo/layouts/transvpr",
+    "transvpr-pitts30k": "zoo/layouts/transvpr",
+}
+CHANGED = {"supervlad-1-cluster": {"aggregation.conv.weight": (3, 768, 1, 1)}}
+"""Shapes that differ from the stored ones: the README's one cluster and two ghosts."""
+SIZED = {
+    **{
+        f"mixvpr-{c * r}": ("mixvpr-4096", {"channels": c, "rows": r})
+        for c, r in ((64, 2), (256, 2))
+    },
+    **{f"conv-ap-{4 * c}": ("conv-ap-4096", {"channels": c}) for c in (128, 512, 2048)},
+}
+"""Models without stored shapes: the ones that they resemble, and the settings of their heads."""
+
+
+@functools.cache
+def stored(name: str) -> tuple[str, ModelConfig]:
+    """The layout and configuration of a published file."""
+    shapes = json.loads((PARITY / f"{STORED[name]}.json").read_text(encoding="utf-8"))
+    plain = {key.rpartition("/")[2].removeprefix("module."): shapes[key] for key in shapes}
+    plain |= CHANGED.get(name, {})
+    blank = {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in plain.items()}
+    return infer(blank, source=name)
+
+
+def parameters(config: ModelConfig) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(config)))
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_a_models_facts_are_those_of_its_file(name):
+    model = published_model(name)
+    layout, config = stored(name)
+    found = (model.layout, model.descriptor, model.parameters)
+    assert found == (layout, config.descriptor_dim, parameters(config))
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_another_size_has_its_own_facts(name):
+    model = published_model(name)
+    like, settings = SIZED[name]
+    layout, config = stored(like)
+    config = dataclasses.replace(
+        config, aggregator=dataclasses.replace(config.aggregator, **settings)
+    )
+    found = (model.layout, model.descriptor, model.parameters)
+    assert found == (layout, config.descriptor_dim, parameters(config))
+
+
+def test_cosplaces_sizes_differ_in_their_linear_layer():
+    of_family = [name for name in PUBLISHED if name.startswith(("cosplace-", "eigenplaces-"))]
+    assert len(of_family) == 30 + 11
+    backbones = {
+        "vgg16": VggConfig(),
+        **{f"resnet{layers}": ResNetConfig(layers=layers) for layers in (18, 50, 101, 152)},
+    }
+    counts = {
+        name: sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(backbone.init, KEY)))
+        for name, backbone in backbones.items()
+    }
+    for name in of_family:
+        model = published_model(name)
+        _, backbone, size = name.split("-")
+        linear = (backbones[backbone].dim + 1) * int(size)
+        assert model.descriptor == int(size)
+        assert model.parameters == counts[backbone] + 1 + linear
+
+
+def test_patch_netvlads_sizes_differ_in_their_projection():
+    for name, (like, clusters) in {
+        "mapillary": ("mapillary-4096", 16),
+        "pittsburgh": ("pittsburgh-512", 64),
+    }.items():
+        known = published_model(f"patch-netvlad-{like}")
+        rows = clusters * 512 + 1
+        for size in (128, 512, 4096):
+            model = published_model(f"patch-netvlad-{name}-{size}")
+            assert model.descriptor == size
+            assert model.parameters == known.parameters + rows * (size - known.descriptor)
+
+
+def test_every_model_is_checked_above():
+    families = ("cosplace-", "eigenplaces-", "patch-netvlad-")
+    others = {name for name in PUBLISHED if not name.startswith(families)}
+    assert others <= STORED.keys() | SIZED.keys()
+
+
+def test_the_table_is_sound():
+    for name, model in PUBLISHED.items():
+        assert model.name == name
+        assert re.fullmatch("[a-z0-9][a-z0-9-]*", name)
+        assert model.layout in LAYOUTS
+        assert urlsplit(model.repository).scheme == "https"
+        assert model.url is None or urlsplit(model.url).scheme == "https"
+        assert model.url is not None or model.note
+        # In a model's folder of the cache stand both this file and the weights made of it.
+        assert pathlib.PurePath(model.file).name == model.file != f"{name}.safetensors"
+        assert model.images
+        assert model.paper
+    files = [model.file for model in PUBLISHED.values()]
+    assert len(set(files)) == len(files)  # a mirror has them in one folder
+    urls = [model.url for model in PUBLISHED.values() if model.url is not None]
+    assert len(set(urls)) == len(urls)
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("megalok", "megaloc, megaloc-v1"),
+        ("MegaLoc", "megaloc, megaloc-v1"),
+        ("dinov2_vitb14", "dinov2-vitb14, "),
+        ("supervlad-cross-image", "supervlad-crossimage, "),
+    ],
+)
+def test_an_unknown_name_is_told_with_the_nearest(name, nearest):
+    with pytest.raises(InputError, match=f"^{name}: found no published model .*nearest: {nearest}"):
+        published_model(name)
+
+
+def test_a_name_like_no_other_has_no_nearest():
+    with pytest.raises(InputError, match=r"expected one of `crisalad models`$"):
+        published_model("zzz")

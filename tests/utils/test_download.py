@@ -1,0 +1,260 @@
+"""Downloads from a server on loopback that fails as real ones do."""
+
+import os
+import pathlib
+import resource
+import shutil
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from crisalad_jax.utils.download import MissingFileError, Patience, download
+from crisalad_jax.utils.errors import InputError
+from tests.file_server import FileServer, file_server
+
+DATA = np.random.default_rng(0).bytes(300_000)
+OTHER = np.random.default_rng(1).bytes(300_000)
+# Long enough for loopback on a loaded machine where nothing stalls.
+QUICK = Patience(timeout=5.0, least=1, attempts=3, progress=2**20, pause=0.01)
+
+
+@pytest.fixture
+def server() -> Iterator[FileServer]:
+    with file_server() as server:
+        server.files["/file"] = DATA
+        yield server
+
+
+@pytest.fixture(autouse=True)
+def _no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.upper(), raising=False)
+
+
+def fetch(server: FileServer, folder: pathlib.Path, patience: Patience = QUICK) -> pathlib.Path:
+    download(server.url("/file"), folder / "here", label="file", quiet=True, patience=patience)
+    assert sorted(os.listdir(folder)) == ["here"]
+    return folder / "here"
+
+
+def fails(
+    server: FileServer, folder: pathlib.Path, words: str, patience: Patience = QUICK
+) -> InputError:
+    with pytest.raises(InputError, match=words) as error:
+        fetch(server, folder, patience)
+    assert not (folder / "here").exists()
+    assert str(error.value).startswith(f"{server.url('/file')}: ")
+    assert "\n" not in str(error.value)
+    return error.value
+
+
+def cut_short(server: FileServer, folder: pathlib.Path, size: int) -> None:
+    """Leave the beginning of a file, as if the program had ended there."""
+    server.cuts = [size]
+    fails(server, folder, f"found {size:,} bytes of 300,000", Patience(attempts=1))
+    assert (folder / "here.part").read_bytes() == DATA[:size]
+    server.asked.clear()
+
+
+def test_a_whole_file_is_asked_for_once(server, tmp_path):
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", None)]
+
+
+@pytest.mark.parametrize("known_by", ["etag", "modified"])
+def test_a_cut_is_gone_on_from(server, tmp_path, known_by):
+    if known_by == "modified":
+        server.etag, server.modified = None, "Mon, 01 Jan 2024 00:00:00 GMT"
+    server.cuts = [100_000, 50_000]
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", None), ("/file", "bytes=100000-"), ("/file", "bytes=150000-")]
+
+
+def test_the_next_call_goes_on(server, tmp_path):
+    cut_short(server, tmp_path, 200_000)
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", "bytes=200000-")]
+
+
+def test_a_whole_unfinished_file_is_not_asked_for(server, tmp_path):
+    cut_short(server, tmp_path, 200_000)
+    with (tmp_path / "here.part").open("ab") as file:
+        file.write(DATA[200_000:])
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == []
+
+
+def test_a_server_without_ranges_starts_again(server, tmp_path):
+    server.ranges, server.cuts = False, [100_000]
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert [path for path, _ in server.asked] == ["/file", "/file"]
+
+
+def test_without_tag_and_time_nothing_is_gone_on_with(server, tmp_path):
+    server.etag, server.cuts = None, [100_000]
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", None), ("/file", None)]
+
+
+def test_a_weak_tag_does_not_count(server, tmp_path):
+    server.etag, server.cuts = 'W/"1"', [100_000]
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", None), ("/file", None)]
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+def test_a_changed_file_starts_again(server, tmp_path, obeys):
+    cut_short(server, tmp_path, 100_000)
+    server.files["/file"], server.etag = OTHER, '"2"'
+    if not obeys:  # a server that sends a part of the other file, whatever the condition
+        server.modified = '"1"'
+    assert fetch(server, tmp_path).read_bytes() == OTHER
+
+
+def test_a_file_of_another_length_starts_again(server, tmp_path):
+    cut_short(server, tmp_path, 100_000)
+    server.files["/file"] = OTHER[:250_000]
+    assert fetch(server, tmp_path).read_bytes() == OTHER[:250_000]
+
+
+def test_a_file_shorter_than_its_beginning_starts_again(server, tmp_path):
+    cut_short(server, tmp_path, 100_000)
+    server.files["/file"] = OTHER[:50_000]
+    assert fetch(server, tmp_path).read_bytes() == OTHER[:50_000]
+
+
+def test_a_note_that_is_damaged_starts_again(server, tmp_path):
+    cut_short(server, tmp_path, 100_000)
+    (tmp_path / "here.part.json").write_text("{")
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", None)]
+
+
+def test_a_length_that_never_comes(server, tmp_path):
+    server.length = 400_000
+    fails(server, tmp_path, r"found .*, expected the whole file \(attempts: 3;")
+    assert len(server.asked) >= 3
+
+
+def test_progress_begins_the_count_anew(server, tmp_path):
+    server.cuts = [50_000] * 5
+    patience = Patience(attempts=2, progress=50_000, pause=0.01)
+    assert fetch(server, tmp_path, patience).read_bytes() == DATA
+
+
+def test_no_such_file_is_told_at_once(server, tmp_path):
+    server.files.clear()
+    error = fails(server, tmp_path, "found HTTP 404 Not Found, expected the file")
+    assert isinstance(error, MissingFileError)
+    assert os.listdir(tmp_path) == []
+    assert len(server.asked) == 1
+
+
+def test_passing_faults_are_tried_again(server, tmp_path):
+    server.statuses = [503, 429]
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    server.statuses = [500] * 3
+    (tmp_path / "here").unlink()
+    fails(server, tmp_path, "found HTTP 500 Internal Server Error, .*attempts: 3")
+
+
+def test_a_refusal_is_told_at_once(server, tmp_path):
+    server.statuses = [403]
+    fails(server, tmp_path, "found HTTP 403 Forbidden")
+    assert len(server.asked) == 1
+
+
+def test_a_stalled_server_is_given_up_and_asked_again(server, tmp_path):
+    server.stalls = 1
+    patience = Patience(timeout=0.3, attempts=2, pause=0.01)
+    assert fetch(server, tmp_path, patience).read_bytes() == DATA
+    assert server.asked[1] == ("/file", "bytes=10-")
+
+
+def test_a_server_that_only_stalls(server, tmp_path):
+    server.stalls = 9
+    patience = Patience(timeout=0.2, attempts=2, pause=0.01)
+    fails(server, tmp_path, "found a broken connection .*attempts: 2", patience)
+
+
+def test_a_server_that_crawls(server, tmp_path):
+    server.crawls = True
+    patience = Patience(timeout=0.2, least=2**14, attempts=1)
+    fails(server, tmp_path, r"found \d+ bytes in 0 s", patience)
+
+
+def test_a_page_in_place_of_the_file(server, tmp_path):
+    server.files["/file"] = b"\n<!DOCTYPE html><title>Quota exceeded</title>"
+    fails(server, tmp_path, "found a page of HTML, expected the file here")
+    server.files["/file"], server.kind = DATA, "text/html; charset=utf-8"
+    fails(server, tmp_path, "found a page of HTML")
+    assert os.listdir(tmp_path) == []
+    assert len(server.asked) == 2
+
+
+def test_redirects_are_followed_with_the_range(server, tmp_path):
+    server.files["/there"] = server.files.pop("/file")
+    server.moved["/file"] = "/there"
+    cut_short(server, tmp_path, 100_000)
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", "bytes=100000-"), ("/there", "bytes=100000-")]
+
+
+def test_a_proxy_of_the_environment_is_used(server, tmp_path, monkeypatch):
+    monkeypatch.setenv("http_proxy", server.url(""))
+    address = "http://models.invalid/file"
+    server.files[address] = OTHER
+    download(address, tmp_path / "here", label="file", quiet=True, patience=QUICK)
+    assert (tmp_path / "here").read_bytes() == OTHER
+    assert server.asked == [(address, None)]
+
+
+def test_no_server(tmp_path):
+    with file_server() as gone:
+        pass
+    patience = Patience(attempts=2, pause=0.01)
+    fails(gone, tmp_path, "found no answer .*attempts: 2", patience)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_as_address(tmp_path):
+    (tmp_path / "to").mkdir()
+    for path in (tmp_path / "none", tmp_path):
+        with pytest.raises(MissingFileError, match="found no such file"):
+            download(path.as_uri(), tmp_path / "to" / "here", label="", quiet=True)
+    (tmp_path / "there").write_bytes(DATA)
+    download((tmp_path / "there").as_uri(), tmp_path / "to" / "here", label="", quiet=True)
+    assert (tmp_path / "to" / "here").read_bytes() == DATA
+    assert os.listdir(tmp_path / "to") == ["here"]
+
+
+def test_an_address_that_is_none(tmp_path):
+    with pytest.raises(InputError, match=r"nowhere: found no address .*, expected one"):
+        download("nowhere", tmp_path / "here", label="", quiet=True)
+
+
+def test_a_disk_without_room_is_told_before(server, tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    with pytest.raises(InputError, match="found 1,000 bytes free on the disk, expected 300,000"):
+        fetch(server, tmp_path)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_disk_that_gets_full_leaves_nothing(server, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(InputError, match="here: cannot be written: File too large"):
+            fetch(server, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_bar_shows_megabytes(server, tmp_path, capfd):
+    download(server.url("/file"), tmp_path / "here", label="a model", patience=QUICK)
+    assert "a model" in (shown := capfd.readouterr().err)
+    assert "MB/s" in shown
