@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data import loader
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
@@ -100,6 +101,19 @@ def test_training_batches_hold_the_images_that_the_epoch_drew(places):
         assert batch.valid.all()
         for image, index in zip(batch.images, images, strict=True):
             np.testing.assert_array_equal(image, plain(places.path(index)))
+
+
+def test_training_resizes_bytes_to_one_size_by_the_models_filter(places):
+    how = PreprocessingConfig(
+        size_rule="native", filter="bicubic", antialias=False, pixels="floats"
+    )
+    batch, *_ = train(places, preprocessing=how)
+    assert batch.images.dtype == np.uint8
+    for image, index in zip(batch.images, batch.indices, strict=True):
+        expected = resize_image(
+            read_image(places.path(index)), SIZE, filter="bicubic", antialias=False
+        )
+        np.testing.assert_array_equal(image, expected)
 
 
 @pytest.mark.parametrize("augmentation", [NoAugmentation(), LIGHT, RandAugmentConfig()])
@@ -203,6 +217,7 @@ def test_batches_of_any_size_are_the_images_one_by_one(places, batch_size, threa
 SLOW_READER = """
 import sys, time
 import numpy as np
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data import loader
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.places import read_places

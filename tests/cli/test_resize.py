@@ -1,0 +1,63 @@
+"""The words of --resize at the verbs, and what these say of images."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.cli import renamed
+from crisalad_jax.retrieval.extract import extract
+from tests.cli.test_cli import fails, succeeds
+
+
+def test_words_change_what_is_extracted_and_are_told(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    weights, out = shared / "weights.safetensors", tmp_path / "out.npy"
+    images = shared / "town" / "images" / "test" / "database"
+    said = succeeds(
+        capfd,
+        *("extract", "--weights", weights, "--images", images, "--out", out, "--batch-size", 4),
+        *("--resize", "bicubic", "floats", "--quiet"),
+    )
+    assert "images at 42 x 56, bicubic, antialiased, on floats" in said
+    record = json.loads((tmp_path / "out.npy.json").read_text())
+    assert record["model"]["preprocessing"]["filter"] == "bicubic"
+    params, config = load_weights(weights)
+    config = config.resized(None, ["bicubic", "floats"])
+    expected = extract(params, config, images, batch_size=4, quiet=True).descriptors
+    # The same program on the same numbers.
+    np.testing.assert_allclose(np.load(out), expected, atol=1e-6)
+
+
+def test_info_tells_how_images_are_resized(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    weights, out = shared / "weights.safetensors", tmp_path / "info.json"
+    words = "longer side at most 56, area, on bytes, rounded to multiples of 14"
+    said = succeeds(
+        capfd, "info", "--weights", weights, "--json", out, "--resize", "longer-side", "area"
+    )
+    assert words in said
+    told = json.loads(out.read_text())
+    assert told["images"] == words
+    assert told["preprocessing"]["size_rule"] == "longer-side"
+
+
+def test_wrong_words_are_one_line(shared: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
+    info = ("info", "--weights", shared / "weights.safetensors", "--resize")
+    fails(capfd, *info, "cubic", words=("--resize: found 'cubic', expected some of fixed",))
+    fails(capfd, *info, "bytes", "floats", words=("expected one of bytes, floats",))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("imagenet", "mean-deviation"), ("local-contrast", "local-contrast")]
+)
+def test_the_old_flag_of_normalisation(old: str, new: str) -> None:
+    told: list[str] = []
+    flag = "--model.preprocessing.normalisation"
+    assert renamed.today(["--model.normalisation", old], told.append) == [flag, new]
+    assert renamed.today([f"--model.normalisation={old}"], told.append) == [f"{flag}={new}"]
+    assert told == [f"--model.normalisation is {flag} now"] * 2

@@ -1,0 +1,187 @@
+"""Photographs as each model takes them: chains of floats, and sizes that differ."""
+
+import dataclasses
+import pathlib
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.checkpoints.export import ExportConfig, export_model
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import describe
+from crisalad_jax.retrieval.extract import extract
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.query import query
+from crisalad_jax.retrieval.photographs import photograph_batches, prepare_image
+from crisalad_jax.retrieval.reranking.stage import Reranking
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import MODEL, random_params
+
+MEAN, DEVIATION = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+SHAPES = [(42, 56), (42, 56), (56, 42), (56, 42), (56, 42), (40, 60), (42, 56)]
+"""The last but one is rounded to the size of the last: 42 x 56."""
+ALONE = dataclasses.replace(
+    MODEL,
+    backbone=ViTConfig(dim=32, depth=1, heads=2, position_grid=3),
+    aggregator="gem",
+    cross_image=CrossImageConfig(layers=0),
+)
+NATIVE = ALONE.resized(None, ["native"])
+
+
+@pytest.fixture
+def folder(tmp_path: pathlib.Path) -> pathlib.Path:
+    generator = np.random.default_rng(0)
+    (tmp_path / "images").mkdir()
+    for number, shape in enumerate(SHAPES):
+        image = generator.integers(0, 256, (*shape, 3), dtype=np.uint8)
+        assert cv2.imwrite(str(tmp_path / "images" / f"{number}.png"), image)
+    return tmp_path / "images"
+
+
+def paths_in(folder: pathlib.Path) -> list[pathlib.Path]:
+    return sorted(folder.glob("*.png"))
+
+
+def torch_chain(path: pathlib.Path, *sizes: tuple[int, int], mode: str) -> np.ndarray:
+    """As public wrappers do: normalise, then resize, once or twice."""
+    pixels = torch.from_numpy(read_image(path)).float() / 255
+    tensor = ((pixels - MEAN) / DEVIATION).permute(2, 0, 1)[None]
+    for size in sizes:
+        tensor = torch.nn.functional.interpolate(
+            tensor, size, mode=mode, antialias=True, align_corners=False
+        )
+    return tensor[0].permute(1, 2, 0).numpy()
+
+
+def test_floats_are_those_of_a_wrapper_that_normalises_first(folder: pathlib.Path) -> None:
+    config = ALONE.resized((28, 42), ["bicubic", "floats"])
+    cache = ImageCache()
+    for _ in range(2):
+        first, second = photograph_batches(config, paths_in(folder), batch_size=4, cache=cache)
+        assert first.images.dtype == np.float32
+        assert second.valid.tolist() == [True, True, True, False]
+        found = np.concatenate([first.images, second.images[:3]])
+        expected = [torch_chain(path, (28, 42), mode="bicubic") for path in paths_in(folder)]
+        # Float32 of up to 3 over filters of 12 taps; a bilinear filter differs by 1.
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_a_size_between_patches_is_resized_again_as_megaloc_does(folder: pathlib.Path) -> None:
+    config = ALONE.resized((50, 44), ["floats", "round"])
+    assert config.input_size == (56, 42)
+    path = paths_in(folder)[0]
+    expected = torch_chain(path, (50, 44), (56, 42), mode="bilinear")
+    found = prepare_image(read_image(path), config)
+    np.testing.assert_allclose(found, expected, atol=2e-5)  # as above
+
+
+def test_a_change_of_size_ends_a_batch(folder: pathlib.Path) -> None:
+    paths = paths_in(folder)
+    (folder / "3.png").write_bytes(b"no image")
+    batches = list(photograph_batches(NATIVE, paths, batch_size=2, on_bad_image="skip"))
+    assert [batch.indices.tolist() for batch in batches] == [[0, 1], [2, 3], [4, -1], [5, 6]]
+    sizes = [(42, 56), (56, 42), (56, 42), (42, 56)]
+    assert [batch.images.shape for batch in batches] == [(2, *size, 3) for size in sizes]
+    assert [batch.valid.tolist() for batch in batches] == [
+        *([True, True], [True, False], [True, False], [True, True])
+    ]
+    for batch in batches:
+        for image, number in zip(batch.images, batch.indices, strict=True):
+            if number in (0, 1, 2, 4, 6):
+                np.testing.assert_array_equal(image, read_image(paths[number]))
+    with pytest.raises(InputError, match=f"^{paths[3]}: found 8 bytes"):
+        list(photograph_batches(NATIVE, paths, batch_size=2))
+
+
+def test_images_that_nobody_could_read_have_the_models_size(folder: pathlib.Path) -> None:
+    for path in paths_in(folder)[:2]:
+        path.write_bytes(b"no image")
+    first, *_ = photograph_batches(NATIVE, paths_in(folder), batch_size=2, on_bad_image="skip")
+    assert first.images.shape == (2, *MODEL.image_size, 3)
+    assert not first.valid.any()
+
+
+def test_an_image_that_the_model_cannot_describe_is_named(folder: pathlib.Path) -> None:
+    assert cv2.imwrite(str(folder / "8.png"), np.zeros((14, 14, 3), np.uint8))
+    assert cv2.imwrite(str(folder / "9.png"), np.zeros((1, 4200, 3), np.uint8))
+    salad = MODEL.resized(None, ["native"])
+    with pytest.raises(InputError, match=rf"^{folder / '8.png'}: .* 1 patches for 4 clusters"):
+        list(photograph_batches(salad, [folder / "8.png"], batch_size=1))
+    with pytest.raises(InputError, match=rf"^{folder / '9.png'}: image size: .* at most 4096"):
+        list(photograph_batches(NATIVE, [folder / "9.png"], batch_size=1))
+
+
+def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    """Of a file that stores the rule: extracted, resumably too, and in a map."""
+    params, weights = random_params(NATIVE), tmp_path / "w.safetensors"
+    save_weights(weights, params, NATIVE)
+    params, config = load_weights(weights)
+    assert config == NATIVE
+    images = [prepare_image(read_image(path), config) for path in paths_in(folder)]
+    expected = np.concatenate(
+        [describe(params, np.stack([image] * 2), config)[:1] for image in images]
+    )
+    # Float32 rounding: other images stand beside each.
+    close = {"atol": 2e-6}
+    out = tmp_path / "out.npy"
+    found = extract(params, config, folder, out, batch_size=2, quiet=True)
+    np.testing.assert_allclose(found.descriptors, expected, **close)
+    np.testing.assert_allclose(np.load(out), expected, **close)
+
+    place = tmp_path / "map"
+    index(params, config, folder, place, weights=weights, batch_size=2, quiet=True)
+    again = index(params, config, folder, place, weights=weights, resize=["native"], quiet=True)
+    assert (again.added, again.there) == (0, len(SHAPES))
+    with pytest.raises(InputError, match=r"found images at 42 x 56, .* expected native size, "):
+        index(params, config, folder, place, weights=weights, resize=["fixed"], quiet=True)
+    with Map.open(place) as places:
+        assert places.summary()["resize"] == config.images_in_words
+        np.testing.assert_allclose(np.concatenate(list(places.descriptors)), expected, **close)
+        answers = query(places, params, paths_in(folder)[2:4], k=1, batch_size=2, quiet=True)
+    assert answers.neighbours.indices.ravel().tolist() == [2, 3]
+
+
+def test_a_map_of_another_way_than_its_weights(
+    folder: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """The same parameters: the map keeps its way, and is asked by it."""
+    params, weights, place = random_params(ALONE), tmp_path / "w.safetensors", tmp_path / "map"
+    save_weights(weights, params, ALONE)
+    words = ["bicubic", "floats"]
+    index(params, ALONE, folder, place, weights=weights, resize=words, quiet=True)
+    with Map.open(place) as places:
+        assert places.description.config == ALONE.resized(None, words)
+        answers = query(places, places.load_params(), folder, k=1, quiet=True)
+    # In float32 a unit vector with itself.
+    np.testing.assert_allclose(answers.neighbours.similarities, 1, atol=1e-5)
+
+
+def test_local_features_need_a_fixed_size() -> None:
+    config = dataclasses.replace(
+        ALONE, image_size=(56, 56), aggregator=NetVladConfig(clusters=4)
+    ).resized(None, ["native"])
+    words = "rerank: found a model with size rule native, expected fixed"
+    with pytest.raises(InputError, match=words):
+        Reranking("patch-netvlad", 2).check(config)
+
+
+def test_a_program_of_floats_takes_floats() -> None:
+    config = dataclasses.replace(
+        ALONE,
+        image_size=(40, 60),
+        preprocessing=PreprocessingConfig(pixels="floats", round_to_patch=True),
+    )
+    params = random_params(config)
+    exported = export_model(params, config, ExportConfig(batch_size=1, platforms=("cpu",)))
+    images = exported.in_avals[-1]
+    assert (images.shape, images.dtype) == ((1, 42, 56, 3), np.float32)
