@@ -82,6 +82,10 @@ class TrainConfig:
     steps."""
     trainable: str = "adapters+head"
     """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), head, or all."""
+    batch_norm: Literal["batch", "stored"] = "batch"
+    """Statistics of the backbone's batch norms. "batch" normalises by those of the batch and
+    updates the running ones (torch's `train()`, of frozen layers too). "stored" leaves the running
+    ones as they are and normalises by them (`eval()`)."""
     augmentation: OrName[Augmentation] = part_field(AUGMENTATIONS, "rand-augment")
     """How training images are changed; a registered augmentation, or its name."""
     places_per_batch: int = 48
@@ -89,7 +93,8 @@ class TrainConfig:
     images_per_place: int = 4
     micro_batch: int | None = None
     """So many images' activations are in memory at a time: a step takes less of it and a forward
-    pass longer, and is the same. None is the whole batch."""
+    pass longer, and is the same. None is the whole batch. Batch norms that follow the batch take
+    the statistics of so many images alone, as in several forward passes of torch's."""
     min_images: int = 4
     """Places, or classes, with fewer images are left out."""
     batch_order: Literal["within-city", "shuffled"] = "within-city"

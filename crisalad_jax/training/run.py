@@ -124,6 +124,7 @@ class Run:
             config.micro_batch,
             self._devices.mesh if shard_state else None,
             self.classes,
+            config.batch_norm,
         )
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.

@@ -73,6 +73,21 @@ def test_an_untrained_adapter_adds_nothing(kind: str) -> None:
     np.testing.assert_array_equal(adapter(params, tokens, GRID), jnp.zeros((16, 32)))
 
 
+def test_cricavprs_convolutions_start_at_1e_5() -> None:
+    """Weights and biases, as Lu-Feng/CricaVPR's train.py sets them; batch norms as torch's."""
+    config = AdapterConfig(kind="multi-resolution")
+    params = named_leaves(init_adapter(jax.random.key(0), 32, config))
+    convolutions = [name for name in params if ".conv." in name]
+    assert len(convolutions) == 10
+    starts = dict.fromkeys(convolutions, np.float32(1e-5))
+    starts |= {name: 0.0 for name in params if name.endswith(("norm.bias", "running_mean"))}
+    starts |= {name: 1.0 for name in params if name.endswith(("norm.weight", "running_var"))}
+    starts |= {"up.weight": 0.0, "up.bias": 0.0}
+    assert params.keys() - starts.keys() == {"down.weight", "down.bias"}
+    for name, value in starts.items():
+        np.testing.assert_array_equal(params[name], value, err_msg=name)
+
+
 def test_no_adapter_is_none() -> None:
     config = ViTConfig(adapter=AdapterConfig(kind="none"))
     assert init_adapter(jax.random.key(0), config.dim, config.adapter) is None
