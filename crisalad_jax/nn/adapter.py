@@ -53,6 +53,9 @@ class AdapterConfig:
     """Side of the depthwise filter."""
     alpha: float = 0.2
     """Weight of the adapter's output (paper Eq. 2)."""
+    bias: Literal["convolutions", "up"] = "convolutions"
+    """Layers of the depthwise adapter that have biases: its two convolutions, or the up-projection.
+    The paper prints the count of parameters alone (Table 3), which is 741,504 in both readings."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -86,7 +89,7 @@ class AdapterConfig:
 
 @pytree_dataclass
 class DepthwiseAdapter:
-    """The paper's adapter, whose linears have no bias: 741,504 parameters (Table 3)."""
+    """The paper's adapter, whose down-projection has no bias: 741,504 parameters (Table 3)."""
 
     down: Linear
     depthwise: DepthwiseConv
@@ -134,16 +137,17 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
     if kind == "none":
         return None
     down_key, first, second, up_key = jax.random.split(key, 4)
-    bias = kind != "depthwise"
-    down = init_linear(down_key, dim, width, bias=bias)
-    up = jax.tree.map(jnp.zeros_like, init_linear(up_key, width, dim, bias=bias))
+    depthwise, convolutions = kind == "depthwise", config.bias == "convolutions"
+    down = init_linear(down_key, dim, width, bias=not depthwise)
+    up = init_linear(up_key, width, dim, bias=not (depthwise and convolutions))
+    up = jax.tree.map(jnp.zeros_like, up)
     if kind == "mlp":
         return MlpAdapter(down, up)
-    if kind == "depthwise":
+    if depthwise:
         return DepthwiseAdapter(
             down=down,
-            depthwise=init_depthwise_conv(first, config.kernel_size, width),
-            pointwise=init_linear(second, width, width),
+            depthwise=init_depthwise_conv(first, config.kernel_size, width, bias=convolutions),
+            pointwise=init_linear(second, width, width, bias=convolutions),
             up=up,
         )
     half, quarter, narrow = width // 2, width // 4, width // 16

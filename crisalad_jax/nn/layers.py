@@ -43,7 +43,7 @@ class DepthwiseConv:
     """One k x k filter for each channel."""
 
     weight: Float[Array, "*stack k k dim"]
-    bias: Float[Array, "*stack dim"]
+    bias: Float[Array, "*stack dim"] | None
 
 
 @pytree_dataclass
@@ -82,7 +82,9 @@ def init_layer_norm(dim: int) -> LayerNorm:
     return LayerNorm(jnp.ones(dim), jnp.zeros(dim))
 
 
-def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> DepthwiseConv:
+def init_depthwise_conv(
+    key: PRNGKeyArray, kernel_size: int, dim: int, *, bias: bool = True
+) -> DepthwiseConv:
     """Draw depthwise filters as torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
     weight_key, bias_key = jax.random.split(key)
     bound = 1 / kernel_size
@@ -90,7 +92,7 @@ def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> Depthw
         jax.random.uniform(
             weight_key, (kernel_size, kernel_size, dim), minval=-bound, maxval=bound
         ),
-        jax.random.uniform(bias_key, (dim,), minval=-bound, maxval=bound),
+        jax.random.uniform(bias_key, (dim,), minval=-bound, maxval=bound) if bias else None,
     )
 
 
@@ -183,7 +185,8 @@ def depthwise_conv(
             for i in range(size)
             for j in range(size)
         ]
-    return sum(taps, start=params.bias).astype(x.dtype)
+    y = sum(taps[1:], start=taps[0]) if params.bias is None else sum(taps, start=params.bias)
+    return y.astype(x.dtype)
 
 
 def conv(

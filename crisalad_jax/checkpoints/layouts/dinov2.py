@@ -116,14 +116,15 @@ def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:
                 yield Entry((f"{here}.norm.{name}",), (f"{there}.bn.{name}",), SAME)
             count = "num_batches_tracked"
             yield Extra(f"{here}.norm.{count}", f"{there}.bn.{count}", (), np.int64)
-    bias = kind != "depthwise"
+    depthwise, bias = kind == "depthwise", config.adapter.bias == "convolutions"
     if kind != "none":
-        yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=bias)
-    if kind == "depthwise":
-        yield from affine(f"{ours}.depthwise", f"{theirs}.depthwise", DEPTHWISE)
-        yield from affine(f"{ours}.pointwise", f"{theirs}.pointwise", POINTWISE)
+        yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=not depthwise)
+    if depthwise:
+        yield from affine(f"{ours}.depthwise", f"{theirs}.depthwise", DEPTHWISE, bias=bias)
+        yield from affine(f"{ours}.pointwise", f"{theirs}.pointwise", POINTWISE, bias=bias)
     if kind != "none":
-        yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR, bias=bias)
+        up_bias = not (depthwise and bias)
+        yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR, bias=up_bias)
 
 
 def vit_config(read: Reader) -> ViTConfig:
@@ -142,7 +143,10 @@ def vit_config(read: Reader) -> ViTConfig:
         adapter = dataclasses.replace(adapter, bottleneck=down / width)
     if kind == "depthwise":
         side = read.size("blocks.0.adapter.depthwise.weight", 2)
-        adapter = dataclasses.replace(adapter, kernel_size=side)
+        convolutions = read.has("blocks.0.adapter.depthwise.bias")
+        adapter = dataclasses.replace(
+            adapter, kernel_size=side, bias="convolutions" if convolutions else "up"
+        )
     return backbone_config(
         dim=width,
         depth=read.count("blocks."),
