@@ -29,7 +29,7 @@ TRUTH_FACTOR = 1.5
 """How much further from float64 our bfloat16 may be than torch's."""
 
 EXACT = Tolerance(0.0, "choices, not numbers: every mined pair is the same")
-FROZEN = Tolerance(0.0, "no step touches what is frozen, batch norm's statistics among it")
+FROZEN = Tolerance(0.0, "no step touches what is frozen")
 
 STEP, OWN_STEP, OTHER_SIGNS, AFTER = (
     "AdamW step, same gradient",
@@ -83,6 +83,11 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         "trained, kinks": Tolerance(
             1.2e-3, "the same; three times the 3.9e-4 measured there (on the other 1.6e-5)"
         ),
+        "statistics": Tolerance(
+            5e-4,
+            "a bias before a batch norm has no gradient but rounding, of which AdamW makes steps, "
+            "and the mean moves along; three times the measured 1.7e-4 (seed 0: 1.3e-4)",
+        ),
     },
     "bfloat16": {
         "layer": Tolerance(4.5e-2, "ten roundings of 4e-3; three times the measured 1.5e-2"),
@@ -123,6 +128,11 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
             "20 steps along other signs; three times the measured 1.8e-2 of ten seeds (seed 0: "
             "1e-2)",
         ),
+        "statistics": Tolerance(
+            7e-2,
+            "a bias before a batch norm has no gradient but rounding, of which AdamW makes steps, "
+            "and the mean moves along; three times the measured 2.3e-2",
+        ),
     },
     "float64": {
         "layer": Tolerance(1e-14, "50 roundings of 1e-16, as in float32; measured 2.4e-15"),
@@ -149,6 +159,11 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
         ),
         "trained": Tolerance(
             2e-13, "no sign differs any more; five times the measured 3.6e-14 (seed 0: 2e-14)"
+        ),
+        "statistics": Tolerance(
+            1e-12,
+            "a bias before a batch norm has no gradient but rounding, of which AdamW makes steps, "
+            "and the mean moves along; three times the measured 3.3e-13",
         ),
     },
 }

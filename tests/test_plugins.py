@@ -535,7 +535,7 @@ def test_plug_ins_all_the_way_in_processes_of_their_own(tmp_path: pathlib.Path, 
         *("train", "--data", city, "--val", town, "--out", tmp_path / "run", "--quiet"),
         *(*how, *plug),
     )
-    assert "best Recall@5" in trained.stdout
+    assert "best R@5" in trained.stdout
     weights = tmp_path / "run" / "last.safetensors"
     data = ("--data", town, "--weights", weights, "--grouping", "single", "--quiet")
     crisalad("evaluate", *data, *plug, "--json", tmp_path / "table.json")

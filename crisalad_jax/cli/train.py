@@ -143,7 +143,8 @@ def run(arguments: Train) -> None:
     if result.stopped_early:
         words += ", stopped early"
     if result.best_recall is not None:
-        words += f", best Recall@5 {100 * result.best_recall:.1f} in best.safetensors"
+        best = f"{100 * result.best_recall:.1f}"
+        words += f", best {config.select_by} {best} in best.safetensors"
     if result.skipped_images:
         words += f", {result.skipped_images} unreadable images skipped"
     picture = arguments.out / "curves.png"

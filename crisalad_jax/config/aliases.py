@@ -136,6 +136,9 @@ def _large_margin_cosine(value: Plain) -> None:
 
 
 def _training(value: Plain) -> None:
+    # Files of runs hold all fields: without this one, statistics were never updated.
+    if _adapter_kind(value) == "multi-resolution" and value.keys() >= {"epochs", "patience"}:
+        value.setdefault("batch_norm", "stored")
     beside = {"rand-augment": "rand_augment", "light": "light_augment"}
     if "augmentation" in value or value.keys().isdisjoint(("augment", *beside.values())):
         return
@@ -144,6 +147,14 @@ def _training(value: Plain) -> None:
     value["augmentation"] = _named(
         chosen, settings.get(chosen) if isinstance(chosen, str) else None
     )
+
+
+def _adapter_kind(training: Plain) -> Any:
+    """Return the kind of adapter of a run's model; None where the plain value names none."""
+    value: Any = training
+    for name in ("model", "backbone", "adapter", "kind"):
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value
 
 
 _CHANGES: Mapping[str, Callable[[Plain], None]] = {

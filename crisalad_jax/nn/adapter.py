@@ -11,7 +11,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_positive
 from crisalad_jax.nn.layers import (
@@ -24,14 +24,16 @@ from crisalad_jax.nn.layers import (
     depthwise_conv,
     gelu,
     init_batch_norm,
-    init_conv,
     init_depthwise_conv,
     init_linear,
     linear,
+    train_batch_norm,
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 BATCH_NORM_EPSILON = 1e-3
+CONV_INIT = 1e-5
+"""Initial value of all weights and biases of CricaVPR's convolutions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +55,9 @@ class AdapterConfig:
     """Side of the depthwise filter."""
     alpha: float = 0.2
     """Weight of the adapter's output (paper Eq. 2)."""
+    bias: Literal["convolutions", "up"] = "convolutions"
+    """Layers of the depthwise adapter that have biases: its two convolutions, or the up-projection.
+    The paper prints the count of parameters alone (Table 3), which is 741,504 in both readings."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -86,7 +91,7 @@ class AdapterConfig:
 
 @pytree_dataclass
 class DepthwiseAdapter:
-    """The paper's adapter, whose linears have no bias: 741,504 parameters (Table 3)."""
+    """The paper's adapter, whose down-projection has no bias: 741,504 parameters (Table 3)."""
 
     down: Linear
     depthwise: DepthwiseConv
@@ -135,45 +140,41 @@ Adapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter | SideAdapter
 def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter | None:
     """Draw random parameters beside a backbone of width `dim`; None for "none".
 
-    The up-projection starts at 0.
+    The up-projection starts at 0, the convolutions of the multi-resolution adapter at 1e-5, as in
+    the public code of CricaVPR.
     """
     kind, width = config.kind, config.width(dim)
     if kind == "none":
         return None
     down_key, first, second, up_key = jax.random.split(key, 4)
-    bias = kind != "depthwise"
-    down = init_linear(down_key, dim, width, bias=bias)
-    up = jax.tree.map(jnp.zeros_like, init_linear(up_key, width, dim, bias=bias))
+    depthwise, convolutions = kind == "depthwise", config.bias == "convolutions"
+    down = init_linear(down_key, dim, width, bias=not depthwise)
+    up = init_linear(up_key, width, dim, bias=not (depthwise and convolutions))
+    up = jax.tree.map(jnp.zeros_like, up)
     if kind == "mlp":
         return MlpAdapter(down, up)
     if kind == "side":
         return SideAdapter(down, up)
-    if kind == "depthwise":
+    if depthwise:
         return DepthwiseAdapter(
             down=down,
-            depthwise=init_depthwise_conv(first, config.kernel_size, width),
-            pointwise=init_linear(second, width, width),
+            depthwise=init_depthwise_conv(first, config.kernel_size, width, bias=convolutions),
+            pointwise=init_linear(second, width, width, bias=convolutions),
             up=up,
         )
-    keys = jax.random.split(first, 5)
     half, quarter, narrow = width // 2, width // 4, width // 16
     return MultiResolutionAdapter(
         down=down,
-        branch1=_init_conv_norm(keys[0], 1, width, half),
-        branch2=(
-            _init_conv_norm(keys[1], 1, width, narrow),
-            _init_conv_norm(keys[2], 3, narrow, quarter),
-        ),
-        branch3=(
-            _init_conv_norm(keys[3], 1, width, narrow),
-            _init_conv_norm(keys[4], 5, narrow, quarter),
-        ),
+        branch1=_init_conv_norm(1, width, half),
+        branch2=(_init_conv_norm(1, width, narrow), _init_conv_norm(3, narrow, quarter)),
+        branch3=(_init_conv_norm(1, width, narrow), _init_conv_norm(5, narrow, quarter)),
         up=up,
     )
 
 
-def _init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
-    return ConvNorm(init_conv(key, kernel_size, d_in, d_out), init_batch_norm(d_out))
+def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
+    weight = jnp.full((kernel_size, kernel_size, d_in, d_out), CONV_INIT)
+    return ConvNorm(Conv(weight, jnp.full(d_out, CONV_INIT)), init_batch_norm(d_out))
 
 
 def adapter(
@@ -186,22 +187,52 @@ def adapter(
     as in CricaVPR. The MLP and side adapters have neither convolutions nor skip, and the latter has
     GELU.
     """
+    return _adapter(params, tokens, grid, None)[0]
+
+
+def train_adapter(
+    params: Adapter,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    valid: Bool[Array, " image"],
+) -> tuple[Float[Array, "image token dim"], Adapter]:
+    """Apply an adapter to a training batch, whose statistics its batch norms normalise by.
+
+    Args:
+        params: the adapter.
+        tokens: see `adapter`.
+        grid: rows and columns of patches.
+        valid: which images the statistics are taken of.
+
+    Returns:
+        (tokens, updated): the adapter's output, and the adapter with updated running statistics.
+    """
+    return _adapter(params, tokens, grid, valid)
+
+
+def _adapter(
+    params: Adapter,
+    tokens: Float[Array, "*batch token dim"],
+    grid: tuple[int, int],
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Float[Array, "*batch token dim"], Adapter]:
+    """Apply an adapter; with `valid` None by the stored statistics, which then stay."""
     narrow = checkpoint_name(linear(params.down, tokens), "down")
     if isinstance(params, SideAdapter):
-        return linear(params.up, gelu(narrow))
+        return linear(params.up, gelu(narrow)), params
     hidden = jax.nn.relu(narrow)
     if isinstance(params, MlpAdapter):
-        return linear(params.up, hidden)
+        return linear(params.up, hidden), params
     *batch, count, width = hidden.shape
     special = count - grid[0] * grid[1]
     patches = hidden[..., special:, :].reshape(-1, *grid, width)
     if isinstance(params, DepthwiseAdapter):
         mixed = _separable(params, patches)
     else:
-        mixed = jax.vmap(functools.partial(_multi_resolution, params))(patches)
+        mixed, params = _multi_resolution(params, patches, valid)
     mixed = mixed.reshape(*batch, grid[0] * grid[1], width)
     branch = jnp.concatenate([hidden[..., :special, :], mixed], axis=-2)
-    return linear(params.up, branch + hidden)
+    return linear(params.up, branch + hidden), params
 
 
 def _separable(
@@ -213,14 +244,23 @@ def _separable(
 
 
 def _multi_resolution(
-    params: MultiResolutionAdapter, x: Float[Array, "height width dim"]
-) -> Float[Array, "height width dim"]:
-    branches = (params.branch1,), params.branch2, params.branch3
-    outputs = []
-    for branch in branches:
-        y = x
-        for layer in branch:
-            y = batch_norm(layer.norm, conv(layer.conv, y), epsilon=BATCH_NORM_EPSILON)
-            y = jax.nn.relu(y)
-        outputs.append(y)
-    return jnp.concatenate(outputs, axis=-1)
+    params: MultiResolutionAdapter,
+    x: Float[Array, "image height width dim"],
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Float[Array, "image height width dim"], MultiResolutionAdapter]:
+    def apply(layer: ConvNorm, x: Array) -> tuple[Array, ConvNorm]:
+        y = conv(layer.conv, x)
+        if valid is None:
+            return jax.nn.relu(batch_norm(layer.norm, y, epsilon=BATCH_NORM_EPSILON)), layer
+        y, norm = train_batch_norm(layer.norm, y, valid, epsilon=BATCH_NORM_EPSILON)
+        return jax.nn.relu(y), dataclasses.replace(layer, norm=norm)
+
+    first, branch1 = apply(params.branch1, x)
+    second, narrow2 = apply(params.branch2[0], x)
+    second, wide2 = apply(params.branch2[1], second)
+    third, narrow3 = apply(params.branch3[0], x)
+    third, wide3 = apply(params.branch3[1], third)
+    updated = dataclasses.replace(
+        params, branch1=branch1, branch2=(narrow2, wide2), branch3=(narrow3, wide3)
+    )
+    return jnp.concatenate([first, second, third], axis=-1), updated

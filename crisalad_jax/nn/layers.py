@@ -1,11 +1,13 @@
 """The small layers: linear, layer norm, convolutions on a patch grid, GELU, dropout, L2."""
 
+import dataclasses
 import functools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from crisalad_jax.utils.compiler import product_dtype
 from crisalad_jax.utils.pytree import pytree_dataclass
@@ -14,6 +16,10 @@ Keys = Key[Array, "*keys"]
 """One random key for all, or one for each entry of a batch."""
 TAPS = "taps"
 """Scope of elementwise products that are the multiply-accumulates of a convolution."""
+STATISTICS = ("running_mean", "running_var")
+"""Fields of `BatchNorm` that are measured, not learnt."""
+MOMENTUM = 0.1
+"""Weight of a batch in the running statistics: torch's default."""
 
 
 @pytree_dataclass
@@ -37,7 +43,7 @@ class DepthwiseConv:
     """One k x k filter for each channel."""
 
     weight: Float[Array, "*stack k k dim"]
-    bias: Float[Array, "*stack dim"]
+    bias: Float[Array, "*stack dim"] | None
 
 
 @pytree_dataclass
@@ -50,9 +56,9 @@ class Conv:
 
 @pytree_dataclass
 class BatchNorm:
-    """Gain and shift of a batch norm, and the statistics it normalises by.
+    """Gain and shift of a batch norm, and the running statistics of the batches it has seen.
 
-    The statistics are constants: neither training nor a batch changes them.
+    No gradient changes the statistics. `train_batch_norm` returns updated ones.
     """
 
     weight: Float[Array, "*stack dim"]
@@ -76,7 +82,9 @@ def init_layer_norm(dim: int) -> LayerNorm:
     return LayerNorm(jnp.ones(dim), jnp.zeros(dim))
 
 
-def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> DepthwiseConv:
+def init_depthwise_conv(
+    key: PRNGKeyArray, kernel_size: int, dim: int, *, bias: bool = True
+) -> DepthwiseConv:
     """Draw depthwise filters as torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
     weight_key, bias_key = jax.random.split(key)
     bound = 1 / kernel_size
@@ -84,7 +92,7 @@ def init_depthwise_conv(key: PRNGKeyArray, kernel_size: int, dim: int) -> Depthw
         jax.random.uniform(
             weight_key, (kernel_size, kernel_size, dim), minval=-bound, maxval=bound
         ),
-        jax.random.uniform(bias_key, (dim,), minval=-bound, maxval=bound),
+        jax.random.uniform(bias_key, (dim,), minval=-bound, maxval=bound) if bias else None,
     )
 
 
@@ -177,7 +185,8 @@ def depthwise_conv(
             for i in range(size)
             for j in range(size)
         ]
-    return sum(taps, start=params.bias).astype(x.dtype)
+    y = sum(taps[1:], start=taps[0]) if params.bias is None else sum(taps, start=params.bias)
+    return y.astype(x.dtype)
 
 
 def conv(
@@ -213,6 +222,75 @@ def batch_norm(
     wide = at_least_float32(x)
     scale = params.weight * jax.lax.rsqrt(params.running_var + epsilon)
     return ((wide - params.running_mean) * scale + params.bias).astype(x.dtype)
+
+
+def train_batch_norm(
+    params: BatchNorm,
+    x: Float[Array, "image *shape dim"],
+    valid: Bool[Array, " image"],
+    *,
+    epsilon: float,
+) -> tuple[Float[Array, "image *shape dim"], BatchNorm]:
+    """Normalise by the statistics of a batch, as torch in training mode, and update the running.
+
+    The stored variance takes the unbiased one, the batch is divided by the biased one. Images that
+    are not valid count for nothing; a batch without any changes no statistic. Sharded over devices,
+    the statistics are those of the whole batch.
+
+    Args:
+        params: the batch norm.
+        x: values of a batch; the statistics are over all axes but the last.
+        valid: which images are no padding.
+        epsilon: added to the variance.
+
+    Returns:
+        (y, updated): the normalised values in the type of `x`, and the batch norm with updated
+        statistics, through which no gradient runs.
+    """
+    wide = at_least_float32(x)
+    axes = tuple(range(x.ndim - 1))
+    mask = valid.reshape(-1, *(1,) * (x.ndim - 1))
+    count = valid.sum() * math.prod(x.shape[1:-1])
+
+    def mean(values: Array) -> Array:
+        return jnp.where(mask, values, 0).sum(axis=axes) / jnp.maximum(count, 1)
+
+    centre = mean(wide)
+    centred = wide - centre
+    variance = mean(jnp.square(centred))
+    y = centred * (params.weight * jax.lax.rsqrt(variance + epsilon)) + params.bias
+
+    def moved(running: Array, batch: Array) -> Array:
+        new = (1 - MOMENTUM) * running + MOMENTUM * jax.lax.stop_gradient(batch)
+        return jnp.where(count > 0, new, running).astype(running.dtype)
+
+    unbiased = variance * (count / jnp.maximum(count - 1, 1))
+    updated = dataclasses.replace(
+        params,
+        running_mean=moved(params.running_mean, centre),
+        running_var=moved(params.running_var, unbiased),
+    )
+    return y.astype(x.dtype), updated
+
+
+def split_statistics(params: PyTree) -> tuple[PyTree, PyTree]:
+    """Split parameters into the running statistics of their batch norms, and all else.
+
+    Args:
+        params: a pytree.
+
+    Returns:
+        (statistics, rest): two trees of its structure, None for the other's leaves.
+
+    Example:
+        >>> statistics, rest = split_statistics(init_batch_norm(2))
+        >>> statistics.weight is None, rest.running_mean is None
+        (True, True)
+    """
+    measured = jax.tree_util.tree_map_with_path(
+        lambda path, _: jax.tree_util.keystr(path[-1:], simple=True) in STATISTICS, params
+    )
+    return eqx.partition(params, measured)
 
 
 @jax.custom_jvp

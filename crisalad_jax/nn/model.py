@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
@@ -23,6 +24,7 @@ from crisalad_jax.nn.layers import (
     init_linear,
     l2_normalise,
     split_key,
+    split_statistics,
 )
 from crisalad_jax.nn.misfits import misfits, not_finite, shortened
 from crisalad_jax.nn.pixels import check_pixels, normalise
@@ -284,18 +286,70 @@ def extract_tokens(
         (1, 16, 32)
     """
 
-    def tokens_of(images: Images, keys: Keys | None) -> Tokens:
-        features = extract_features(params, images, config)
+    return _extract_tokens(params, images, None, config, key, micro_batch)[0]
+
+
+def train_tokens(
+    params: Crisalad,
+    images: Images,
+    valid: Bool[Array, " image"],
+    config: ModelConfig,
+    *,
+    key: Key[Array, ""] | None = None,
+    micro_batch: int | None = None,
+) -> tuple[Tokens, Crisalad]:
+    """Extract the tokens of a training batch, by the statistics of the batch.
+
+    Where the backbone has batch norms, these normalise by the mean and variance of the batch's
+    valid images, as torch's in training mode. So a token depends on the other images. Devices that
+    share a batch share its statistics. A micro-batch is a forward pass of its own: it has its own
+    statistics, and updates the running ones in turn.
+
+    Args:
+        params: see `describe`.
+        images: see `describe`.
+        valid: which images are no padding.
+        config: see `describe`.
+        key: see `describe`.
+        micro_batch: see `extract_tokens`.
+
+    Returns:
+        (tokens, statistics): a tree of the structure of `params`, which holds the running
+        statistics after this batch, and None for all other leaves.
+
+    Raises:
+        InputError: as `describe`.
+    """
+    return _extract_tokens(params, images, valid, config, key, micro_batch)
+
+
+def _extract_tokens(
+    params: Crisalad,
+    images: Images,
+    valid: Bool[Array, " image"] | None,
+    config: ModelConfig,
+    key: Key[Array, ""] | None,
+    micro_batch: int | None,
+) -> tuple[Tokens, Any]:
+    """Extract tokens, and the running statistics; None in their place where `valid` is None."""
+
+    def tokens_of(
+        statistics: Crisalad | None, images: Images, keys: Keys | None, valid: Array | None
+    ) -> tuple[Crisalad | None, Tokens]:
+        current = params if statistics is None else eqx.combine(statistics, params)
+        features, statistics = _extract_features(current, images, valid, config)
         grid = config.backbone.grid((images.shape[1], images.shape[2]))
         with jax.named_scope("aggregator"):
             tokens = config.aggregator.apply(params.aggregator, features, grid, key=keys)
         check_tokens(tokens, config.aggregator, config.backbone.dim, (images.shape[0],))
-        return tokens
+        return statistics, tokens
 
+    statistics = None if valid is None else split_statistics(params)[0]
     count = images.shape[0]  # which may be symbolic, where `len` is not
     keys = None if key is None else jax.random.split(key, count)
     if micro_batch is None or micro_batch == count:
-        return tokens_of(images, keys)
+        statistics, tokens = tokens_of(statistics, images, keys, valid)
+        return tokens, statistics
     if count % micro_batch:
         raise InputError(
             f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
@@ -308,8 +362,10 @@ def extract_tokens(
     def join(x: Array) -> Array:
         return x.swapaxes(0, 1).reshape(count, *x.shape[2:])
 
-    once = jax.checkpoint(lambda part: tokens_of(*part), prevent_cse=False)
-    return jax.tree.map(join, jax.lax.map(once, jax.tree.map(split, (images, keys))))
+    once = jax.checkpoint(lambda statistics, part: tokens_of(statistics, *part), prevent_cse=False)
+    parts = jax.tree.map(split, (images, keys, valid))
+    statistics, tokens = jax.lax.scan(once, statistics, parts)
+    return jax.tree.map(join, tokens), statistics
 
 
 @_door("images", _check_images)
@@ -336,6 +392,13 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         >>> extract_features(params, np.zeros((1, 98, 98, 3), np.uint8), config).patches.shape
         (1, 49, 128)
     """
+    return _extract_features(params, images, None, config)[0]
+
+
+def _extract_features(
+    params: Crisalad, images: Images, valid: Bool[Array, " image"] | None, config: ModelConfig
+) -> tuple[Features, Crisalad | None]:
+    """Extract features, and the running statistics; None where `valid` is None."""
     check_params(params, config)
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
@@ -354,7 +417,14 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         request = dataclasses.replace(request, inserted=inserted)
     pixels = images.astype(config.compute_dtype)
     with jax.named_scope("backbone"):
-        return config.backbone.apply(params.backbone, pixels, request, remat=config.remat)
+        if valid is None:
+            features = config.backbone.apply(params.backbone, pixels, request, remat=config.remat)
+            return features, None
+        features, backbone = config.backbone.apply_training(
+            params.backbone, pixels, request, remat=config.remat, valid=valid
+        )
+    statistics, _ = split_statistics(dataclasses.replace(params, backbone=backbone))
+    return features, statistics
 
 
 @_door("images", _check_images)

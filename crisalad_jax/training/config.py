@@ -1,6 +1,7 @@
 """Configuration of a training run."""
 
 import dataclasses
+import itertools
 import re
 from typing import Literal
 
@@ -19,18 +20,19 @@ from crisalad_jax.nn.config import ModelConfig
 
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
-    """AdamW or Adam with an optional warm-up and a learning rate that falls.
+    """An optimiser of torch, with an optional warm-up and a learning rate that falls.
 
     Example:
         >>> OptimiserConfig(learning_rate=1e-3, warmup_steps=100).kind
         'adamw'
     """
 
-    kind: Literal["adamw", "adam"] = "adamw"
-    """In Adam the weight decay is part of the gradient."""
+    kind: Literal["adamw", "adam", "sgd"] = "adamw"
+    """In Adam and SGD the weight decay is part of the gradient."""
     learning_rate: float = 6e-5
-    schedule: Literal["linear", "step"] = "linear"
-    """Linear decay step by step, or one step down every few epochs."""
+    schedule: Literal["linear", "step", "milestones"] = "linear"
+    """Linear decay step by step, or a step down: one every few epochs, or one after each of
+    `milestones`."""
     end_lr_fraction: float = 0.0
     """Share of the learning rate that is left at the end of a linear decay."""
     decay_steps: int | None = None
@@ -39,11 +41,18 @@ class OptimiserConfig:
     """Epochs from one step down to the next (CricaVPR's)."""
     step_gamma: float = 0.5
     """What a step down multiplies the learning rate by (CricaVPR's)."""
+    milestones: tuple[int, ...] = ()
+    """Numbers of epochs after which the learning rate steps down, counted from the start."""
     warmup_steps: int = 0
+    """Steps of a linear warm-up, of which the last is at the learning rate."""
+    warmup_epochs: int = 0
+    """The same in epochs, in place of `warmup_steps`."""
     weight_decay: float = 0.01
     """Torch's default for AdamW; the paper names none."""
     b1: float = 0.9
     b2: float = 0.999
+    momentum: float = 0.9
+    """Of SGD."""
     clip_norm: float | None = None
     """Largest norm of the whole gradient."""
 
@@ -57,12 +66,27 @@ class OptimiserConfig:
                 f"OptimiserConfig.decay_steps: found {self.decay_steps}, expected more than 0, or "
                 "None",
             )
-        for name in ("end_lr_fraction", "warmup_steps", "weight_decay"):
+        for name in ("end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"):
             value = getattr(self, name)
             require(value >= 0, f"OptimiserConfig.{name}: found {value}, expected at least 0")
-        require_fraction(self, "b1", "b2")
+        require(
+            not (self.warmup_steps and self.warmup_epochs),
+            f"OptimiserConfig.warmup_epochs: found {self.warmup_epochs} beside warmup_steps "
+            f"{self.warmup_steps}, expected only one of the two",
+        )
+        require(
+            self.schedule != "milestones"
+            or (bool(self.milestones) and _rises((0, *self.milestones))),
+            f"OptimiserConfig.milestones: found {self.milestones}, expected numbers of epochs that "
+            "rise",
+        )
+        require_fraction(self, "b1", "b2", "momentum")
         if self.clip_norm is not None:
             require_positive(self, "clip_norm")
+
+
+def _rises(numbers: tuple[int, ...]) -> bool:
+    return all(first < second for first, second in itertools.pairwise(numbers))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +106,10 @@ class TrainConfig:
     steps."""
     trainable: str = "adapters+head"
     """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), head, or all."""
+    batch_norm: Literal["batch", "stored"] = "batch"
+    """Statistics of the backbone's batch norms. "batch" normalises by those of the batch and
+    updates the running ones (torch's `train()`, of frozen layers too). "stored" leaves the running
+    ones as they are and normalises by them (`eval()`)."""
     augmentation: OrName[Augmentation] = part_field(AUGMENTATIONS, "rand-augment")
     """How training images are changed; a registered augmentation, or its name."""
     places_per_batch: int = 48
@@ -89,7 +117,8 @@ class TrainConfig:
     images_per_place: int = 4
     micro_batch: int | None = None
     """So many images' activations are in memory at a time: a step takes less of it and a forward
-    pass longer, and is the same. None is the whole batch."""
+    pass longer, and is the same. None is the whole batch. Batch norms that follow the batch take
+    the statistics of so many images alone, as in several forward passes of torch's."""
     min_images: int = 4
     """Places, or classes, with fewer images are left out."""
     batch_order: Literal["within-city", "shuffled"] = "within-city"
@@ -100,10 +129,12 @@ class TrainConfig:
     """The paper converged within five, and stopped after three without gain."""
     validate_every: int = 1
     """Epochs from one validation to the next."""
+    select_by: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
+    """Recall of a validation that tells which weights are the best."""
     patience: int | None = 3
-    """Validations without a better Recall@5 after which training stops; None never stops early."""
+    """Validations without a better recall after which training stops; None never stops early."""
     keep_best: int = 1
-    """So many validations' weights are kept, those of the best Recall@5."""
+    """So many validations' weights are kept, those of the best recall."""
     seed: int = 0
 
     def __post_init__(self) -> None:

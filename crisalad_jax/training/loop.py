@@ -25,7 +25,7 @@ class FitResult(NamedTuple):
     """Parameters after the last step."""
     steps: int
     best_recall: float | None
-    """Best Recall@5 of a validation, as a fraction; None without validation."""
+    """Best recall of a validation, a fraction, by `TrainConfig.select_by`; None without one."""
     stopped_early: bool
     skipped_images: int
     """Number of unreadable images that were masked out, counted each time they came up."""
@@ -47,8 +47,8 @@ def fit(
 
     The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
     same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
-    and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best
-    Recall@5 (grouping `single`), and the best `config.keep_best` weights in `best/`.
+    and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best recall by
+    `config.select_by` (grouping `single`), and the best `config.keep_best` weights in `best/`.
 
     A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one.
 

@@ -20,22 +20,31 @@ def learning_rate_schedule(
 
     Linear decay reaches `end_lr_fraction` after `config.decay_steps`, or after the last of `steps`.
     Step decay multiplies by `step_gamma` every `step_epochs`, counted from the end of the warm-up.
+    Milestones count from the start of the run. One that comes before the end of the warm-up is
+    without effect, as in GSV-Cities' code, in which the warm-up sets the learning rate anew.
     """
     peak, end = config.learning_rate, config.learning_rate * config.end_lr_fraction
+    warmup_steps = config.warmup_steps or config.warmup_epochs * steps_per_epoch
     if config.schedule == "linear":
-        length = config.decay_steps or max(steps - config.warmup_steps, 1)
+        length = config.decay_steps or max(steps - warmup_steps, 1)
         decay = optax.linear_schedule(peak, end, length)
+    elif config.schedule == "milestones":
+        after = [epoch * steps_per_epoch - warmup_steps for epoch in config.milestones]
+        decay = optax.piecewise_constant_schedule(
+            peak, {step: config.step_gamma for step in after if step >= 0}
+        )
     else:
         decay = optax.exponential_decay(
             peak, config.step_epochs * steps_per_epoch, config.step_gamma, staircase=True
         )
-    if not config.warmup_steps:
+    if not warmup_steps:
         return _of_real_steps(decay)
     # A warm-up of n steps starts at 1 / n of the peak: its first step would otherwise be 0.
-    warmup = optax.linear_schedule(
-        peak / config.warmup_steps, peak, max(config.warmup_steps - 1, 1)
+    return _of_real_steps(
+        optax.join_schedules(
+            [lambda count: peak * (count + 1) / warmup_steps, decay], [warmup_steps]
+        )
     )
-    return _of_real_steps(optax.join_schedules([warmup, decay], [config.warmup_steps]))
 
 
 def with_short_warmup(config: OptimiserConfig, steps: int) -> OptimiserConfig:
@@ -76,10 +85,10 @@ def _of_real_steps(schedule: optax.Schedule) -> optax.Schedule:
 def make_optimiser(
     config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
 ) -> optax.GradientTransformation:
-    """Make torch's AdamW (Loshchilov and Hutter 2019) or Adam (Kingma and Ba 2015).
+    """Make torch's AdamW (Loshchilov and Hutter 2019), Adam (Kingma and Ba 2015) or SGD.
 
-    Both decay every parameter: AdamW the parameter itself, Adam through its gradient. With
-    `config.clip_norm` the gradient is clipped first.
+    All decay every parameter: AdamW the parameter itself, the others through its gradient. SGD has
+    torch's momentum, without dampening. With `config.clip_norm` the gradient is clipped first.
     """
     schedule = learning_rate_schedule(config, steps, steps_per_epoch)
     b1, b2 = config.b1, config.b2
@@ -87,7 +96,12 @@ def make_optimiser(
         optimiser = optax.adamw(schedule, b1, b2, weight_decay=config.weight_decay)
     else:
         decay = optax.add_decayed_weights(config.weight_decay)
-        optimiser = optax.chain(decay, optax.adam(schedule, b1, b2))
+        descent = (
+            optax.adam(schedule, b1, b2)
+            if config.kind == "adam"
+            else optax.sgd(schedule, config.momentum)
+        )
+        optimiser = optax.chain(decay, descent)
     if config.clip_norm is None:
         return optimiser
     return optax.chain(optax.clip_by_global_norm(config.clip_norm), optimiser)

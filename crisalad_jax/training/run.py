@@ -50,6 +50,8 @@ from crisalad_jax.utils.signals import SignalState
 
 WATCHED_QUERIES = 16
 """Number of images whose transport statistics every validation logs."""
+SELECTED = {"R@1": (1,), "R@5": (5,), "R@1+R@5": (1, 5)}
+"""Ranks whose recalls are added, by `TrainConfig.select_by`."""
 SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
 
@@ -124,6 +126,7 @@ class Run:
             config.micro_batch,
             self._devices.mesh if shard_state else None,
             self.classes,
+            config.batch_norm,
         )
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.
@@ -302,7 +305,7 @@ class Run:
             note += f"easy anchors {metrics['easy_anchor_fraction']:.2f}"
         note += f"  {size / seconds:.0f} images/s"
         if self.record.best:
-            note += f"  best R@5 {100 * self.record.best[0][0]:.1f}"
+            note += f"  best {self.config.select_by} {100 * self.record.best[0][0]:.1f}"
         return note
 
     def _refuse(self, metrics: Mapping[str, int | float], size: int, skipped: int) -> None:
@@ -356,7 +359,8 @@ class Run:
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
         line = {"step": self.step, "epoch": epoch, **recalls, **watched}
         self._files.log_step(line, of=benchmark.name)
-        newest, keep = [result.recalls[5], self.step], self.config.keep_best
+        selected = sum(result.recalls[k] for k in SELECTED[self.config.select_by])
+        newest, keep = [selected, self.step], self.config.keep_best
         # Of equal recalls the first counts as the best.
         record.best = sorted([*record.best, newest], key=lambda best: (-best[0], best[1]))[:keep]
         record.without_gain = 0 if record.best[0] == newest else record.without_gain + 1

@@ -38,7 +38,7 @@ class RunRecord:
     validated: int = 0
     """Step of the last validation."""
     best: list[list[Any]] = dataclasses.field(default_factory=list)
-    """Recall@5 and step of the best validations, best first."""
+    """Recall, by `TrainConfig.select_by`, and step of the best validations, best first."""
     without_gain: int = 0
     """Number of validations since the best one."""
     sources: dict[str, list[Any]] = dataclasses.field(default_factory=dict)

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import re
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,12 +18,13 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.losses import Loss, LossConfig, LossResult, LossValue, metric_loss
 from crisalad_jax.losses.base import call_loss, check_value
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.layers import split_key
+from crisalad_jax.nn.layers import split_key, split_statistics
 from crisalad_jax.nn.model import (
     Crisalad,
     attend_across_images,
     check_params,
     extract_tokens,
+    train_tokens,
     valid_mask,
 )
 from crisalad_jax.nn.pixels import check_pixels
@@ -47,10 +48,11 @@ LossFunction = Callable[..., Float[Array, ""]]
 
 
 class TrainState(NamedTuple):
-    """State that changes from step to step; `trainable` has None where a parameter is frozen."""
+    """State that changes from step to step."""
 
     step: Int[Array, ""]
     trainable: PyTree
+    """Parameters that train, and running statistics that are updated; None for all others."""
     optimiser: PyTree
     classifiers: Classifiers | None = None
     """Parameters of the loss, if it has any."""
@@ -96,6 +98,8 @@ class StepConfig:
     of ZeRO, Rajbhandari et al. 2020)."""
     classes: tuple[int, ...] = ()
     """Number of classes of each group, where the loss classifies; an epoch trains one group."""
+    batch_norm: Literal["batch", "stored"] = "batch"
+    """See `TrainConfig.batch_norm`."""
 
     def learning_rate(self, step: Int[Array, ""]) -> Float[Array, ""] | None:
         """Compute the learning rate of a step, from 0; None if the optimiser is passed in."""
@@ -158,12 +162,17 @@ def init_train_state(
     if isinstance(config.optimiser, OptimiserConfig) and distributed.is_primary():
         tell_long_warmup(config.optimiser, config.steps)
     chosen, frozen = split_params(params, config.model, trainable)
+    statistics = None
+    if config.batch_norm == "batch":
+        statistics, frozen = split_statistics(frozen)
     # Copied, because a step uses up the buffers of its state, and `params` are the caller's.
-    chosen = jax.tree.map(jnp.copy, chosen)
+    chosen, statistics = jax.tree.map(jnp.copy, (chosen, statistics))
     optimiser = config.make_optimiser().init(chosen)
     classifiers = None
     if isinstance(config.loss, LossConfig):
         classifiers = _init_loss(key, config.loss.kind, config)
+    if statistics is not None:
+        chosen = eqx.combine(chosen, statistics)
     return TrainState(jnp.zeros((), jnp.int32), chosen, optimiser, classifiers), frozen
 
 
@@ -248,6 +257,7 @@ def step_config(
         steps_per_epoch=steps_per_epoch,
         micro_batch=config.micro_batch,
         classes=classes,
+        batch_norm=config.batch_norm,
     )
 
 
@@ -338,6 +348,9 @@ def train_step(
     If the loss classifies, labels are that group's classes. Dropout is drawn from `key` and the
     step's number, so that a resumed run repeats an uninterrupted one.
 
+    Running statistics in the state are updated, as torch's batch norms in training mode do it, and
+    the batch is normalised by its own. Without any in the state, the stored ones stay in use.
+
     If the loss or the gradient is not finite, or no image is valid, the state is returned as it was
     and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
     a loop may read metrics one step late, and still have the state before the failed step.
@@ -348,18 +361,22 @@ def train_step(
     if state.classifiers is not None:
         classifier = jax.tree.map(lambda leaf: leaf[group], state.classifiers.weights)
 
+    statistics, learnt = split_statistics(state.trainable)
+
     def loss_of(trained: tuple[PyTree, Any]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
-        trainable, classifier = trained
-        params = eqx.combine(trainable, frozen)
+        learnt, classifier = trained
+        params = eqx.combine(learnt, statistics, frozen)
+        options = {"key": tokens_key, "micro_batch": config.micro_batch}
         # The two halves of `describe`, because the tokens carry the transport's statistics.
-        tokens = extract_tokens(
-            params, images, config.model, key=tokens_key, micro_batch=config.micro_batch
-        )
+        if jax.tree.leaves(statistics):
+            tokens, measured = train_tokens(params, images, valid, config.model, **options)
+        else:
+            tokens, measured = extract_tokens(params, images, config.model, **options), statistics
         descriptors = attend_across_images(
             params, tokens, config.model, mask=valid_mask(valid), key=cross_key
         )
         result = _loss(descriptors, labels, valid, classifier, group, config)
-        return result.loss, (result, tokens.transport)
+        return result.loss, (result, tokens.transport, measured)
 
     def placed(tree: PyTree, *, whole: bool = False) -> PyTree:
         mesh = config.shard_over
@@ -376,20 +393,20 @@ def train_step(
 
         return jax.tree.map(place, tree)
 
-    (loss, (result, transport)), (gradient, classifier_gradient) = jax.value_and_grad(
+    (loss, (result, transport, statistics)), (gradient, classifier_gradient) = jax.value_and_grad(
         loss_of, has_aux=True
-    )((placed(state.trainable, whole=True), placed(classifier, whole=True)))
+    )((placed(learnt, whole=True), placed(classifier, whole=True)))
     transport = jax.tree.map(lambda each: jnp.where(valid, each, 0).sum() / valid.sum(), transport)
     norm = optax.tree.norm((gradient, classifier_gradient))
     learning_rate = config.learning_rate(state.step)
     optimiser = config.make_optimiser()
-    updates, new_optimiser = optimiser.update(gradient, state.optimiser, state.trainable)
+    updates, new_optimiser = optimiser.update(gradient, state.optimiser, learnt)
     classifiers = state.classifiers
     if classifiers is not None:
         assert isinstance(config.loss, LossConfig)
         rate = config.loss.kind.learning_rate
         classifiers = update_classifiers(classifiers, group, classifier_gradient, rate)
-    trainable = optax.apply_updates(state.trainable, updates)
+    trainable = eqx.combine(optax.apply_updates(learnt, updates), statistics)
     new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
     updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & valid.any()
     state = jax.tree.map(lambda after, before: jnp.where(updated, after, before), new, state)

@@ -8,13 +8,12 @@ import jax
 from jaxtyping import PyTree
 
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.layers import STATISTICS
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 HEAD, ADAPTERS_AND_HEAD, ALL = "head", "adapters+head", "all"
-STATISTICS = (".running_mean", ".running_var")
-"""Names of batch-norm statistics, which never train: they are measured, not learnt."""
 _LAST_BLOCKS = re.compile(r"last-(\d+)-blocks\+head")
 
 
@@ -33,8 +32,8 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
 
     If some of the blocks train, the backbone's stack is cut in two, and `merge_params` joins it. So
     no gradient is computed in the frozen blocks before the last N, nor in the whole first block if
-    only its adapter trains. Batch-norm statistics always stay frozen, and so does an aggregator
-    that learns nothing (AnyLoc's vocabulary).
+    only its adapter trains. Batch-norm statistics have no gradient and count as frozen, though a
+    step may update them. So does an aggregator that learns nothing (AnyLoc's vocabulary).
 
     Args:
         params: the whole model.
@@ -83,7 +82,8 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
     names = iter(named_leaves(params))
 
     def learns(name: str) -> bool:
-        fixed = name.endswith(STATISTICS) or (constant and name.startswith(constant))
+        measured = name.rpartition(".")[2] in STATISTICS
+        fixed = measured or (constant and name.startswith(constant))
         return name.startswith(prefixes) and not fixed
 
     chosen = jax.tree.map(lambda _: learns(next(names)), params)

@@ -157,7 +157,8 @@ def convert(model: TorchCrisalad) -> tuple[Crisalad, dict[str, np.ndarray]]:
     """Our parameters of a reference model, in arrays of their own, and the extras beside them."""
     state = {name: tensor.detach().numpy() for name, tensor in model.state_dict().items()}
     params, extras = to_params(state, model.config, LAYOUT, source="the torch reference")
-    return jax.tree.map(jnp.array, params), extras
+    # Copied: torch counts a batch norm's batches in place.
+    return jax.tree.map(jnp.array, params), {name: x.copy() for name, x in extras.items()}
 
 
 def split(arrays: Arrays) -> dict[str, np.ndarray]:

@@ -50,13 +50,21 @@ def over_grid(
 
 
 class DepthwiseAdapter(MlpAdapter):
-    """The paper's depthwise-separable convolution; its linears carry no bias."""
+    """The paper's depthwise-separable convolution; its first linear carries no bias."""
 
-    def __init__(self, dim: int, width: int, kernel_size: int) -> None:
-        """The depthwise filters are `kernel_size` x `kernel_size`."""
+    def __init__(self, dim: int, width: int, kernel_size: int, *, bias: bool = True) -> None:
+        """The depthwise filters are `kernel_size` x `kernel_size`.
+
+        Either the convolutions have biases, or else the last linear.
+        """
         super().__init__(dim, width, bias=False)
-        self.depthwise = Conv2d(width, width, kernel_size, padding="same", groups=width)
-        self.pointwise = Conv2d(width, width, 1)
+        if not bias:
+            self.D_fc2 = Linear(width, dim)
+            nn.init.zeros_(self.D_fc2.weight)
+            nn.init.zeros_(self.D_fc2.bias)
+        side = kernel_size
+        self.depthwise = Conv2d(width, width, side, padding="same", groups=width, bias=bias)
+        self.pointwise = Conv2d(width, width, 1, bias=bias)
 
     def mix(self, hidden: Tensor, grid: tuple[int, int]) -> Tensor:
         """(batch, token, width) to the same."""
@@ -106,7 +114,8 @@ def make_adapter(config: ViTConfig) -> MlpAdapter | None:
     """The adapter of `config.adapter.kind`; None for "none"."""
     dim, width = config.dim, config.adapter_dim
     if config.adapter.kind == "depthwise":
-        return DepthwiseAdapter(dim, width, config.adapter.kernel_size)
+        bias = config.adapter.bias == "convolutions"
+        return DepthwiseAdapter(dim, width, config.adapter.kernel_size, bias=bias)
     if config.adapter.kind == "multi-resolution":
         return MultiResolutionAdapter(dim, width)
     return MlpAdapter(dim, width) if config.adapter.kind == "mlp" else None

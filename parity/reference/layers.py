@@ -42,13 +42,11 @@ class LayerNorm(nn.LayerNorm):
 
 
 class BatchNorm2d(nn.BatchNorm2d):
-    """Normalises by its stored statistics in training as well, and never updates them."""
+    """Batch norm, in float32 at least inside."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """(batch, dim, height, width) to the same, in float32 at least inside."""
-        statistics = self.running_mean, self.running_var
-        y = F.batch_norm(at_least_float32(x), *statistics, self.weight, self.bias, eps=self.eps)
-        return y.to(x.dtype)
+        """(batch, dim, height, width) to the same."""
+        return super().forward(at_least_float32(x)).to(x.dtype)
 
 
 def l2_normalise(x: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ def freeze(model: Crisalad, trainable: str) -> list[nn.Parameter]:
 
     "head" (aggregator and cross-image encoder), "adapters+head" (the paper), "last-N-blocks+head"
     (SALAD: the last N blocks, the final layer norm, and the head), or "all". Batch-norm statistics
-    are buffers and train in no case.
+    are buffers: they have no gradient, and in training mode every forward pass updates them.
 
     Raises:
         InputError: an unknown name, or more blocks than there are.

@@ -97,6 +97,10 @@ MODELS = {
             MODEL.backbone, adapter=AdapterConfig(kind="multi-resolution")
         ),
     ),
+    "bias of the up-projection": dataclasses.replace(
+        MODEL,
+        backbone=dataclasses.replace(MODEL.backbone, adapter=AdapterConfig(bias="up")),
+    ),
     "GeM": dataclasses.replace(MODEL, aggregator="gem"),
     "Conv-AP": dataclasses.replace(MODEL, aggregator=ConvApConfig(16)),
     "CosPlace": dataclasses.replace(MODEL, aggregator=CosPlaceConfig(16)),

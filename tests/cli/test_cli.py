@@ -261,7 +261,7 @@ def test_a_run_from_the_command_line_and_the_same_command_again(
     )
     out = succeeds(capfd, *arguments)
     assert "8 places, 24 images; validation on town/test (@UTM, 25 m)" in out
-    assert f"{STEPS} steps, best Recall@5" in out
+    assert f"{STEPS} steps, best R@5" in out
     assert (tmp_path / "run" / "curves.png").stat().st_size > 0
     found, expected = (
         load_weights(folder / "last.safetensors") for folder in (tmp_path / "run", run)
@@ -274,7 +274,7 @@ def test_a_run_from_the_command_line_and_the_same_command_again(
 
     log = (tmp_path / "run" / "metrics.jsonl").read_bytes()
     out = succeeds(capfd, *arguments)
-    assert f"{STEPS} steps, best Recall@5" in out
+    assert f"{STEPS} steps, best R@5" in out
     assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == log
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +18,15 @@ from crisalad_jax.utils.pytree import named_leaves
 GRID = (3, 5)
 
 
-@pytest.mark.parametrize("special", [1, 5])
-@pytest.mark.parametrize("kernel_size", [1, 3, 5])
-def test_equals_torch(special: int, kernel_size: int) -> None:
-    config = ViTConfig(dim=16, heads=2, adapter=AdapterConfig(kernel_size=kernel_size))
+@pytest.mark.parametrize(
+    ("special", "kernel_size", "bias"),
+    [(1, 1, "convolutions"), (1, 3, "up"), (5, 3, "convolutions"), (5, 5, "up")],
+)
+def test_equals_torch(special: int, kernel_size: int, bias: Literal["convolutions", "up"]) -> None:
+    chosen = AdapterConfig(kernel_size=kernel_size, bias=bias)
+    config = ViTConfig(dim=16, heads=2, adapter=chosen)
     params = init_adapter(jax.random.key(0), config.dim, config.adapter)
-    up = dataclasses.replace(
-        params.up, weight=jax.random.normal(jax.random.key(1), params.up.weight.shape)
-    )
+    up = jax.tree.map(lambda x: jax.random.normal(jax.random.key(1), x.shape), params.up)
     params = dataclasses.replace(params, up=up)
     tokens = jax.random.normal(jax.random.key(2), (special + 15, 16))
 
@@ -40,16 +42,19 @@ def test_equals_torch(special: int, kernel_size: int) -> None:
     )
     maps = torch.nn.functional.conv2d(maps, t.pointwise.weight.T[..., None, None], t.pointwise.bias)
     branch = torch.cat([hidden[:special], torch.relu(maps)[0].reshape(8, -1).T])
-    expected = (branch + hidden) @ t.up.weight
+    expected = (branch + hidden) @ t.up.weight + (0 if t.up.bias is None else t.up.bias)
     # Chains of at most 25 products of order 1, then 8 of order 10.
     np.testing.assert_allclose(adapter(params, tokens, GRID), expected, atol=2e-5)
 
 
-def test_the_papers_adapter_has_its_parameter_count() -> None:
-    """741.504 K in Table 3."""
-    make = functools.partial(init_adapter, dim=768, config=AdapterConfig())
-    shapes = jax.eval_shape(make, jax.random.key(0))
-    assert sum(leaf.size for leaf in jax.tree.leaves(shapes)) == 741_504
+@pytest.mark.parametrize("bias", ["convolutions", "up"])
+def test_the_papers_adapter_has_its_parameter_count(bias: Literal["convolutions", "up"]) -> None:
+    """741.504 K in Table 3, in both readings."""
+    make = functools.partial(init_adapter, dim=768, config=AdapterConfig(bias=bias))
+    shapes = named_leaves(jax.eval_shape(make, jax.random.key(0)))
+    assert sum(leaf.size for leaf in shapes.values()) == 741_504
+    biases = {name.partition(".")[0] for name in shapes if name.endswith("bias")}
+    assert biases == ({"depthwise", "pointwise"} if bias == "convolutions" else {"up"})
 
 
 def test_cricavprs_adapter_has_its_parameter_count() -> None:
@@ -71,6 +76,21 @@ def test_an_untrained_adapter_adds_nothing(kind: str) -> None:
     params = init_adapter(jax.random.key(0), config.dim, config.adapter)
     tokens = jax.random.normal(jax.random.key(2), (16, 32))
     np.testing.assert_array_equal(adapter(params, tokens, GRID), jnp.zeros((16, 32)))
+
+
+def test_cricavprs_convolutions_start_at_1e_5() -> None:
+    """Weights and biases, as Lu-Feng/CricaVPR's train.py sets them; batch norms as torch's."""
+    config = AdapterConfig(kind="multi-resolution")
+    params = named_leaves(init_adapter(jax.random.key(0), 32, config))
+    convolutions = [name for name in params if ".conv." in name]
+    assert len(convolutions) == 10
+    starts = dict.fromkeys(convolutions, np.float32(1e-5))
+    starts |= {name: 0.0 for name in params if name.endswith(("norm.bias", "running_mean"))}
+    starts |= {name: 1.0 for name in params if name.endswith(("norm.weight", "running_var"))}
+    starts |= {"up.weight": 0.0, "up.bias": 0.0}
+    assert params.keys() - starts.keys() == {"down.weight", "down.bias"}
+    for name, value in starts.items():
+        np.testing.assert_array_equal(params[name], value, err_msg=name)
 
 
 def test_no_adapter_is_none() -> None:

@@ -32,6 +32,8 @@ from crisalad_jax.nn.layers import (
     layer_norm,
     linear,
     split_key,
+    split_statistics,
+    train_batch_norm,
 )
 
 
@@ -203,6 +205,65 @@ def test_starts_are_torch_defaults() -> None:
     for layer, bound in ((depthwise, 1 / 3), (full, 1 / math.sqrt(3 * 3 * 16))):
         for values in (layer.weight, layer.bias):
             assert 0.99 * bound < float(jnp.abs(values).max()) <= bound
+
+
+@pytest.mark.parametrize("images", [4, 1])
+def test_batch_norm_in_training_equals_torchs(images: int) -> None:
+    """Output, gradients, and running statistics after two batches, with a padded image.
+
+    Values are of order 10 about means of order 10: float32 rounds them by 1e-6, and the variances,
+    whose sums are of 12 to 48 squares, by some 1e-5 of themselves.
+    """
+    layer = torch.nn.BatchNorm2d(3, eps=1e-3).train()
+    start = {name: normal(i, 3) for i, name in enumerate(("weight", "bias", "running_mean"))}
+    start["running_var"] = np.array([0.1, 1.0, 10.0], np.float32)
+    layer.load_state_dict({n: torch.tensor(x) for n, x in start.items()}, strict=False)
+    params = BatchNorm(**{name: jnp.asarray(x) for name, x in start.items()})
+    valid = jnp.arange(images + 1) < images
+    for seed in (5, 6):
+        x = 10 * normal(seed, images + 1, 3, 4, 3) + 10 * normal(seed + 10, 3)
+        towards = normal(seed + 20, images, 3, 4, 3)
+        tensor = torch.tensor(x[:images]).permute(0, 3, 1, 2).requires_grad_()
+        theirs = layer(tensor)
+        layer.zero_grad()
+        theirs.backward(torch.tensor(towards).permute(0, 3, 1, 2))
+
+        def total(params: BatchNorm, x: jax.Array, towards: np.ndarray = towards) -> Any:
+            y, updated = train_batch_norm(params, x, valid, epsilon=1e-3)
+            return (y[:images] * towards).sum(), (y[:images], updated)
+
+        gradient = jax.value_and_grad(total, argnums=(0, 1), has_aux=True)
+        (_, (ours, updated)), (of_params, of_x) = gradient(params, jnp.asarray(x))
+        np.testing.assert_allclose(ours, theirs.detach().permute(0, 2, 3, 1), atol=1e-5)
+        assert tensor.grad is not None
+        np.testing.assert_allclose(of_x[:images], tensor.grad.permute(0, 2, 3, 1), atol=1e-5)
+        assert not of_x[images:].any()
+        for name in ("weight", "bias"):
+            expected = getattr(layer, name).grad
+            np.testing.assert_allclose(getattr(of_params, name), expected, rtol=1e-5, atol=1e-4)
+        for name in ("running_mean", "running_var"):
+            assert not getattr(of_params, name).any()
+            np.testing.assert_allclose(getattr(updated, name), getattr(layer, name), rtol=1e-5)
+        params = updated
+
+
+def test_batch_norm_of_no_image_keeps_its_statistics() -> None:
+    params = init_batch_norm(3)
+    nothing = jnp.zeros(2, bool)
+    y, updated = train_batch_norm(params, jnp.asarray(normal(0, 2, 5, 3)), nothing, epsilon=1e-3)
+    assert np.isfinite(y).all()
+    np.testing.assert_array_equal(updated.running_mean, params.running_mean)
+    np.testing.assert_array_equal(updated.running_var, params.running_var)
+
+
+def test_statistics_are_found_wherever_they_are() -> None:
+    tree = {"first": (init_batch_norm(2), jnp.ones(3)), "running_mean": jnp.ones(1)}
+    statistics, rest = split_statistics(tree)
+    assert statistics["first"][0].weight is None
+    assert statistics["first"][1] is None
+    assert rest["first"][0].running_var is None
+    assert rest["running_mean"] is None
+    assert len(jax.tree.leaves(statistics)) == 3
 
 
 def test_batch_norm_starts_as_torchs() -> None:

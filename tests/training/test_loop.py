@@ -286,6 +286,24 @@ def test_a_validation_watches_the_transport_on_the_first_queries(
     assert logged == [0.25, 0.5, 4.0]
 
 
+@pytest.mark.parametrize(
+    ("select_by", "best"),
+    # Of R@5 0.25 and 0.75 the R@1 are 0.75 and 0.25, and the sums equal: the first counts.
+    [("R@1", [0.75, 1]), ("R@5", [0.75, 2]), ("R@1+R@5", [1.0, 1])],
+)
+def test_the_best_weights_are_chosen_by_the_recall_that_is_named(
+    tmp_path, places, params, benchmark, monkeypatch, select_by, best
+):
+    scripted(monkeypatch, [0.25, 0.75])
+    config = dataclasses.replace(RECIPE, select_by=select_by)
+    run = open_run(config, places, tmp_path, params, benchmark)
+    for step in (1, 2):
+        run.step = step
+        run.validate(SignalState())
+    run.close()
+    assert run.record.best == [best]
+
+
 def test_without_salad_a_validation_has_no_transport_to_watch(
     tmp_path, places, benchmark, monkeypatch
 ):

@@ -7,6 +7,7 @@ import warnings
 import jax
 import numpy as np
 import pytest
+import torch
 
 from crisalad_jax.data.places import read_places
 from crisalad_jax.training import loop
@@ -14,6 +15,7 @@ from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.optimiser import learning_rate_schedule, with_short_warmup
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.step import StepConfig, init_train_state
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
 from tests.conftest import MODEL, RECIPE, STEPS
 
@@ -66,3 +68,97 @@ def test_a_shortened_warm_up_reaches_the_learning_rate() -> None:
 def test_published_recipes_keep_their_warm_up() -> None:
     assert recipe("tiny").optimiser.warmup_steps == 30
     assert recipe("b14").optimiser.warmup_steps == 0
+
+
+EPOCH, STEPS_OF_RUN = 7, 300
+"""Steps of an epoch, and of a run of some 43 epochs."""
+
+
+def warmed_up(count: int, lengths: list[int], gamma: float) -> tuple[OptimiserConfig, list[float]]:
+    """As MixVPR's, Conv-AP's and BoQ's code: torch's MultiStepLR by epoch, and a rate that the
+    warm-up sets anew before each of its steps."""
+    ours = OptimiserConfig(
+        learning_rate=0.05,
+        schedule="milestones",
+        milestones=tuple(lengths),
+        step_gamma=gamma,
+        warmup_steps=count,
+    )
+    optimiser = torch.optim.SGD([torch.zeros(1)], lr=0.05)
+    scheduler = torch.optim.lr_scheduler.MultiStepLR(optimiser, lengths, gamma)
+    rates = []
+    for step in range(STEPS_OF_RUN):
+        (group,) = optimiser.param_groups
+        if step < count:
+            group["lr"] = min(1.0, (step + 1) / count) * 0.05
+        rates.append(group["lr"])
+        optimiser.step()
+        if (step + 1) % EPOCH == 0:
+            scheduler.step()
+    return ours, rates
+
+
+def stepped(ours: OptimiserConfig, make) -> tuple[OptimiserConfig, list[float]]:
+    """A scheduler that takes a step after each of the optimiser's."""
+    optimiser = torch.optim.SGD([torch.zeros(1)], lr=ours.learning_rate)
+    scheduler, rates = make(optimiser), []
+    for _ in range(STEPS_OF_RUN):
+        rates.append(optimiser.param_groups[0]["lr"])
+        optimiser.step()
+        scheduler.step()
+    return ours, rates
+
+
+SCHEDULES = {
+    "MixVPR": lambda: warmed_up(23, [5, 10, 15, 25, 40], 0.3),
+    "Conv-AP, a milestone within the warm-up": lambda: warmed_up(40, [5, 10, 15, 25], 0.3),
+    "a milestone at the warm-up's end": lambda: warmed_up(35, [5, 10], 0.3),
+    "BoQ": lambda: warmed_up(10 * EPOCH, [10, 20], 0.1),
+    "no warm-up": lambda: warmed_up(0, [5, 10], 0.3),
+    "SALAD": lambda: stepped(
+        OptimiserConfig(learning_rate=6e-5, end_lr_fraction=0.2, decay_steps=200),
+        lambda each: torch.optim.lr_scheduler.LinearLR(each, 1.0, 0.2, total_iters=200),
+    ),
+    "CricaVPR": lambda: stepped(
+        OptimiserConfig(learning_rate=1e-4, schedule="step"),
+        lambda each: torch.optim.lr_scheduler.StepLR(each, 3 * EPOCH, 0.5),
+    ),
+    "EDTformer": lambda: stepped(
+        OptimiserConfig(learning_rate=1e-4, schedule="step", step_gamma=0.7),
+        lambda each: torch.optim.lr_scheduler.LambdaLR(each, lambda n: 0.7 ** (n // (3 * EPOCH))),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_the_learning_rate_of_every_step_is_torchs(name: str) -> None:
+    ours, theirs = SCHEDULES[name]()
+    schedule = learning_rate_schedule(ours, STEPS_OF_RUN, EPOCH)
+    rates = [float(schedule(step)) for step in range(STEPS_OF_RUN)]
+    # Sums and powers in float32.
+    np.testing.assert_allclose(rates, theirs, rtol=2e-6)
+    assert len(set(theirs)) > 2
+
+
+def test_a_warm_up_in_epochs_is_one_in_steps() -> None:
+    for schedule in ("linear", "step", "milestones"):
+        options = {"schedule": schedule, "milestones": (10, 20)}
+        in_steps = learning_rate_schedule(OptimiserConfig(warmup_steps=70, **options), 300, 7)
+        in_epochs = learning_rate_schedule(OptimiserConfig(warmup_epochs=10, **options), 300, 7)
+        assert [in_steps(step) for step in (0, 69, 70, 299)] == [
+            in_epochs(step) for step in (0, 69, 70, 299)
+        ]
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"schedule": "milestones"}, r"OptimiserConfig\.milestones: found \(\), expected numbers"),
+        ({"schedule": "milestones", "milestones": (5, 5)}, r"milestones: found \(5, 5\), expected"),
+        ({"warmup_steps": 3, "warmup_epochs": 2}, "warmup_epochs: found 2 beside warmup_steps 3"),
+        ({"momentum": 1.0}, r"OptimiserConfig\.momentum: found 1\.0"),
+    ],
+)
+def test_schedules_that_do_not_fit_are_refused(fields, words) -> None:
+    with pytest.raises(InputError, match=words):
+        OptimiserConfig(**fields)

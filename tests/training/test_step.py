@@ -250,6 +250,30 @@ def test_adam_with_steps_down_equals_torch(decay: float) -> None:
     np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
 
 
+def test_sgd_with_momentum_equals_torch() -> None:
+    """Nine steps of MixVPR's: momentum, weight decay, and a fall after the second epoch."""
+    config = OptimiserConfig(
+        kind="sgd",
+        learning_rate=0.1,
+        schedule="milestones",
+        milestones=(2,),
+        step_gamma=0.3,
+        weight_decay=1e-3,
+    )
+    start, *gradients = np.random.default_rng(0).standard_normal((10, 7))
+    tensor = torch.tensor(start, requires_grad=True)
+    theirs = torch.optim.SGD([tensor], lr=0.1, momentum=0.9, weight_decay=1e-3)
+    down = torch.optim.lr_scheduler.MultiStepLR(theirs, [2], 0.3)
+    for step, gradient in enumerate(gradients):
+        tensor.grad = torch.tensor(gradient)
+        theirs.step()
+        if step % 2 == 1:
+            down.step()
+    ours = optimised(config, start, gradients, steps_per_epoch=2)
+    # Sums of nine steps of order 1, each rounded to 1e-16.
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
+
+
 def optimised(
     config: OptimiserConfig,
     start: np.ndarray,

@@ -134,12 +134,12 @@ def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:
                 yield Entry((f"{here}.norm.{name}",), (f"{there}.bn.{name}",), SAME)
             count = "num_batches_tracked"
             yield Extra(f"{here}.norm.{count}", f"{there}.bn.{count}", (), np.int64)
-    bias = kind != "depthwise"
-    yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=bias)
-    if kind == "depthwise":
-        yield from affine(f"{ours}.depthwise", f"{theirs}.depthwise", DEPTHWISE)
-        yield from affine(f"{ours}.pointwise", f"{theirs}.pointwise", POINTWISE)
-    yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR, bias=bias)
+    depthwise, bias = kind == "depthwise", config.adapter.bias == "convolutions"
+    yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=not depthwise)
+    if depthwise:
+        yield from affine(f"{ours}.depthwise", f"{theirs}.depthwise", DEPTHWISE, bias=bias)
+        yield from affine(f"{ours}.pointwise", f"{theirs}.pointwise", POINTWISE, bias=bias)
+    yield from affine(f"{ours}.up", f"{theirs}.D_fc2", LINEAR, bias=not (depthwise and bias))
 
 
 def vit_config(read: Reader) -> ViTConfig:
@@ -170,7 +170,8 @@ def _adapter_config(read: Reader, width: int) -> AdapterConfig:
     if not read.has("blocks.0.adapter.depthwise.weight"):
         return adapter
     side = read.size("blocks.0.adapter.depthwise.weight", 2)
-    return dataclasses.replace(adapter, kind="depthwise", kernel_size=side)
+    bias = "convolutions" if read.has("blocks.0.adapter.depthwise.bias") else "up"
+    return dataclasses.replace(adapter, kind="depthwise", kernel_size=side, bias=bias)
 
 
 def backbone_config(

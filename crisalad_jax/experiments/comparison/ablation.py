@@ -137,7 +137,9 @@ class AdapterCost(NamedTuple):
 NOTES = (
     "Table 3 at the paper's size: ViT-B/14, 224 x 224 pixels, 256 patches and a class token.",
     "Parameters as the paper counts them: of the depthwise adapter all weights, the biases of its "
-    "two convolutions, and none of its two linears, which have none: 741,504. Of the "
+    "two convolutions, and none of its two linears, which have none: 741,504. The other reading, a "
+    "bias of the up-projection and none of the convolutions, has as many "
+    '(`AdapterConfig.bias="up"`). Of the '
     "multi-resolution adapter all weights and the biases of its two linears, without its "
     "convolutions' biases (432) and its batch norms (864, and 864 running statistics): 761,472.",
     "MACs as the paper counts them: each linear once an image, convolutions at 256 positions, "

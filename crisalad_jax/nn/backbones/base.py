@@ -4,10 +4,11 @@ import abc
 import dataclasses
 from typing import Any, ClassVar, Literal, NamedTuple
 
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.nn.layers import split_statistics
 
 
 class Features(NamedTuple):
@@ -84,6 +85,37 @@ class Backbone(Part, abc.ABC):
         Raises:
             InputError: while tracing, for a request that this backbone cannot meet.
         """
+
+    def apply_training(
+        self,
+        params: Any,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+        valid: Bool[Array, " image"],
+    ) -> tuple[Features, Any]:
+        """Return the features of a training batch, and the running statistics after it.
+
+        A backbone with batch norms overrides it, by `layers.train_batch_norm`. By default the
+        features are those of `apply`, and the statistics stay as they are.
+
+        Args:
+            params: see `apply`.
+            images: see `apply`.
+            request: see `apply`.
+            remat: see `apply`.
+            valid: which images are no padding; the statistics are taken of these.
+
+        Returns:
+            (features, statistics): a tree of the structure of `params`, which holds the running
+            statistics (`layers.split_statistics`), and None for all other leaves.
+
+        Raises:
+            InputError: as `apply`.
+        """
+        features = self.apply(params, images, request, remat=remat)
+        return features, split_statistics(params)[0]
 
     @property
     def extras(self) -> str:

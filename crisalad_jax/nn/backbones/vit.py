@@ -9,17 +9,23 @@ import itertools
 import math
 import operator
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from crisalad_jax.config.checks import choose, require, require_positive
 from crisalad_jax.config.fields import free_field
-from crisalad_jax.nn.adapter import Adapter, AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.adapter import (
+    Adapter,
+    AdapterConfig,
+    adapter,
+    init_adapter,
+    train_adapter,
+)
 from crisalad_jax.nn.attention import Attention, attention
 from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
@@ -30,6 +36,7 @@ from crisalad_jax.nn.layers import (
     init_layer_norm,
     layer_norm,
     linear,
+    split_statistics,
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -167,6 +174,18 @@ class ViTConfig(Backbone):
         """Return the features of normalised images whose sides are multiples of 14."""
         return vit(params, images, self, request, remat=remat)
 
+    def apply_training(
+        self,
+        params: ViT,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+        valid: Bool[Array, " image"],
+    ) -> tuple[Features, ViT]:
+        """Return the features of a training batch, and the statistics of adapters' batch norms."""
+        return train_vit(params, images, self, request, remat=remat, valid=valid)
+
     def split_blocks(self, params: ViT, first: int) -> ViT:
         """Cut the stack of blocks in two."""
         stack = _one_stack(params)
@@ -260,6 +279,35 @@ def vit(
             several levels of a facet or without the last block, or, of adapters on a path beside
             the blocks, other tokens than the last block's, or inserted ones.
     """
+    return train_vit(params, images, config, request, remat=remat, valid=None)[0]
+
+
+def train_vit(
+    params: ViT,
+    images: Float[Array, "image height width 3"],
+    config: ViTConfig,
+    request: FeatureRequest,
+    *,
+    remat: str,
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Features, ViT]:
+    """Compute the features of a training batch, by the batch norms' statistics of the batch.
+
+    Args:
+        params: see `vit`.
+        images: see `vit`.
+        config: see `vit`.
+        request: see `vit`; of a facet the stored statistics are taken, and stay.
+        remat: `ModelConfig.remat`.
+        valid: which images the statistics are taken of. None takes the stored ones, which stay.
+
+    Returns:
+        (features, statistics): a tree of the structure of `params`, which holds the updated running
+        statistics, and None for all other leaves.
+
+    Raises:
+        InputError: as `vit`.
+    """
     levels = (config.depth,) if request.levels is None else request.levels
     require(
         levels[0] > 0 and levels[-1] <= config.depth and list(levels) == sorted(set(levels)),
@@ -271,28 +319,36 @@ def vit(
         f"{config.depth}",
     )
     tokens = jax.vmap(lambda image: embed(params, image, config))(images)
-    outputs = []
+    grid = grid_of(images[0])
+    blocks, outputs = params.blocks, []
     if request.inserted is not None:
-        outputs.append(_with_inserted(params, tokens, grid_of(images[0]), config, request, remat))
+        tokens, measured = _with_inserted(
+            params, tokens, grid, config, request, remat=remat, valid=valid
+        )
+        blocks = _as_cut(measured, params.blocks)
+        outputs.append(tokens)
     elif request.facet == "token" and levels[-1] == config.depth:
-        for part in _cut_at(params.blocks, levels):
-            shorter = dataclasses.replace(params, blocks=part)
-            tokens = run_blocks(shorter, tokens, grid_of(images[0]), config, remat=remat)
+        measured = []
+        for stack_group in _cut_at(params.blocks, levels):
+            tokens, parts = _run_stacks(stack_group, tokens, grid, config, remat=remat, valid=valid)
+            measured += parts
             outputs.append(tokens)
+        blocks = _as_cut(measured, params.blocks)
     else:
         require(
             len(levels) == 1,
             f"levels: found {levels}, expected one of a facet, and several of tokens alone, up to "
             f"the last block {config.depth}",
         )
-        outputs.append(_facet(params, tokens, grid_of(images[0]), config, levels[0], request.facet))
+        outputs.append(_facet(params, tokens, grid, config, levels[0], request.facet))
     if request.norm:
         outputs = [layer_norm(params.norm, level, epsilon=NORM_EPSILON) for level in outputs]
     front = 0 if request.inserted is None else len(request.inserted)
     patches = [level[:, front + 1 + config.registers :] for level in outputs]
     joined = patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1)
     inserted = None if request.inserted is None else outputs[-1][:, :front]
-    return Features(outputs[-1][:, front], joined, inserted)
+    statistics, _ = split_statistics(dataclasses.replace(params, blocks=blocks))
+    return Features(outputs[-1][:, front], joined, inserted), statistics
 
 
 def _with_inserted(
@@ -301,8 +357,10 @@ def _with_inserted(
     grid: tuple[int, int],
     config: ViTConfig,
     request: FeatureRequest,
+    *,
     remat: str,
-) -> Float[Array, "image all dim"]:
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Float[Array, "image all dim"], list[Block]]:
     """Run all blocks, with the requested tokens in front after the first `request.insertion`."""
     assert request.insertion is not None
     assert request.inserted is not None
@@ -312,12 +370,11 @@ def _with_inserted(
         "expected none of these",
     )
     before, after = _cut_at(params.blocks, (request.insertion, config.depth))
-    tokens = run_blocks(
-        dataclasses.replace(params, blocks=before), tokens, grid, config, remat=remat
-    )
+    run = functools.partial(_run_stacks, grid=grid, config=config, remat=remat, valid=valid)
+    tokens, first = run(before, tokens)
     front = jnp.broadcast_to(request.inserted, (len(tokens), *request.inserted.shape))
-    tokens = jnp.concatenate([front.astype(tokens.dtype), tokens], axis=1)
-    return run_blocks(dataclasses.replace(params, blocks=after), tokens, grid, config, remat=remat)
+    tokens, last = run(after, jnp.concatenate([front.astype(tokens.dtype), tokens], axis=1))
+    return tokens, first + last
 
 
 def _cut_at(
@@ -335,6 +392,18 @@ def _cut_at(
             parts.append(jax.tree.map(operator.itemgetter(chosen), stack))
             start += len(stack.ls1)
         yield tuple(part for part in parts if len(part.ls1))
+
+
+def _as_cut(parts: Sequence[Block], blocks: Block | tuple[Block, ...]) -> Any:
+    """Join parts of a stack of blocks in order, and cut the whole as `blocks` are cut."""
+    whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    if isinstance(blocks, Block):
+        return whole
+    ends = itertools.accumulate(len(stack.ls1) for stack in blocks)
+    return tuple(
+        jax.tree.map(operator.itemgetter(slice(begin, end)), whole)
+        for begin, end in itertools.pairwise((0, *ends))
+    )
 
 
 def _facet(
@@ -398,28 +467,43 @@ def run_blocks(
     *,
     remat: str = "dots",
 ) -> Float[Array, "image token dim"]:
-    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`.
+    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`."""
+    stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
+    return _run_stacks(stacks, tokens, grid, config, remat=remat, valid=None)[0]
+
+
+def _run_stacks(
+    stacks: Sequence[Block],
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: ViTConfig,
+    *,
+    remat: str,
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Float[Array, "image token dim"], list[Block]]:
+    """Run stacks of blocks in turn; return the tokens and each stack's running statistics.
 
     Side adapters have a path beside the blocks, from which the tokens come. After every block its
     adapter takes the sum of both paths.
     """
-    side = config.adapter.kind == "side"
 
-    def body(carry: Carry, layer: Block) -> tuple[Carry, None]:
+    def body(carry: Carry, layer: Block) -> tuple[Carry, Block]:
         if isinstance(carry, jax.Array):
-            return block(layer, carry, grid, config), None
+            return train_block(layer, carry, grid, config, valid)
         tokens, beside = carry
         tokens = block(dataclasses.replace(layer, adapter=None), tokens, grid, config)
-        return (tokens, _beside(layer, tokens + beside, grid, config)), None
+        carry = tokens, _beside(layer, tokens + beside, grid, config)
+        return carry, split_statistics(layer)[0]
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=choose("remat", remat, _POLICIES))
-    stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
-    carry: Carry = (tokens, tokens) if side else tokens
+    statistics = []
+    carry: Carry = (tokens, tokens) if config.adapter.kind == "side" else tokens
     with jax.named_scope("blocks"):
         for stack in stacks:
-            carry, _ = jax.lax.scan(body, carry, stack)
-    return carry if isinstance(carry, jax.Array) else carry[1]
+            carry, measured = jax.lax.scan(body, carry, stack)
+            statistics.append(measured)
+    return carry if isinstance(carry, jax.Array) else carry[1], statistics
 
 
 def _beside(
@@ -436,6 +520,28 @@ def block(
     params: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
 ) -> Float[Array, "image token dim"]:
     """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR."""
+    return train_block(params, tokens, grid, config, None)[0]
+
+
+def train_block(
+    params: Block,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: ViTConfig,
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Float[Array, "image token dim"], Block]:
+    """Run one block on a training batch.
+
+    Args:
+        params: the block.
+        tokens: of a batch of images.
+        grid: rows and columns of patches.
+        config: the backbone.
+        valid: which images the batch norms' statistics are taken of; None takes the stored ones.
+
+    Returns:
+        (tokens, statistics): the second as `train_vit` returns it.
+    """
     normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
     attended = attention(params.attn, normed, config.heads, key=None)
     tokens = (at_least_float32(tokens) + params.ls1 * at_least_float32(attended)).astype(
@@ -446,8 +552,14 @@ def block(
     update = feed_forward(params.mlp, normed)
     if params.adapter is not None:
         with jax.named_scope("adapter"):
-            update = update + config.adapter.alpha * adapter(params.adapter, normed, grid)
-    return (at_least_float32(tokens) + params.ls2 * at_least_float32(update)).astype(tokens.dtype)
+            if valid is None:
+                adapted = adapter(params.adapter, normed, grid)
+            else:
+                adapted, trained = train_adapter(params.adapter, normed, grid, valid)
+                params = dataclasses.replace(params, adapter=trained)
+            update = update + config.adapter.alpha * adapted
+    tokens = (at_least_float32(tokens) + params.ls2 * at_least_float32(update)).astype(tokens.dtype)
+    return tokens, split_statistics(params)[0]
 
 
 def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:

@@ -10,7 +10,10 @@ from crisalad_jax.training.recipes.base import register_recipe
 
 @register_recipe("cricavpr")
 def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make CricaVPR's recipe: multi-resolution adapters, a GeM pyramid, Adam with step decay."""
+    """Make CricaVPR's recipe: multi-resolution adapters, a GeM pyramid, Adam with step decay.
+
+    Its README trains 10 epochs, fewer than its patience of 10 would ever end.
+    """
     adapter = AdapterConfig(kind="multi-resolution")
     backbone = dataclasses.replace(model.backbone, adapter=adapter)
     return TrainConfig(
@@ -19,4 +22,6 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
             kind="adam", learning_rate=1e-4, schedule="step", weight_decay=0.0
         ),
         places_per_batch=72,
+        epochs=10,
+        patience=10,
     )
