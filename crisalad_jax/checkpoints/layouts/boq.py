@@ -16,8 +16,11 @@ from crisalad_jax.checkpoints.layouts.forms import (
 )
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
+
+_CHAIN = PreprocessingConfig(filter="bicubic", pixels="floats")
 
 
 @register_head("boq")
@@ -53,6 +56,7 @@ register_over_dinov2(
     infer_boq,
     prefix="backbone.dino.",
     image_size=(322, 322),
+    preprocessing=_CHAIN,
 )
 
 register_over_cnn(
@@ -64,4 +68,5 @@ register_over_cnn(
     names=Names("backbone.net.", numbered=True),
     mark="aggregator.proj_c.weight",
     image_size=lambda state: (384, 384),
+    preprocessing=lambda head: _CHAIN,
 )

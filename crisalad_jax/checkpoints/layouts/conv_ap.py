@@ -6,6 +6,7 @@ from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.cnn import Names
 from crisalad_jax.checkpoints.layouts.forms import POINTWISE, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 
@@ -21,6 +22,11 @@ def infer_conv_ap(state: State) -> ConvApConfig:
     return ConvApConfig(channels=Reader(state).size("aggregator.channel_pool.weight", 0))
 
 
+def _chain(head: ConvApConfig) -> PreprocessingConfig:
+    """Return the filter by the README: bicubic for the model of 4,096 numbers alone."""
+    return PreprocessingConfig(filter="bicubic" if head.channels == 1024 else "bilinear")
+
+
 register_over_cnn(
     "conv-ap",
     "Conv-AP .ckpt",
@@ -30,4 +36,5 @@ register_over_cnn(
     names=Names("backbone.model.", numbered=False),
     mark="aggregator.channel_pool.weight",
     image_size=lambda state: (320, 320),
+    preprocessing=_chain,
 )

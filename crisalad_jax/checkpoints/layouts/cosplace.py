@@ -6,6 +6,7 @@ from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.cnn import Names
 from crisalad_jax.checkpoints.layouts.forms import FIRST, LINEAR, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
 from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
@@ -38,5 +39,6 @@ register_over_cnn(
     backbones=(ResNetConfig, VggConfig),
     names=Names("backbone.", numbered=True),
     mark="aggregation.3.weight",
-    image_size=lambda state: (480, 640),
+    image_size=lambda state: (512, 512),
+    preprocessing=lambda head: PreprocessingConfig(size_rule="native"),
 )

@@ -4,6 +4,7 @@ import functools
 
 from crisalad_jax.checkpoints.layouts.mixvpr import infer_mixvpr
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 
 register_over_dinov2(
     "dino-mix",
@@ -12,5 +13,6 @@ register_over_dinov2(
     functools.partial(infer_mixvpr, last_norm=False),
     prefix="backbone.dino_model.",
     norm=False,
+    preprocessing=PreprocessingConfig(pixels="floats"),
     under="state_dict",
 )

@@ -12,6 +12,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
     torch_attention,
 )
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
 
 
@@ -51,6 +52,7 @@ register_over_dinov2(
     mark="queries",
     first=1,
     image_size=(322, 322),
+    preprocessing=PreprocessingConfig(pixels="floats", round_to_patch=True),
     adapter="side",
     module="module.",
     under="model_state_dict",

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import FIRST, Entry
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 
 _TOKENS = "learnable_aggregation_tokens"
@@ -30,6 +31,7 @@ register_over_dinov2(
     mark=_TOKENS,
     first=1,
     image_size=(322, 322),
+    preprocessing=PreprocessingConfig(pixels="floats", round_to_patch=True),
     backbone={"position_resize": "plain"},
     module="module.",
     under="model_state_dict",

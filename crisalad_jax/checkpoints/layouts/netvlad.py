@@ -7,6 +7,7 @@ from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.cnn import Names
 from crisalad_jax.checkpoints.layouts.forms import POINTWISE, SAME, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 
@@ -36,7 +37,8 @@ for _name, _holds, _inner in (
         backbones=(VggConfig,),
         names=Names(f"encoder.{_inner}", numbered=True),
         mark=f"{_pool}centroids",
-        head=functools.partial(netvlad_lines, prefix=_pool),
+        lines_of_head=functools.partial(netvlad_lines, prefix=_pool),
         image_size=lambda state: (480, 640),
+        preprocessing=lambda head: PreprocessingConfig(size_rule="native"),
         under="state_dict",
     )

@@ -80,11 +80,11 @@ register_over_cnn(
     backbones=(VggConfig,),
     names=Names("backbone.", numbered=True),
     mark="netvlad.centers",
-    head=_hloc_lines,
+    lines_of_head=_hloc_lines,
     projection="whiten",
     projection_form=_WHITENING_COLUMNS,
     image_size=lambda state: _LARGEST,
-    preprocessing=_chain(_MEAN),
+    preprocessing=lambda head: _chain(_MEAN),
 )
 
 

@@ -32,12 +32,12 @@ def register_over_cnn(
     names: Names,
     mark: str,
     image_size: Callable[[State], tuple[int, int]],
-    head: Callable[[Any], Lines] | None = None,
+    lines_of_head: Callable[[Any], Lines] | None = None,
     projection: str | None = None,
     projection_form: Form = LINEAR,
     module: str = "",
     under: str | None = None,
-    preprocessing: PreprocessingConfig = PreprocessingConfig(),
+    preprocessing: Callable[[Any], PreprocessingConfig] = lambda head: PreprocessingConfig(),
 ) -> None:
     """Register the layout of one family of models.
 
@@ -50,12 +50,12 @@ def register_over_cnn(
         names: how its files name their layers.
         mark: a name that only files of this family, or of the same names, have.
         image_size: returns the height and width in pixels that the models are evaluated at.
-        head: yields the aggregator's table; by default the registered one.
+        lines_of_head: yields the aggregator's table; by default the registered one.
         projection: their name of the projection; None without one.
         projection_form: form of the projection's weight.
         module: see `name`.
         under: see `name`.
-        preprocessing: how the family's models resize and normalise images.
+        preprocessing: returns how a model with this head resizes and normalises images.
     """
     expected = f"aggregator {aggregator}, backbone "
     expected += " or ".join(kind.part_name for kind in backbones) + ", no encoder"
@@ -72,7 +72,7 @@ def register_over_cnn(
 
     def lines(config: ModelConfig) -> Lines:
         yield from cnn_lines(config.backbone, names)
-        yield from head_lines(config) if head is None else head(config.aggregator)
+        yield from head_lines(config) if lines_of_head is None else lines_of_head(config.aggregator)
         if projection is not None:
             yield from affine("projection", projection, projection_form)
 
@@ -81,12 +81,13 @@ def register_over_cnn(
         if not isinstance(backbone, backbones):
             wanted = " or ".join(kind.part_name for kind in backbones)
             raise InputError(f"found backbone {backbone.part_name}, expected {wanted}")
+        head = infer_head(state)
         dim = 0 if projection is None else Reader(state).size(f"{projection}.weight", 0)
         return ModelConfig(
             image_size=image_size(state),
-            preprocessing=preprocessing,
+            preprocessing=preprocessing(head),
             backbone=backbone,
-            aggregator=infer_head(state),
+            aggregator=head,
             cross_image=CrossImageConfig(layers=0),
             projection=ProjectionConfig(dim=dim),
         )

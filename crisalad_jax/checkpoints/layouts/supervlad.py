@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import POINTWISE, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.utils.errors import InputError
 
@@ -42,6 +43,7 @@ register_over_dinov2(
     prefix="backbone.",
     mark=f"{_CONV}.weight",
     image_size=(322, 322),
+    preprocessing=PreprocessingConfig(pixels="floats", round_to_patch=True),
     encoder=None,
     module="module.",
     under="model_state_dict",

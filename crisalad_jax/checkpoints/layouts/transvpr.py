@@ -22,6 +22,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
     Extra,
     affine,
 )
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.backbones.transvpr import WIDTHS, TransVprNetConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -46,7 +47,7 @@ def _accepts(config: ModelConfig) -> str | None:
         and not config.cross_image.layers
         and not config.projection.dim
     )
-    return None if fits else "aggregator transvpr, backbone transvpr, no encoder"
+    return None if fits else "aggregator transvpr, backbone transvpr-net, no encoder"
 
 
 def _lines(config: ModelConfig) -> Lines:
@@ -77,6 +78,7 @@ def _infer(state: State) -> ModelConfig:
     dim = read.size("transformer.class_emb", 2)
     return ModelConfig(
         image_size=(480, 640),
+        preprocessing=PreprocessingConfig(pixels="floats"),
         backbone=TransVprNetConfig(
             dim=dim,
             depth=read.count("transformer.blocks."),

@@ -58,7 +58,7 @@ class TransVprNet:
     """Layer norm of every block's output that is asked for."""
 
 
-@BACKBONES.register("transvpr", tiny={"dim": 64, "depth": 4})
+@BACKBONES.register("transvpr-net", tiny={"dim": 64, "depth": 4})
 @dataclasses.dataclass(frozen=True)
 class TransVprNetConfig(Backbone):
     """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
