@@ -109,10 +109,10 @@ def _is_ready(model: Published) -> bool:
         return False
     if not published.is_file():  # removed for the room
         return True
-    if record["stamp"] != _stamp(published):  # as after a copy of the folder
+    if not record.items() >= _stamp(published).items():  # as after a copy of the folder
         _check_same(model, record, sha256_of(published))
         with contextlib.suppress(InputError):  # where the cache is for reading alone
-            write_json(_folder(model) / _RECORD, record | {"stamp": _stamp(published)})
+            write_json(_folder(model) / _RECORD, record | _stamp(published))
     return record["version"] == VERSION
 
 
@@ -122,16 +122,16 @@ def _record(model: Published) -> dict[str, Any] | None:
     if not path.exists():
         return None
     record = read_json(path, "the record of a download", must=lambda _: True)
-    wrong = not isinstance(record, dict) or {"url", "sha256", "stamp", "version"} - record.keys()
+    wrong = not isinstance(record, dict) or {"sha256", "version"} - record.keys()
     if wrong:
         raise InputError(f"{path}: found no record of a download, expected one, or no such file")
     return record
 
 
-def _stamp(path: pathlib.Path) -> list[int]:
+def _stamp(path: pathlib.Path) -> dict[str, int]:
     """Return a file's size in bytes and time of change in nanoseconds."""
     status = path.stat()
-    return [status.st_size, status.st_mtime_ns]
+    return {"size": status.st_size, "changed_ns": status.st_mtime_ns}
 
 
 def _check_same(model: Published, record: Mapping[str, Any], digest: str) -> None:
@@ -225,5 +225,5 @@ def _convert(model: Published, published: pathlib.Path, *, fresh: bool) -> None:
             published.unlink()
         raise InputError(f"{model.name}: {error}") from error
     save_weights(_weights(model), checkpoint.params, checkpoint.config, extras=checkpoint.extras)
-    known = {"url": model.url, "file": model.file, "sha256": digest, "stamp": _stamp(published)}
-    write_json(_folder(model) / _RECORD, known | {"version": VERSION})
+    known = {"url": model.url, "file": model.file, "sha256": digest, "version": VERSION}
+    write_json(_folder(model) / _RECORD, known | _stamp(published))

@@ -131,7 +131,7 @@ def test_a_name_loads_what_its_file_holds_and_downloads_once(model, server, tmp_
     assert contents(folder) == ["record.json", "tiny-model.safetensors", FILE]
     record = json.loads((folder / "record.json").read_text())
     assert record["sha256"] == hashlib.sha256(DATA).hexdigest()
-    assert record["stamp"][0] == len(DATA)
+    assert record["size"] == len(DATA)
     assert (record["url"], record["file"]) == (model.url, FILE)
 
 

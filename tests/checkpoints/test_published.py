@@ -47,6 +47,9 @@ STORED = {
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
     "transvpr-msls": "zoo/layouts/transvpr",
     "transvpr-pitts30k": "zoo/layouts/transvpr",
+    "edtformer": "zoo/layouts/edtformer",
+    "image": "zoo/layouts/image_merged",
+    "image-gsv": "zoo/layouts/image_merged",
 }
 CHANGED = {"supervlad-1-cluster": {"aggregation.conv.weight": (3, 768, 1, 1)}}
 """Shapes that differ from the stored ones: the README's one cluster and two ghosts."""
