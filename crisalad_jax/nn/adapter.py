@@ -1,7 +1,8 @@
-"""The adapters of a block: the paper's (section 3.2), two others of its Table 2, and EDTformer's.
+"""The adapters of a block: the paper's (section 3.2), two others of its Table 2, and more.
 
 All project the tokens down, act on them, and project them up again. The up-projection starts at 0,
-so that an untrained adapter adds nothing. All but EDTformer's are beside the block's MLP.
+so that an untrained adapter adds nothing. All but EDTformer's are beside the block's MLP; SelaVPR
+has a second one after the attention.
 """
 
 import dataclasses
@@ -45,16 +46,18 @@ class AdapterConfig:
         'none'
     """
 
-    kind: Literal["depthwise", "multi-resolution", "mlp", "side", "none"] = "depthwise"
+    kind: Literal["depthwise", "multi-resolution", "mlp", "serial-parallel", "side", "none"] = (
+        "depthwise"
+    )
     """Kind of adapter: the paper's depthwise-separable convolution, CricaVPR's multi-resolution
-    one, or a plain MLP; or EDTformer's, on a path of their own beside all blocks (side); none
-    leaves it out."""
+    one, or a plain MLP; SelaVPR's plain MLPs, one after the attention and one beside the MLP; or
+    EDTformer's, on a path of their own beside all blocks (side); none leaves it out."""
     bottleneck: float = 0.5
     """Width of the adapter over the width of the backbone."""
     kernel_size: int = 3
     """Side of the depthwise filter."""
     alpha: float = 0.2
-    """Weight of the adapter's output (paper Eq. 2)."""
+    """Weight of the adapter's output (paper Eq. 2); a serial one has weight 1."""
     bias: Literal["convolutions", "up"] = "convolutions"
     """Layers of the depthwise adapter that have biases: its two convolutions, or the up-projection.
     The paper prints the count of parameters alone (Table 3), which is 741,504 in both readings."""
@@ -134,7 +137,16 @@ class SideAdapter:
     up: Linear
 
 
-Adapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter | SideAdapter
+@pytree_dataclass
+class SerialParallelAdapter:
+    """SelaVPR's adapters: after the attention, with a skip, and beside the MLP (Lu et al. 2024)."""
+
+    serial: MlpAdapter
+    parallel: MlpAdapter
+
+
+SingleAdapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter | SideAdapter
+Adapter = SingleAdapter | SerialParallelAdapter
 
 
 def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter | None:
@@ -146,6 +158,12 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
     kind, width = config.kind, config.width(dim)
     if kind == "none":
         return None
+    if kind == "serial-parallel":
+        plain = dataclasses.replace(config, kind="mlp")
+        serial, parallel = (init_adapter(each, dim, plain) for each in jax.random.split(key))
+        assert isinstance(serial, MlpAdapter)
+        assert isinstance(parallel, MlpAdapter)
+        return SerialParallelAdapter(serial, parallel)
     down_key, first, second, up_key = jax.random.split(key, 4)
     depthwise, convolutions = kind == "depthwise", config.bias == "convolutions"
     down = init_linear(down_key, dim, width, bias=not depthwise)
@@ -178,7 +196,7 @@ def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
 
 
 def adapter(
-    params: Adapter, tokens: Float[Array, "*batch token dim"], grid: tuple[int, int]
+    params: SingleAdapter, tokens: Float[Array, "*batch token dim"], grid: tuple[int, int]
 ) -> Float[Array, "*batch token dim"]:
     """Apply an adapter: down, ReLU, convolutions on the patch grid plus skip, up (paper Eq. 2).
 
@@ -191,11 +209,11 @@ def adapter(
 
 
 def train_adapter(
-    params: Adapter,
+    params: SingleAdapter,
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
     valid: Bool[Array, " image"],
-) -> tuple[Float[Array, "image token dim"], Adapter]:
+) -> tuple[Float[Array, "image token dim"], SingleAdapter]:
     """Apply an adapter to a training batch, whose statistics its batch norms normalise by.
 
     Args:
@@ -211,11 +229,11 @@ def train_adapter(
 
 
 def _adapter(
-    params: Adapter,
+    params: SingleAdapter,
     tokens: Float[Array, "*batch token dim"],
     grid: tuple[int, int],
     valid: Bool[Array, " image"] | None,
-) -> tuple[Float[Array, "*batch token dim"], Adapter]:
+) -> tuple[Float[Array, "*batch token dim"], SingleAdapter]:
     """Apply an adapter; with `valid` None by the stored statistics, which then stay."""
     narrow = checkpoint_name(linear(params.down, tokens), "down")
     if isinstance(params, SideAdapter):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend import core
 
-from crisalad_jax.nn.adapter import adapter, init_adapter
+from crisalad_jax.nn.adapter import SerialParallelAdapter, adapter, init_adapter
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import TAPS
 from crisalad_jax.nn.model import attend_across_images, extract_tokens, parameter_shapes, self_mask
@@ -166,14 +166,16 @@ def _macs(equation: Any, name: str, scope: str) -> int:
 
 
 def adapter_macs(config: ModelConfig) -> int:
-    """Count one adapter's true multiply-accumulates per image, with linears at every token."""
+    """Count one block's adapters' true multiply-accumulates per image, linears at every token."""
     backbone: Any = config.backbone
     grid = config.grid
     tokens = 1 + backbone.registers + math.prod(grid)
     make = functools.partial(init_adapter, dim=backbone.dim, config=backbone.adapter)
     params = jax.eval_shape(make, jax.random.key(0))
     x = jax.ShapeDtypeStruct((1, tokens, backbone.dim), jnp.float32)
-    return count_macs(functools.partial(adapter, grid=grid), params, x)
+    pair = isinstance(params, SerialParallelAdapter)
+    parts = (params.serial, params.parallel) if pair else (params,)
+    return sum(count_macs(functools.partial(adapter, grid=grid), part, x) for part in parts)
 
 
 def paper_adapter_macs(config: ModelConfig) -> int:
@@ -183,5 +185,6 @@ def paper_adapter_macs(config: ModelConfig) -> int:
     """
     backbone: Any = config.backbone
     tokens = 1 + backbone.registers + config.patches
-    linears = 2 * backbone.dim * backbone.adapter_dim
+    adapters = 2 if backbone.adapter.kind == "serial-parallel" else 1
+    linears = adapters * 2 * backbone.dim * backbone.adapter_dim
     return adapter_macs(config) - (tokens - 1) * linears

@@ -25,11 +25,14 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
     ("netvlad", r"(pool\.centroids|netvlad\.centers)$", 0.4),
     ("netvlad", r"(whiten|WPCA\.0)\.bias$", 0.02),
     ("^transvpr", r"pool\.fc\.1\.bias$", 0.1),
+    ("^vladbuff", r"aggregator\.conv\.weight$", 100.0),
+    ("^vladbuff", r"aggregator\.(centroids|pca_mean)$", 0.5),
+    ("^vladbuff", r"WPCA_\d+\.0\.bias$", 0.02),
 )
 """Weights of another size than the rest: a pattern of models, one of names, and a factor. With them
 a descriptor depends on the image more than on a bias."""
-FIXED = {r"aggregation\.1\.p$": 3.0}
-"""Weights that are no draws, by a pattern of names: GeM's exponent."""
+FIXED = {r"aggregation\.1\.p$": 3.0, r"aggregator\.ab_params$": (8.0, 7.0, 1.0)}
+"""Weights that are no draws, by a pattern of names: GeM's exponent, VLAD-BuFF's constants."""
 
 
 def layout(name: str) -> dict[str, tuple[int, ...]]:

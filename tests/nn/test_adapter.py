@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.adapter import (
+    AdapterConfig,
+    SerialParallelAdapter,
+    adapter,
+    init_adapter,
+)
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.layers import Linear
 from crisalad_jax.utils.pytree import named_leaves
@@ -91,6 +96,16 @@ def test_cricavprs_convolutions_start_at_1e_5() -> None:
     assert params.keys() - starts.keys() == {"down.weight", "down.bias"}
     for name, value in starts.items():
         np.testing.assert_array_equal(params[name], value, err_msg=name)
+
+
+def test_serial_and_parallel_adapters_add_nothing_untrained() -> None:
+    config = AdapterConfig(kind="serial-parallel")
+    params = init_adapter(jax.random.key(0), 32, config)
+    assert isinstance(params, SerialParallelAdapter)
+    tokens = jax.random.normal(jax.random.key(2), (16, 32))
+    for each in (params.serial, params.parallel):
+        np.testing.assert_array_equal(adapter(each, tokens, GRID), jnp.zeros((16, 32)))
+    assert (params.serial.down.weight != params.parallel.down.weight).any()
 
 
 def test_no_adapter_is_none() -> None:

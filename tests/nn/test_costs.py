@@ -23,8 +23,10 @@ from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.costs import adapter_macs, count_macs, paper_adapter_macs, part_costs
@@ -56,7 +58,9 @@ def test_the_other_adapters_by_hand() -> None:
     linears = 257 * 768 * 384 * 2
     branches = 384 * 192 + 2 * 384 * 24 + (9 + 25) * 24 * 96
     assert adapter_macs(with_adapter("multi-resolution")) == linears + 256 * branches
-    assert adapter_macs(with_adapter("mlp")) == linears
+    assert adapter_macs(with_adapter("mlp")) == adapter_macs(with_adapter("side")) == linears
+    assert adapter_macs(with_adapter("serial-parallel")) == 2 * linears
+    assert paper_adapter_macs(with_adapter("serial-parallel")) == 4 * 768 * 384
 
 
 def test_parameters_of_the_public_backbone() -> None:
@@ -184,6 +188,17 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
     ),
     # The blocks do all the work.
     "aggregation-tokens": (AggregationTokensConfig(tokens=3, insertion=1), 0),
+    # The reduction; then scores, sums by them, and each patch beside all others.
+    "vlad-buff": (
+        VladBuffConfig(clusters=5, reduced=12),
+        PATCHES * DIM * 12 + 2 * PATCHES * 12 * 5 + PATCHES**2 * 12,
+    ),
+    "vlad-buff, whole": (
+        VladBuffConfig(clusters=5, reduced=0),
+        2 * PATCHES * DIM * 5 + PATCHES**2 * DIM,
+    ),
+    # A descriptor needs no local features.
+    "selavpr": (SelaVprConfig(hidden=8, local=4), 0),
 }
 
 

@@ -21,8 +21,10 @@ from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig, init_cross_image
 from crisalad_jax.nn.model import (
@@ -56,6 +58,8 @@ PARTS: dict[str, Aggregator] = {
     "transvpr": TransVprConfig(levels=2, dim=16),
     "edtformer": EdtFormerConfig(width=16, heads=2, queries=3, channels=16, rows=2),
     "aggregation-tokens": AggregationTokensConfig(tokens=3, insertion=1),
+    "vlad-buff": VladBuffConfig(clusters=4, reduced=12),
+    "selavpr": SelaVprConfig(hidden=8, local=4),
 }
 METHODS = [
     # tests/test_model.py and others have enough of these.

@@ -118,12 +118,17 @@ def vit_lines(
 
 
 def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:
-    """Yield one block's adapter, under CricaVPR's names, and similar names for other kinds.
+    """Yield one block's adapter, under CricaVPR's names, or SelaVPR's or similar ones.
 
     Side adapters are in no block.
     """
     kind = config.adapter.kind
     if kind in ("none", "side"):
+        return
+    if kind == "serial-parallel":
+        for i, name in enumerate(("serial", "parallel"), 1):
+            yield from affine(f"{ours}.{name}.down", f"{theirs}{i}.D_fc1", LINEAR)
+            yield from affine(f"{ours}.{name}.up", f"{theirs}{i}.D_fc2", LINEAR)
         return
     if kind == "multi-resolution":
         for branch in ("branch1", "branch2.0", "branch2.1", "branch3.0", "branch3.1"):
@@ -162,6 +167,9 @@ def _adapter_config(read: Reader, width: int) -> AdapterConfig:
     if read.has("adapters.0.D_fc1.weight"):
         down = read.size("adapters.0.D_fc1.weight", 0)
         return AdapterConfig(kind="side", bottleneck=down / width, alpha=SIDE_ALPHA)
+    if read.has("blocks.0.adapter1.D_fc1.weight"):
+        down = read.size("blocks.0.adapter1.D_fc1.weight", 0)
+        return AdapterConfig(kind="serial-parallel", bottleneck=down / width)
     if not read.has("blocks.0.adapter.D_fc1.weight"):
         return AdapterConfig(kind="none")
     adapter = AdapterConfig("mlp", read.size("blocks.0.adapter.D_fc1.weight", 0) / width)

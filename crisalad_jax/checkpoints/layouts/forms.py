@@ -48,6 +48,8 @@ FIRST = Form(lambda x: (x[0],), lambda x: (x[None],))
 CLASS_TOKEN = Form(lambda x: (x[0, 0],), lambda x: (x[None, None],))
 POINTWISE = Form(lambda w: (w[:, :, 0, 0].T,), lambda w: (w.T[:, :, None, None],))
 CONV = Form(lambda w: (w.transpose(2, 3, 1, 0),), lambda w: (w.transpose(3, 2, 0, 1),))
+# Of a transposed convolution, whose torch weight begins with the channels that come in.
+UPCONV = Form(lambda w: (w.transpose(2, 3, 0, 1),), lambda w: (w.transpose(2, 3, 0, 1),))
 DEPTHWISE = Form(
     lambda w: (w[:, 0].transpose(1, 2, 0),), lambda w: (w.transpose(2, 0, 1)[:, None],)
 )

@@ -1,6 +1,7 @@
 """Layouts of models that are a head over DINOv2, told by what they differ in."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -22,7 +23,7 @@ from crisalad_jax.checkpoints.layouts.dinov2 import (
     vit_of,
 )
 from crisalad_jax.checkpoints.layouts.encoder import encoder_lines, infer_encoder
-from crisalad_jax.checkpoints.layouts.forms import LINEAR, affine
+from crisalad_jax.checkpoints.layouts.forms import LINEAR, Form, affine
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import Aggregator
 from crisalad_jax.nn.config import ModelConfig
@@ -45,6 +46,7 @@ def register_over_dinov2(
     backbone: Mapping[str, Any] = MappingProxyType({}),
     encoder: bool | None = False,
     projection: str | None = None,
+    projection_form: Form = LINEAR,
     mask_token: bool = True,
     norm: bool = True,
     module: str = "",
@@ -67,7 +69,8 @@ def register_over_dinov2(
         adapter: kind of the adapters.
         backbone: fields of the backbone's configuration that no shape tells.
         encoder: whether there is a cross-image encoder; None where the file tells.
-        projection: their name of the projection; None without one.
+        projection: their name of the projection, with {dim} for its width; None without one.
+        projection_form: see `affine`.
         mask_token: see `vit_lines`, and so is `norm`.
         norm: see `mask_token`.
         module: see `name`.
@@ -88,10 +91,11 @@ def register_over_dinov2(
         yield from of_head[first:]
         yield from encoder_lines(config.cross_image)
         if projection is not None:
-            yield from affine("projection", projection, LINEAR)
+            theirs = projection.format(dim=config.projection.dim)
+            yield from affine("projection", theirs, projection_form)
 
     def infer(state: State) -> ModelConfig:
-        dim = 0 if projection is None else Reader(state).size(f"{projection}.weight", 0)
+        dim = 0 if projection is None else _projection_dim(state, projection)
         return ModelConfig(
             image_size=image_size,
             preprocessing=preprocessing,
@@ -105,3 +109,10 @@ def register_over_dinov2(
         return has_vit(state, prefix) and (mark is None or mark in state)
 
     register_layout(Layout(name, holds, accepts, lines, detects, infer, module, under, stored))
+
+
+def _projection_dim(state: State, projection: str) -> int:
+    """Return the width of the projection that a state has under a name with {dim}."""
+    pattern = re.compile(re.escape(f"{projection}.weight").replace(r"\{dim\}", "[0-9]+"))
+    found = next((name for name in state if pattern.fullmatch(name)), f"{projection}.weight")
+    return Reader(state).size(found, 0)

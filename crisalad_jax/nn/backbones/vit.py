@@ -22,6 +22,8 @@ from crisalad_jax.config.fields import free_field
 from crisalad_jax.nn.adapter import (
     Adapter,
     AdapterConfig,
+    SerialParallelAdapter,
+    SideAdapter,
     adapter,
     init_adapter,
     train_adapter,
@@ -510,7 +512,7 @@ def _beside(
     layer: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
 ) -> Float[Array, "image token dim"]:
     """Apply a block's side adapter, with its skip."""
-    assert layer.adapter is not None
+    assert isinstance(layer.adapter, SideAdapter)
     with jax.named_scope("adapter"):
         update = config.adapter.alpha * at_least_float32(adapter(layer.adapter, tokens, grid))
         return (at_least_float32(tokens) + update).astype(tokens.dtype)
@@ -544,18 +546,23 @@ def train_block(
     """
     normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
     attended = attention(params.attn, normed, config.heads, key=None)
+    beside = params.adapter
+    if isinstance(beside, SerialParallelAdapter):
+        with jax.named_scope("adapter"):
+            attended = attended + adapter(beside.serial, attended, grid)
+        beside = beside.parallel
     tokens = (at_least_float32(tokens) + params.ls1 * at_least_float32(attended)).astype(
         tokens.dtype
     )
     tokens = checkpoint_name(tokens, "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
     update = feed_forward(params.mlp, normed)
-    if params.adapter is not None:
+    if beside is not None:
         with jax.named_scope("adapter"):
-            if valid is None:
-                adapted = adapter(params.adapter, normed, grid)
+            if valid is None or isinstance(params.adapter, SerialParallelAdapter):
+                adapted = adapter(beside, normed, grid)
             else:
-                adapted, trained = train_adapter(params.adapter, normed, grid, valid)
+                adapted, trained = train_adapter(beside, normed, grid, valid)
                 params = dataclasses.replace(params, adapter=trained)
             update = update + config.adapter.alpha * adapted
     tokens = (at_least_float32(tokens) + params.ls2 * at_least_float32(update)).astype(tokens.dtype)

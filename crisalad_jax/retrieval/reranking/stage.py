@@ -17,7 +17,7 @@ from crisalad_jax.data.loader import ImageBatch, ImageCache
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.photographs import photograph_batches
-from crisalad_jax.retrieval.reranking import patch_netvlad, transvpr
+from crisalad_jax.retrieval.reranking import patch_netvlad, selavpr, transvpr
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
@@ -25,6 +25,7 @@ from crisalad_jax.utils.progress import progress_bar
 
 _METHODS: Mapping[str, tuple[str, ModuleType]] = {
     "patch-netvlad": ("netvlad", patch_netvlad),
+    "selavpr": ("selavpr", selavpr),
     "transvpr": ("transvpr", transvpr),
 }
 """The aggregator that each method needs, and its module with `shape`, `describe` and `score`."""
@@ -39,7 +40,7 @@ class Reranking:
     """Which retrievals are re-ranked, by which method, with which model."""
 
     name: str
-    """patch-netvlad, by a model with NetVLAD; or transvpr, by one with TransVPR."""
+    """patch-netvlad, by a model with NetVLAD; selavpr or transvpr, by one with that aggregator."""
     top: int
     """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
     params: Crisalad | None = None

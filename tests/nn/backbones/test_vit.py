@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapter import AdapterConfig, MlpAdapter
+from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones.base import FeatureRequest
 from crisalad_jax.nn.backbones.vit import (
+    NORM_EPSILON,
     SwiGlu,
     ViTConfig,
     block,
@@ -22,6 +24,7 @@ from crisalad_jax.nn.backbones.vit import (
     run_blocks,
     vit,
 )
+from crisalad_jax.nn.layers import LayerNorm, layer_norm
 from crisalad_jax.utils.errors import InputError
 
 CONFIG = ViTConfig(dim=16, depth=3, heads=2, position_grid=5)
@@ -134,6 +137,31 @@ def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
         for c in (dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=0.0)), config)
     ]
     np.testing.assert_allclose(more[1] - more[0], 2 * (out[1] - out[0]), atol=1e-5)
+
+
+def test_serial_and_parallel_adapters_by_hand() -> None:
+    """x' = x + ls1 * (a + S(a)) of attention a; x' + ls2 * (MLP + 0.2 P) of the normed x'."""
+    kind = AdapterConfig(kind="serial-parallel")
+    config = dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5, adapter=kind)
+    layer = jax.tree.map(lambda leaf: leaf[0], init_vit(jax.random.key(0), config).blocks)
+    key = jax.random.key(1)
+    adapters = jax.tree.map(lambda leaf: jax.random.normal(key, leaf.shape), layer.adapter)
+    tokens = jax.random.normal(jax.random.key(2), (1, 7, 16))
+
+    def mlp(params: MlpAdapter, x: jax.Array) -> jax.Array:
+        hidden = jnp.maximum(x @ params.down.weight + params.down.bias, 0)
+        return hidden @ params.up.weight + params.up.bias
+
+    def normed(norm: LayerNorm, x: jax.Array) -> jax.Array:
+        return layer_norm(norm, x, epsilon=NORM_EPSILON)
+
+    a = attention(layer.attn, normed(layer.norm1, tokens), 2, key=None)
+    middle = tokens + 0.5 * (a + mlp(adapters.serial, a))
+    y = normed(layer.norm2, middle)
+    expected = middle + 0.5 * (feed_forward(layer.mlp, y) + 0.2 * mlp(adapters.parallel, y))
+    found = block(dataclasses.replace(layer, adapter=adapters), tokens, (2, 3), config)
+    # Sums of at most 16 products of order 10.
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
 
 
 SIDE = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="side", alpha=0.5))

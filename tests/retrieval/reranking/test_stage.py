@@ -9,6 +9,7 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.reranking import (
@@ -17,6 +18,7 @@ from crisalad_jax.retrieval.reranking import (
     parse_reranking,
     patch_netvlad,
     rerank,
+    selavpr,
     stage,
     transvpr,
 )
@@ -26,6 +28,7 @@ from tests.conftest import BATCH, MODEL, random_params
 
 PLAIN = dataclasses.replace(MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0))
 TRANSVPR = dataclasses.replace(PLAIN, aggregator=TransVprConfig(levels=2, dim=16))
+SELAVPR = dataclasses.replace(PLAIN, aggregator=SelaVprConfig(hidden=16, local=8))
 NETVLAD = dataclasses.replace(PLAIN, aggregator=NetVladConfig(clusters=4))
 
 
@@ -33,6 +36,8 @@ def model_of(name: str) -> tuple:
     """Random parameters of a re-ranker, its configuration and module."""
     if name == "transvpr":
         return random_params(TRANSVPR), TRANSVPR, transvpr
+    if name == "selavpr":
+        return random_params(SELAVPR), SELAVPR, selavpr
     return random_params(NETVLAD), NETVLAD, patch_netvlad
 
 
@@ -50,7 +55,7 @@ def reranking(name: str, top: int) -> Reranking:
     return Reranking(name, top, own, config)
 
 
-NAMES = pytest.mark.parametrize("name", ["transvpr", "patch-netvlad"])
+NAMES = pytest.mark.parametrize("name", ["transvpr", "selavpr", "patch-netvlad"])
 
 
 @NAMES
@@ -182,7 +187,7 @@ def test_the_first_stages_model_serves_where_it_can(benchmark) -> None:
         ("transvpr:" + 5000 * "1", "expected NAME:TOPK"),
         ("transvpr:ten", "expected NAME:TOPK"),
         ("transvpr:1", "found transvpr:1, expected at least 2 retrievals"),
-        ("superglue:10", "rerank: found 'superglue', expected one of patch-netvlad, transvpr"),
+        ("superglue:10", "rerank: found 'superglue', expected one of patch-netvlad, selavpr, tran"),
     ],
 )
 def test_what_cannot_be_read_is_named(text: str, words: str) -> None:

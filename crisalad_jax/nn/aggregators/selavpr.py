@@ -1,0 +1,121 @@
+"""SelaVPR: a generalised mean, and local features to re-rank by (Lu et al., ICLR 2024)."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
+from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.layers import Conv, Keys, at_least_float32, l2_normalise
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+SCALE = 2
+"""Stride of both transposed convolutions."""
+
+
+@pytree_dataclass
+class SelaVpr:
+    """The exponent of the mean, and two transposed convolutions of 3 x 3."""
+
+    p: Float[Array, ""]
+    upconv1: Conv
+    upconv2: Conv
+
+
+@AGGREGATORS.register("selavpr", tiny={"hidden": 32, "local": 16})
+@dataclasses.dataclass(frozen=True)
+class SelaVprConfig(Aggregator):
+    """SelaVPR's global and local features (Lu et al., ICLR 2024).
+
+    Example:
+        >>> SelaVprConfig().local_grid((16, 16))
+        (61, 61)
+    """
+
+    hidden: int = 256
+    """Number of channels between the transposed convolutions."""
+    local: int = 128
+    """Width of a local feature."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "hidden", "local")
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of a global token as wide as the backbone."""
+        return TokenShape(dim, 0, dim)
+
+    def local_grid(self, grid: tuple[int, int]) -> tuple[int, int]:
+        """Return the rows and columns of local features over those of patches."""
+        rows, columns = (SCALE * (SCALE * (side - 1)) + 1 for side in grid)
+        return rows, columns
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> SelaVpr:
+        """Start at an exponent of 3; draw convolutions uniform within 1 / sqrt(9 channels out).
+
+        That is torch's `nn.ConvTranspose2d`, which takes the channels out for those in.
+        """
+        first, second = jax.random.split(key)
+        return SelaVpr(
+            p=jnp.full((), START),
+            upconv1=_init_upconv(first, backbone.dim, self.hidden),
+            upconv2=_init_upconv(second, self.hidden, self.local),
+        )
+
+    def apply(
+        self, params: SelaVpr, features: Features, grid: tuple[int, int], *, key: Keys | None
+    ) -> Tokens:
+        """Return the mean of all patches, a global token as wide as the backbone."""
+        mean = generalised_mean(log_units(at_least_float32(features.patches)), params.p, axis=-2)
+        return Tokens.of_global(mean)
+
+
+def _init_upconv(key: PRNGKeyArray, d_in: int, d_out: int) -> Conv:
+    weight_key, bias_key = jax.random.split(key)
+    bound = 1 / (3 * math.sqrt(d_out))
+    return Conv(
+        jax.random.uniform(weight_key, (3, 3, d_in, d_out), minval=-bound, maxval=bound),
+        jax.random.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
+    )
+
+
+def local_features(
+    params: SelaVpr, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
+) -> Float[Array, "*batch rows columns local"]:
+    """Upsample the patch grid twice, with a ReLU between, to unit features in float32 at least.
+
+    Args:
+        params: of the model.
+        patches: of the backbone's last layer norm.
+        grid: rows and columns of patches, of which n become 4 n - 3.
+    """
+    maps = patches.reshape(-1, *grid, patches.shape[-1])
+    maps = jax.nn.relu(upconv(params.upconv1, maps))
+    maps = l2_normalise(at_least_float32(upconv(params.upconv2, maps)))
+    return maps.reshape(*patches.shape[:-2], *maps.shape[1:])
+
+
+def upconv(
+    params: Conv, x: Float[Array, "image height width d_in"]
+) -> Float[Array, "image height2 width2 d_out"]:
+    """Convolve transposed, as torch's `nn.ConvTranspose2d(3, stride=2, padding=1)`.
+
+    It is a convolution by the flipped kernel of `x` with zeros between its pixels. The weight has
+    the axes row, column, channel in, channel out.
+    """
+    assert params.bias is not None
+    y = jax.lax.conv_general_dilated(
+        x,
+        params.weight[::-1, ::-1].astype(x.dtype),
+        window_strides=(1, 1),
+        padding=((1, 1), (1, 1)),
+        lhs_dilation=(SCALE, SCALE),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+    return (at_least_float32(y) + params.bias).astype(x.dtype)
