@@ -4,6 +4,7 @@ In float64 both sides agree but for some hundred roundings of 1e-16, and no ReLU
 another side; a wrong stride, padding, epsilon or axis shows at 1e-2 and more.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,7 @@ from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad, attend_across_images, train_tokens
 from parity.cases.case import LAYOUT, build, convert
 
 BOUND = 1e-11
@@ -74,3 +76,43 @@ def test_descriptors_and_gradients(backbone: Backbone, aggregator: Aggregator) -
         error = np.linalg.norm(ours[name] - gradient)
         # A bias before a norm has no gradient but rounding: the whole's size is the scale.
         assert error < BOUND * np.linalg.norm(gradient) + 1e-14, name
+
+
+def test_a_training_batch_is_normalised_as_torch_does() -> None:
+    """Descriptors, gradients through the batch's statistics, and the running ones after it."""
+    config = ModelConfig(
+        image_size=SIZE,
+        backbone=ResNetConfig(layers=18, stages=2),
+        aggregator=CosPlaceConfig(dim=20),
+        cross_image=CrossImageConfig(layers=0),
+    )
+    rng = np.random.default_rng(0)
+    model = build(config, "float64", rng).train()
+    images = rng.normal(size=(3, *SIZE, 3))
+    slopes = rng.normal(size=(3, config.descriptor_dim))
+    with jax.enable_x64(True):
+        params, extras = convert(model)
+
+        def weighed(params: Crisalad) -> tuple[jax.Array, tuple[jax.Array, Crisalad]]:
+            batch = jnp.asarray(images), jnp.ones(3, bool)
+            tokens, statistics = train_tokens(params, *batch, model.config)
+            found = attend_across_images(params, tokens, model.config)
+            return (found * slopes).sum(), (found, statistics)
+
+        gradients, (found, statistics) = jax.grad(weighed, has_aux=True)(params)
+        ours = to_state(gradients, model.config, LAYOUT, extras)
+        after = to_state(eqx.combine(statistics, params), model.config, LAYOUT, extras)
+    theirs = model(torch.from_numpy(images).permute(0, 3, 1, 2))
+    (theirs * torch.from_numpy(slopes)).sum().backward()
+    np.testing.assert_allclose(found, theirs.detach().numpy(), atol=BOUND)
+    scale = max(float(p.grad.norm()) for p in model.parameters() if p.grad is not None)
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None:
+            error = np.linalg.norm(ours[name] - parameter.grad.numpy())
+            assert error < BOUND * scale, name
+    moved = 0
+    for name, buffer in model.named_buffers():
+        if "running" in name:
+            np.testing.assert_allclose(after[name], buffer.numpy(), rtol=BOUND, atol=BOUND)
+            moved += bool((buffer.numpy() != extras.get(name, 0)).any())
+    assert moved == 2 * 10  # a norm for each of ten convolutions

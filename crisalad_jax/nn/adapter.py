@@ -15,8 +15,8 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_positive
+from crisalad_jax.nn.convolutions import ConvNorm
 from crisalad_jax.nn.layers import (
-    BatchNorm,
     Conv,
     DepthwiseConv,
     Linear,
@@ -100,14 +100,6 @@ class DepthwiseAdapter:
     depthwise: DepthwiseConv
     pointwise: Linear
     up: Linear
-
-
-@pytree_dataclass
-class ConvNorm:
-    """A convolution and the batch norm after it."""
-
-    conv: Conv
-    norm: BatchNorm
 
 
 @pytree_dataclass

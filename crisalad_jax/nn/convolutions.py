@@ -1,12 +1,13 @@
 """What convolutional backbones are made of: convolutions with a batch norm, and maxima."""
 
+import dataclasses
 import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.nn.layers import BatchNorm, Conv, conv, init_batch_norm
+from crisalad_jax.nn.layers import BatchNorm, Conv, conv, init_batch_norm, train_batch_norm
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 BATCH_NORM_EPSILON = 1e-5
@@ -39,18 +40,36 @@ def init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -
 
 
 def conv_norm(
-    params: ConvNorm, x: Float[Array, "*batch height width d_in"], *, stride: int = 1
-) -> Float[Array, "*batch rows columns d_out"]:
-    """Convolve, and normalise by the stored statistics, which are folded into the convolution.
+    params: ConvNorm,
+    x: Float[Array, "image height width d_in"],
+    valid: Bool[Array, " image"] | None = None,
+    *,
+    stride: int = 1,
+) -> tuple[Float[Array, "image rows columns d_out"], ConvNorm]:
+    """Convolve, and normalise by the stored statistics or by those of a training batch.
 
-    Folding costs a pass over the weights, and saves one over the much larger activations.
+    The stored statistics are folded into the convolution: that costs a pass over the weights, and
+    saves one over the much larger activations.
+
+    Args:
+        params: the layers.
+        x: a batch of images.
+        valid: which images the batch's statistics are taken of; None takes the stored ones.
+        stride: of the convolution.
+
+    Returns:
+        (y, updated): the second has updated running statistics where `valid` is given.
     """
+    if valid is not None:
+        y = conv(params.conv, x, stride=stride)
+        y, norm = train_batch_norm(params.norm, y, valid, epsilon=BATCH_NORM_EPSILON)
+        return y, dataclasses.replace(params, norm=norm)
     norm = params.norm
     scale = norm.weight * jax.lax.rsqrt(norm.running_var + BATCH_NORM_EPSILON)
     shift = norm.bias - norm.running_mean * scale
     if params.conv.bias is not None:
         shift = shift + params.conv.bias * scale
-    return conv(Conv(params.conv.weight * scale, shift), x, stride=stride)
+    return conv(Conv(params.conv.weight * scale, shift), x, stride=stride), params
 
 
 def max_pool(

@@ -9,7 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.nn.backbones.base import BACKBONES
-from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
+from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages, Valid
 from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_conv_norm, max_pool
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -107,25 +107,32 @@ class ResNetConfig(StagedBackbone):
             yield Residual(convs, shortcut)
             d_in = widths[-1]
 
-    def run_stem(self, params: ConvNorm, images: Map) -> Map:
+    def run_stem(self, params: ConvNorm, images: Map, valid: Valid) -> tuple[Map, ConvNorm]:
         """Convolve by 7 x 7, and take the maxima of 3 x 3: both halve the grid."""
-        return max_pool(jax.nn.relu(conv_norm(params, images, stride=2)), 3, padding=1)
+        x, params = conv_norm(params, images, valid, stride=2)
+        return max_pool(jax.nn.relu(x), 3, padding=1), params
 
-    def run_stage(self, number: int, params: Stage, x: Map) -> Map:
+    def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
         """Run the blocks; the first halves the grid, but for the first stage's."""
+        layers = []
         for i, block in enumerate(params.layers):
-            x = residual(block, x, stride=2 if number and not i else 1)
-        return x
+            x, block = residual(block, x, valid, stride=2 if number and not i else 1)
+            layers.append(block)
+        return x, Stage(tuple(layers))
 
 
-def residual(params: Residual, x: Map, *, stride: int) -> Map:
-    """Add the convolutions' output to the input; the first of 3 x 3 has the stride."""
-    y = x
+def residual(params: Residual, x: Map, valid: Valid, *, stride: int) -> tuple[Map, Residual]:
+    """Add the convolutions' output to the input; the first of 3 x 3 has the stride.
+
+    Returns:
+        (y, updated): the output, and the block as `conv_norm` returns its layers.
+    """
+    y, convs, shortcut = x, [], params.shortcut
     strided = next(i for i, each in enumerate(params.convs) if each.conv.weight.shape[0] == 3)
     for i, layer in enumerate(params.convs):
-        y = conv_norm(layer, y, stride=stride if i == strided else 1)
-        if i + 1 < len(params.convs):
-            y = jax.nn.relu(y)
-    if params.shortcut is not None:
-        x = conv_norm(params.shortcut, x, stride=stride)
-    return jax.nn.relu(x + y)
+        y = jax.nn.relu(y) if i else y
+        y, layer = conv_norm(layer, y, valid, stride=stride if i == strided else 1)
+        convs.append(layer)
+    if shortcut is not None:
+        x, shortcut = conv_norm(shortcut, x, valid, stride=stride)
+    return jax.nn.relu(x + y), Residual(tuple(convs), shortcut)

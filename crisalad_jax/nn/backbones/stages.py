@@ -5,14 +5,18 @@ import dataclasses
 from typing import Any, ClassVar
 
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn.layers import split_statistics
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Map = Float[Array, "image _ _ _"]
 """Features in rows and columns, channels last."""
+
+
+Valid = Bool[Array, " image"] | None
 
 
 @pytree_dataclass
@@ -20,6 +24,10 @@ class Stage:
     """The layers of one stage, in order."""
 
     layers: tuple[Any, ...]
+
+
+Blocks = tuple[Stage, ...] | tuple[tuple[Stage, ...], ...]
+"""Stages, or two parts of them."""
 
 
 @pytree_dataclass
@@ -30,7 +38,7 @@ class Stages:
     """
 
     stem: Any
-    blocks: tuple[Stage, ...] | tuple[tuple[Stage, ...], ...]
+    blocks: Blocks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,12 +54,15 @@ class StagedBackbone(Backbone):
     depth: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @abc.abstractmethod
-    def run_stem(self, params: Any, images: Map) -> Map:
-        """Return what the first stage takes."""
+    def run_stem(self, params: Any, images: Map, valid: Valid) -> tuple[Map, Any]:
+        """Return what the first stage takes, and the stem with updated statistics.
+
+        `valid` is that of `apply_training`; None takes the stored statistics, which stay.
+        """
 
     @abc.abstractmethod
-    def run_stage(self, number: int, params: Stage, x: Map) -> Map:
-        """Return the output of the stage of this number, from 0."""
+    def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
+        """Return the output of the stage of this number, from 0, and the stage as `run_stem`."""
 
     def apply(
         self,
@@ -68,21 +79,42 @@ class StagedBackbone(Backbone):
         Raises:
             InputError: while tracing, for another level than the last, or a facet of attention.
         """
+        return self._run(params, images, request, remat, None)[0]
+
+    def apply_training(
+        self,
+        params: Stages,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+        valid: Bool[Array, " image"],
+    ) -> tuple[Features, Any]:
+        """Return the features of a training batch, and the running statistics after it."""
+        features, updated = self._run(params, images, request, remat, valid)
+        return features, split_statistics(updated)[0]
+
+    def _run(
+        self, params: Stages, images: Map, request: FeatureRequest, remat: str, valid: Valid
+    ) -> tuple[Features, Stages]:
         require(
             request.levels in (None, (self.depth,)) and request.facet == "token",
             f"features: found a request for levels {request.levels} and facet {request.facet} of "
             f"backbone {self.part_name}, expected its last stage's",
         )
-        x = self.run_stem(params.stem, images)
+        x, stem = self.run_stem(params.stem, images, valid)
+        updated = []
         for number, stage in enumerate(_joined(params.blocks)):
 
-            def run(stage: Stage, x: Map, number: int = number) -> Map:
-                return self.run_stage(number, stage, x)
+            def run(stage: Stage, x: Map, number: int = number) -> tuple[Map, Stage]:
+                return self.run_stage(number, stage, x, valid)
 
             with jax.named_scope("blocks"):
-                x = jax.checkpoint(run)(stage, x) if remat == "full" else run(stage, x)
+                x, stage = jax.checkpoint(run)(stage, x) if remat == "full" else run(stage, x)
+            updated.append(stage)
         patches = x.reshape(x.shape[0], -1, x.shape[-1])
-        return Features(patches[:, 0, :0], patches)
+        features = Features(patches[:, 0, :0], patches)
+        return features, Stages(stem, _cut_as(tuple(updated), params.blocks))
 
     def split_blocks(self, params: Stages, first: int) -> Stages:
         """Cut the stages in two."""
@@ -94,9 +126,15 @@ class StagedBackbone(Backbone):
         return dataclasses.replace(params, blocks=_joined(params.blocks))
 
 
-def _joined(
-    blocks: tuple[Stage, ...] | tuple[tuple[Stage, ...], ...],
-) -> tuple[Stage, ...]:
+def _cut_as(stages: tuple[Stage, ...], blocks: Blocks) -> Blocks:
+    """Cut stages as `blocks` are cut."""
+    if not isinstance(blocks[0], tuple):
+        return stages
+    first = len(blocks[0])
+    return stages[:first], stages[first:]
+
+
+def _joined(blocks: Blocks) -> tuple[Stage, ...]:
     stages: list[Stage] = []
     for part in blocks:
         stages += part if isinstance(part, tuple) else (part,)

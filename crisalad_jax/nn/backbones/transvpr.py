@@ -5,11 +5,11 @@ RuotongWANG/TransVPR-model-implementation.
 """
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.attention import Attention, attention
@@ -26,6 +26,7 @@ from crisalad_jax.nn.layers import (
     init_layer_norm,
     layer_norm,
     linear,
+    split_statistics,
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -130,6 +131,29 @@ class TransVprNetConfig(Backbone):
         Raises:
             InputError: while tracing, for levels out of order, or a facet of attention.
         """
+        return self._run(params, images, request, remat, None)[0]
+
+    def apply_training(
+        self,
+        params: TransVprNet,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+        valid: Bool[Array, " image"],
+    ) -> tuple[Features, Any]:
+        """Return the features of a training batch, and the running statistics after it."""
+        features, updated = self._run(params, images, request, remat, valid)
+        return features, split_statistics(updated)[0]
+
+    def _run(
+        self,
+        params: TransVprNet,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        remat: str,
+        valid: Bool[Array, " image"] | None,
+    ) -> tuple[Features, TransVprNet]:
         levels = (self.depth,) if request.levels is None else request.levels
         require(
             list(levels) == sorted(set(levels)) and levels[0] > 0 and levels[-1] <= self.depth,
@@ -149,14 +173,14 @@ class TransVprNetConfig(Backbone):
 
         if remat == "full":
             body = jax.checkpoint(body, prevent_cse=False)
-        tokens = embed(params, images)
+        tokens, params = embed(params, images, valid)
         with jax.named_scope("blocks"):
             _, outputs = jax.lax.scan(body, tokens, params.blocks)
         chosen = [outputs[level - 1] for level in levels]
         if request.norm:
             chosen = [layer_norm(params.norm, x, epsilon=NORM_EPSILON) for x in chosen]
         patches = jnp.concatenate([x[:, 1:] for x in chosen], axis=-1)
-        return Features(chosen[-1][:, 0], patches)
+        return Features(chosen[-1][:, 0], patches), params
 
 
 def _side(number: int) -> int:
@@ -165,17 +189,26 @@ def _side(number: int) -> int:
 
 
 def embed(
-    params: TransVprNet, images: Float[Array, "image height width 3"]
-) -> Float[Array, "image token dim"]:
-    """Return the class token, and for every patch a vector with a part from each map."""
-    x, parts = images, []
+    params: TransVprNet,
+    images: Float[Array, "image height width 3"],
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Float[Array, "image token dim"], TransVprNet]:
+    """Return the class token, and for every patch a vector with a part from each map.
+
+    Returns:
+        (tokens, updated): the second has updated statistics where `valid` is given.
+    """
+    x, parts, convs = images, [], []
     for number, layer in enumerate(params.convs):
-        x = max_pool(jax.nn.relu(conv_norm(layer, x)), 3, padding=1)
+        x, layer = conv_norm(layer, x, valid)
+        x = max_pool(jax.nn.relu(x), 3, padding=1)
+        convs.append(layer)
         parts.append(conv(params.tokenizers[number], x, stride=_side(number), padding=0))
     tokens = jnp.concatenate(parts, axis=-1)
     tokens = tokens.reshape(len(images), -1, tokens.shape[-1])
     first = jnp.broadcast_to(params.cls_token, (len(images), 1, tokens.shape[-1]))
-    return jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
+    tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
+    return tokens, dataclasses.replace(params, convs=tuple(convs))
 
 
 def block(

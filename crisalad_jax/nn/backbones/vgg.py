@@ -8,7 +8,7 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.nn.backbones.base import BACKBONES
-from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
+from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages, Valid
 from crisalad_jax.nn.convolutions import init_he_conv, max_pool
 from crisalad_jax.nn.layers import conv
 
@@ -46,15 +46,15 @@ class VggConfig(StagedBackbone):
         layers = iter([init_he_conv(each, 3, a, b, bias=True) for each, a, b in pairs])
         return Stages(None, tuple(Stage(tuple(itertools.islice(layers, len(w)))) for w in WIDTHS))
 
-    def run_stem(self, params: None, images: Map) -> Map:
+    def run_stem(self, params: None, images: Map, valid: Valid) -> tuple[Map, None]:
         """Return the images: nothing comes before the first stage."""
-        return images
+        return images, None
 
-    def run_stage(self, number: int, params: Stage, x: Map) -> Map:
+    def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
         """Run the convolutions, after maxima that halve the grid; the last one has no ReLU."""
         x = max_pool(x, 2) if number else x
         for i, layer in enumerate(params.layers):
             x = conv(layer, x)
             if (number, i) != (len(WIDTHS) - 1, len(params.layers) - 1):
                 x = jax.nn.relu(x)
-        return x
+        return x, params

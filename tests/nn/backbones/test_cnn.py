@@ -105,7 +105,7 @@ def test_a_folded_norm_is_torchs_convolution_and_norm(bias: bool) -> None:
             Conv(jnp.asarray(weight), None if own is None else jnp.asarray(own)),
             BatchNorm(*map(jnp.asarray, (gain, shift, mean, variance))),
         )
-        found = conv_norm(params, jnp.asarray(x), stride=2)
+        found, _ = conv_norm(params, jnp.asarray(x), stride=2)
     first, kernel, *rest = map(torch.from_numpy, (x, weight, mean, variance, gain, shift))
     convolved = F.conv2d(
         first.permute(0, 3, 1, 2),
