@@ -50,9 +50,27 @@ STORED = {
     "edtformer": "zoo/layouts/edtformer",
     "image": "zoo/layouts/image_merged",
     "image-gsv": "zoo/layouts/image_merged",
+    "vlad-buff-8192": "zoo/layouts/vladbuff_192_wpca4096",
+    "vlad-buff-4096": "zoo/layouts/vladbuff_192_wpca4096",
+    "selavpr-msls": "zoo/layouts/selavpr",
+    "selavpr-pitts30k": "zoo/layouts/selavpr",
 }
-CHANGED = {"supervlad-1-cluster": {"aggregation.conv.weight": (3, 768, 1, 1)}}
-"""Shapes that differ from the stored ones: the README's one cluster and two ghosts."""
+CHANGED: dict[str, dict[str, tuple[int, ...] | None]] = {
+    # The README's one cluster and two ghosts.
+    "supervlad-1-cluster": {"aggregation.conv.weight": (3, 768, 1, 1)},
+    # Without a projection of features; 8,192 components of 64 x 768.
+    "vlad-buff-8192": {
+        "aggregator.pca_mean": None,
+        "aggregator.pca_rot": None,
+        "aggregator.centroids": (64, 768),
+        "aggregator.conv.weight": (64, 768, 1, 1),
+        "WPCA_4096.0.weight": None,
+        "WPCA_4096.0.bias": None,
+        "WPCA_8192.0.weight": (8192, 49152, 1, 1),
+        "WPCA_8192.0.bias": (8192,),
+    },
+}
+"""Shapes that differ from the stored ones; None has no such name."""
 SIZED = {
     **{
         f"mixvpr-{c * r}": ("mixvpr-4096", {"channels": c, "rows": r})
@@ -69,6 +87,7 @@ def stored(name: str) -> tuple[str, ModelConfig]:
     shapes = json.loads((PARITY / f"{STORED[name]}.json").read_text(encoding="utf-8"))
     plain = {key.rpartition("/")[2].removeprefix("module."): shapes[key] for key in shapes}
     plain |= CHANGED.get(name, {})
+    plain = {key: shape for key, shape in plain.items() if shape is not None}
     blank = {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in plain.items()}
     return infer(blank, source=name)
 
