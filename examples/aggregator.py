@@ -3,7 +3,7 @@
 A frozen dataclass holds the settings, a pytree of arrays the parameters.
 
     python examples/aggregator.py
-    crisalad train --plugin examples/aggregator.py --recipe attention-pool --preset tiny ...
+    crisalad train --plugin examples/aggregator.py --recipe crisalad+attention-pool ...
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ class AttentionPool(cj.Aggregator):
 
 def main():
     """Describe two pictures of noise by an untrained model with this aggregator."""
-    config = cj.recipe("tiny", "attention-pool").model
+    config = cj.recipe("tiny", "crisalad+attention-pool").model
     params = cj.init_crisalad(jax.random.key(0), config)
     pictures = np.random.default_rng(0).integers(0, 256, (2, *config.image_size, 3), np.uint8)
     descriptors = cj.describe(params, pictures, config)

@@ -10,9 +10,10 @@ class Compare(ComparisonFlags):
     """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""
 
     methods: str | None = None
-    """Comma-separated; by default all of the paper: netvlad, gem, conv-ap, patch-netvlad, transvpr,
-    cosplace, mixvpr, eigenplaces, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is
-    a method too, and any registered part, as NAME or KIND:NAME: CriSALAD with it in place."""
+    """Comma-separated; by default the methods of Table 1 over one backbone: crisalad+netvlad (or
+    gem, conv-ap, patch-netvlad, transvpr, mixvpr: that head with CriSALAD's backbone and training),
+    cosplace-vit, eigenplaces-vit, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is
+    a method too, and so is RECIPE+PART, with a registered part as NAME or KIND:NAME."""
     weights: tuple[str, ...] = ()
     """NAME=FILE, for each method that is not to be trained: its weights, or a published model's
     name (`crisalad models`)."""

@@ -37,10 +37,10 @@ class Train:
     preset: str = "b14"
     """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
     recipe: str | None = None
-    """How it trains: crisalad (the paper; the default), crisalad-1e-4 or crisalad-step (its Table
-    2), salad, cricavpr, cosplace, eigenplaces, scratch (the default of tiny, from random weights),
-    or any registered part, such as the aggregators netvlad, gem, conv-ap, mixvpr, transvpr and boq:
-    the paper's way with that part in place."""
+    """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
+    crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, supervlad. For our ViT:
+    cosplace-vit, eigenplaces-vit. From random weights: scratch (the default of tiny). RECIPE+PART
+    is a recipe with a registered part in place, such as crisalad+gem."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import re
 from typing import Literal
 
 from crisalad_jax.config.checks import (
@@ -16,6 +15,7 @@ from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +105,8 @@ class TrainConfig:
     """By default AdamW as in the paper, whose decay is "as adopted in SALAD": to 0.2 in 4,000
     steps."""
     trainable: str = "adapters+head"
-    """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), head, or all."""
+    """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), head, or all; see
+    `split_params`."""
     batch_norm: Literal["batch", "stored"] = "batch"
     """Statistics of the backbone's batch norms. "batch" normalises by those of the batch and
     updates the running ones (torch's `train()`, of frozen layers too). "stored" leaves the running
@@ -160,10 +161,8 @@ class TrainConfig:
             f"({self.images_per_place})",
         )
         require(
-            re.fullmatch(r"head|adapters\+head|last-\d+-blocks\+head|all", self.trainable)
-            is not None,
-            f"TrainConfig.trainable: found {self.trainable!r}, expected head, adapters+head, "
-            "last-N-blocks+head or all",
+            TRAINABLE.fullmatch(self.trainable) is not None,
+            f"TrainConfig.trainable: found {self.trainable!r}, expected {EXPECTED}",
         )
         require(
             self.trainable != "adapters+head" or has_adapters(self.model),

@@ -14,7 +14,12 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 
 HEAD, ADAPTERS_AND_HEAD, ALL = "head", "adapters+head", "all"
-_LAST_BLOCKS = re.compile(r"last-(\d+)-blocks\+head")
+_LAST_BLOCKS = re.compile(r"last-(\d+)-blocks(\+positions)?(\+no-norm)?\+head")
+TRAINABLE = re.compile(f"{HEAD}|{re.escape(ADAPTERS_AND_HEAD)}|{ALL}|{_LAST_BLOCKS.pattern}")
+"""Names of what trains, as `split_params` takes them."""
+EXPECTED = (
+    f"{HEAD}, {ADAPTERS_AND_HEAD}, last-N-blocks+head (or +positions+head, +no-norm+head) or {ALL}"
+)
 
 
 def shards_batch(trainable: str) -> bool:
@@ -40,7 +45,9 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         config: the model's.
         trainable: "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "head"
             (the last two alone), "all", or "last-N-blocks+head" (SALAD: the last N blocks, the
-            final layer norm, and the head).
+            final layer norm if the aggregator asks for it, and the head). Of the last,
+            "last-N-blocks+positions+head" also trains the class token and the positions (DINO-Mix),
+            and "last-N-blocks+no-norm+head" freezes the layer norm (SuperVLAD).
 
     Returns:
         (trainable, frozen): two trees of the model's structure, None for the other's leaves.
@@ -72,12 +79,14 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         if last > depth:
             raise InputError(f"trainable: found the last {last} blocks, expected at most {depth}")
         params = _cut_blocks(params, config, depth - last)
-        prefixes = (*head, "backbone.norm.", "backbone.blocks.1.")
+        prefixes = (*head, "backbone.blocks.1.")
+        # Without a gradient a weight decay alone would move the norm.
+        if not match[3] and config.aggregator.features(depth).norm:
+            prefixes += ("backbone.norm.",)
+        if match[2]:
+            prefixes += ("backbone.cls_token", "backbone.pos_embed")
     else:
-        raise InputError(
-            f"trainable: found {trainable!r}, expected head, adapters+head, last-N-blocks+head or "
-            "all"
-        )
+        raise InputError(f"trainable: found {trainable!r}, expected {EXPECTED}")
     constant = () if config.aggregator.learns else ("aggregator.",)
     names = iter(named_leaves(params))
 

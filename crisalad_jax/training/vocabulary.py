@@ -28,7 +28,7 @@ from crisalad_jax.nn.model import Crisalad, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.photographs import photograph_batches
-from crisalad_jax.training.recipes import recipe
+from crisalad_jax.training.recipes import RECIPES, recipe
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target
@@ -146,7 +146,8 @@ def start_vocabulary(
         InputError: no such preset or aggregator, or one without a vocabulary; a field that it does
             not have; or a checkpoint that cannot be read or is of another size.
     """
-    config = recipe(preset, aggregator).model
+    name = aggregator if aggregator in RECIPES else f"crisalad+{aggregator}"
+    config = recipe(preset, name).model
     part = config.aggregator
     _check_vocabulary(config, "--aggregator: found")
     known = [field.name for field in dataclasses.fields(part)]

@@ -41,6 +41,7 @@ from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import RECIPES, recipe
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,7 @@ def test_the_recipes_are_their_papers():
     """serizba/salad and Lu-Feng/CricaVPR as published; Table 2's rows."""
     salad = recipe("b14", "salad")
     assert (salad.places_per_batch, salad.images_per_place, salad.epochs) == (60, 4, 4)
-    assert salad.trainable == "last-4-blocks+head"
+    assert (salad.trainable, salad.select_by) == ("last-4-blocks+head", "R@1")
     assert (salad.model.backbone.adapter.kind, salad.model.cross_image.layers) == ("none", 0)
     optimiser = salad.optimiser
     assert (optimiser.kind, optimiser.learning_rate) == ("adamw", 6e-5)
@@ -104,7 +105,7 @@ def test_the_recipes_are_their_papers():
     assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
     assert (cricavpr.epochs, cricavpr.patience, cricavpr.select_by) == (10, 10, "R@5")
     paper = recipe("b14")
-    netvlad = recipe("b14", "netvlad")
+    netvlad = recipe("b14", "crisalad+netvlad")
     assert (netvlad.places_per_batch, netvlad.images_per_place) == (48, 4)
     assert netvlad.loss.kind.part_name == "multi-similarity"
     assert netvlad.model.descriptor_dim == 64 * 768
@@ -120,7 +121,7 @@ def test_the_recipes_are_their_papers():
 
 def test_classification_is_as_published():
     """gmberton/CosPlace and gmberton/EigenPlaces: their papers' constants and their code's."""
-    cosplace = recipe("b14", "cosplace")
+    cosplace = recipe("b14", "cosplace-vit")
     assert cosplace.model.aggregator.part_name == "cosplace"
     assert cosplace.model.cross_image.layers == 0
     assert cosplace.model.descriptor_dim == 512
@@ -137,7 +138,7 @@ def test_classification_is_as_published():
     assert (classes.cell, classes.sector) == (10.0, 30.0)
     assert (classes.spacing, classes.sector_spacing) == (5, 2)
     assert cosplace.min_images_of_place == cosplace.min_images == 4
-    eigenplaces = recipe("b14", "eigenplaces")
+    eigenplaces = recipe("b14", "eigenplaces-vit")
     assert eigenplaces.model.descriptor_dim == 2048
     assert eigenplaces.optimiser == optimiser
     assert (eigenplaces.min_images, eigenplaces.min_images_of_place) == (5, 1)
@@ -148,8 +149,70 @@ def test_classification_is_as_published():
     assert (classes.cell, classes.spacing, classes.focal_distance) == (15.0, 3, 10.0)
 
 
+def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
+    """amaralibey/Bag-of-Queries, GaoShuang98/DINO-Mix and Lu-Feng/SuperVLAD."""
+    boq = recipe("b14", "boq")
+    assert boq.model.descriptor_dim == 12_288
+    assert boq.model.preprocessing.filter == "bicubic"
+    assert (boq.trainable, boq.places_per_batch, boq.epochs) == ("last-2-blocks+head", 128, 40)
+    assert (boq.augmentation, boq.select_by) == (RandAugmentConfig(3, 15), "R@1")
+    assert boq.optimiser == OptimiserConfig(
+        kind="adamw",
+        learning_rate=1e-4,
+        schedule="milestones",
+        milestones=(10, 20),
+        step_gamma=0.1,
+        warmup_epochs=10,
+        weight_decay=1e-4,
+    )
+    mix = recipe("b14", "dino-mix")
+    assert mix.model.aggregator == MixVprConfig(channels=1024, rows=4, depth=2, last_norm=False)
+    assert (mix.places_per_batch, mix.epochs, mix.select_by) == (80, 60, "R@1")
+    assert mix.trainable == "last-4-blocks+positions+head"
+    assert mix.optimiser == OptimiserConfig(
+        kind="sgd",
+        learning_rate=0.005,
+        schedule="milestones",
+        milestones=(5, 10, 15, 25, 45),
+        step_gamma=0.3,
+        warmup_steps=650,
+        weight_decay=1e-3,
+        momentum=0.9,
+    )
+    vlad = recipe("b14", "supervlad")
+    assert vlad.model.descriptor_dim == 4 * 768
+    assert vlad.trainable == "last-4-blocks+no-norm+head"
+    assert (vlad.places_per_batch, vlad.epochs, vlad.patience) == (120, 20, 3)
+    assert vlad.select_by == "R@1+R@5"
+    assert vlad.optimiser == OptimiserConfig(
+        kind="adam",
+        learning_rate=5e-5,
+        schedule="step",
+        step_epochs=3,
+        step_gamma=0.5,
+        weight_decay=0.0,
+    )
+    for config in (boq, mix, vlad):
+        assert config.model.image_size == (224, 224)
+        assert (config.model.backbone.adapter.kind, config.model.cross_image.layers) == ("none", 0)
+        assert config.images_per_place == 4
+
+
+def test_a_part_alone_and_old_names_are_told():
+    with pytest.warns(Note, match=r"^recipe: found gem, which is a part: crisalad\+gem, CriS"):
+        assert recipe("tiny", "gem") == recipe("tiny", "crisalad+gem")
+    with pytest.warns(Note, match="^recipe: found eigenplaces, which is called eigenplaces-vit$"):
+        assert recipe("tiny", "eigenplaces") == recipe("tiny", "eigenplaces-vit")
+    swapped = recipe("b14", "salad+step:newton")
+    assert swapped.model.aggregator.sinkhorn.step.part_name == "newton"
+    assert swapped.optimiser == recipe("b14", "salad").optimiser
+    for name in ("crisalad+crisalad", "gem+salad", "crisalad+"):
+        with pytest.raises(InputError, match=r"^recipe: found '.*', expected one of anyloc"):
+            recipe("tiny", name)
+
+
 def test_a_classification_needs_no_second_image_of_a_place():
-    classified = recipe("b14", "cosplace")
+    classified = recipe("b14", "cosplace-vit")
     assert TrainConfig(loss=classified.loss, images_per_place=1).images_per_place == 1
     with pytest.raises(InputError, match=r"TrainConfig\.images_per_place: found 0"):
         TrainConfig(loss=classified.loss, images_per_place=0)
@@ -161,7 +224,7 @@ def test_a_classification_needs_no_second_image_of_a_place():
     [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288)],
 )
 def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int):
-    found, paper = recipe("b14", name), recipe("b14")
+    found, paper = recipe("b14", f"crisalad+{name}"), recipe("b14")
     assert found.model.aggregator == AGGREGATORS.find(name)()
     assert found.model.descriptor_dim == width
     assert found.model.cross_image.layers == 0
@@ -172,7 +235,9 @@ def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", sorted({*RECIPES, *AGGREGATORS}))
+@pytest.mark.parametrize(
+    "name", [*RECIPES, *(f"crisalad+aggregator:{name}" for name in AGGREGATORS)]
+)
 def test_every_recipe_fits_every_preset(preset: str, name: str):
     assert recipe(preset, name).model.backbone.dim == PRESETS[preset].backbone.dim
 
@@ -195,7 +260,7 @@ def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
         recipe("b16")
     words = (
-        r"^recipe: found 'dbow', expected one of anyloc, cosplace, cricavpr, crisal.*, scratch.*, "
+        r"^recipe: found 'dbow', expected one of anyloc, boq, .*crisalad, .*scratch.*, "
         r"or a registered part as NAME or KIND:NAME, with a kind of aggregator, .* \(is a plug-in "
         r"missing\?"
     )

@@ -1,6 +1,7 @@
 """What trains, the optimiser against torch, and one compiled step."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,16 @@ import torch
 from crisalad_jax.losses import LossConfig, metric_loss
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import dropout
-from crisalad_jax.nn.model import Crisalad, describe, extract_tokens, init_crisalad
+from crisalad_jax.nn.model import (
+    Crisalad,
+    describe,
+    extract_tokens,
+    init_crisalad,
+    parameter_shapes,
+)
 from crisalad_jax.sinkhorn import SinkhornConfig, SinkhornStep
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
@@ -86,6 +94,17 @@ def test_batch_norm_statistics_never_train(trainable: str) -> None:
             "last-0-blocks+head",
             ("aggregator.", "cross_image.", "backbone.norm.", "backbone.blocks.1."),
         ),
+        (
+            "last-1-blocks+positions+head",
+            (
+                *("aggregator.", "cross_image.", "backbone.norm.", "backbone.blocks.1."),
+                *("backbone.cls_token", "backbone.pos_embed", "backbone.pos_embed_cls"),
+            ),
+        ),
+        (
+            "last-1-blocks+no-norm+head",
+            ("aggregator.", "cross_image.", "backbone.blocks.1."),
+        ),
         ("all", ("",)),
     ],
 )
@@ -99,6 +118,20 @@ def test_what_trains_is_chosen_by_name(params, trainable: str, prefixes: tuple[s
     whole = named_leaves(merge_params(chosen, frozen, MODEL))
     for name, leaf in named_leaves(params).items():
         np.testing.assert_array_equal(whole[name], leaf)
+
+
+def test_a_norm_that_the_aggregator_leaves_out_stays_frozen() -> None:
+    """It has no gradient: weight decay alone would move it."""
+    boq = BoqConfig(channels=16, queries=3, rows=2)
+    cross_image = dataclasses.replace(MODEL.cross_image, layers=0)
+    model = dataclasses.replace(MODEL, aggregator=boq, cross_image=cross_image)
+    shapes = parameter_shapes(model)
+    for last_norm in (False, True):
+        chosen = dataclasses.replace(boq, last_norm=last_norm)
+        model = dataclasses.replace(model, aggregator=chosen)
+        split = functools.partial(split_params, config=model, trainable="last-1-blocks+head")
+        names = named_leaves(jax.eval_shape(split, shapes)[0])
+        assert ("backbone.norm.weight" in names) == last_norm
 
 
 def test_blocks_are_counted_from_the_end(params) -> None:

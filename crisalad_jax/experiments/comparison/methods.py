@@ -6,7 +6,14 @@ from typing import NamedTuple
 from crisalad_jax.config.parts import Part
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.recipes import RECIPES, find_part, from_scratch, recipe, with_part
+from crisalad_jax.training.recipes import (
+    RECIPES,
+    find_part,
+    from_scratch,
+    recipe,
+    split_name,
+    with_part,
+)
 
 
 class ComparedMethod(NamedTuple):
@@ -21,45 +28,65 @@ class ComparedMethod(NamedTuple):
 
 
 METHODS: Mapping[str, ComparedMethod] = {
-    "netvlad": ComparedMethod("NetVLAD", "netvlad"),
-    "gem": ComparedMethod("GeM", "gem"),
-    "conv-ap": ComparedMethod("Conv-AP", "conv-ap"),
-    "patch-netvlad": ComparedMethod("Patch-NetVLAD", "netvlad", rerank="patch-netvlad"),
-    "transvpr": ComparedMethod("TransVPR", "transvpr", rerank="transvpr"),
-    "cosplace": ComparedMethod("CosPlace", "cosplace"),
-    "mixvpr": ComparedMethod("MixVPR", "mixvpr"),
-    "eigenplaces": ComparedMethod("EigenPlaces", "eigenplaces"),
+    "crisalad+netvlad": ComparedMethod("CriSALAD + NetVLAD", "crisalad+netvlad"),
+    "crisalad+gem": ComparedMethod("CriSALAD + GeM", "crisalad+gem"),
+    "crisalad+conv-ap": ComparedMethod("CriSALAD + Conv-AP", "crisalad+conv-ap"),
+    "crisalad+patch-netvlad": ComparedMethod(
+        "CriSALAD + Patch-NetVLAD", "crisalad+netvlad", rerank="patch-netvlad"
+    ),
+    "crisalad+transvpr": ComparedMethod(
+        "CriSALAD + TransVPR", "crisalad+aggregator:transvpr", rerank="transvpr"
+    ),
+    "cosplace-vit": ComparedMethod("CosPlace over our ViT", "cosplace-vit"),
+    "crisalad+mixvpr": ComparedMethod("CriSALAD + MixVPR", "crisalad+mixvpr"),
+    "eigenplaces-vit": ComparedMethod("EigenPlaces over our ViT", "eigenplaces-vit"),
     "anyloc": ComparedMethod("AnyLoc", "anyloc"),
     "cricavpr": ComparedMethod("CricaVPR", "cricavpr"),
     "salad": ComparedMethod("DINO-SALAD", "salad"),
     "crisalad": ComparedMethod("CriSALAD", "crisalad"),
     "boq": ComparedMethod("BoQ", "boq"),
 }
-"""Methods in the order of Table 1. Other names are recipes or parts, without a second stage."""
+"""Methods in the order of Table 1. Those with a + have the head of a method whose own backbone is
+another, on CriSALAD's backbone and with its training. Other names are recipes or parts, without a
+second stage."""
+OLD_NAMES: Mapping[str, str] = {
+    **{
+        name: f"crisalad+{name}"
+        for name in ("netvlad", "gem", "conv-ap", "patch-netvlad", "transvpr", "mixvpr")
+    },
+    **{name: f"{name}-vit" for name in ("cosplace", "eigenplaces")},
+}
+"""Names of methods in earlier versions, where they are neither a recipe."""
 
 
 def method_of(name: str, preset: str) -> ComparedMethod:
     """Look up a method to compare.
 
     Args:
-        name: of `METHODS`, or what `recipe` looks up: a recipe, or a part as NAME or KIND:NAME.
+        name: of `METHODS`, or what `recipe` looks up: a recipe, or RECIPE+PART. A part alone
+            stands for crisalad+PART.
         preset: the size of the models.
 
     Returns:
-        The method; of a recipe or a part its name is the title.
+        The method; of a recipe its name is the title.
 
     Raises:
         InputError: there is no such method, recipe or part.
 
     Example:
-        >>> method_of("netvlad", "b14").title, method_of("step:newton", "b14").title
-        ('NetVLAD', 'step:newton')
+        >>> method_of("crisalad+gem", "b14").title, method_of("step:newton", "b14").title
+        ('CriSALAD + GeM', 'crisalad+step:newton')
     """
     if name in METHODS:
         return METHODS[name]
-    if name not in RECIPES:
-        find_part(name, preset, what="--methods", others={*METHODS, *RECIPES})
-    return ComparedMethod(name, name)
+    if name in RECIPES:
+        return ComparedMethod(name, name)
+    if name in OLD_NAMES:
+        return METHODS[OLD_NAMES[name]]
+    base, part = split_name(name)
+    find_part(part, preset, what="--methods", others={*METHODS, *RECIPES})
+    whole = f"{base or 'crisalad'}+{part}"
+    return METHODS.get(whole, ComparedMethod(whole, whole))
 
 
 def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> TrainConfig:
@@ -77,19 +104,23 @@ def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> Tra
         InputError: what `recipe` raises.
     """
     if recipe_name not in RECIPES:
-        part = find_part(recipe_name, preset)
-        return training_with(part, preset, from_nothing=from_nothing)
+        base, part = split_name(recipe_name)
+        found = find_part(part, preset)
+        return training_with(found, preset, from_nothing=from_nothing, base=base or "crisalad")
     config = recipe(preset, recipe_name)
     return from_scratch(config) if from_nothing else config
 
 
-def training_with(part: Part, preset: str, *, from_nothing: bool) -> TrainConfig:
-    """Make CriSALAD's recipe with one part replaced by another of its kind.
+def training_with(
+    part: Part, preset: str, *, from_nothing: bool, base: str = "crisalad"
+) -> TrainConfig:
+    """Make a recipe with one part replaced by another of its kind.
 
     Args:
         part: the part.
         preset: the size of the model.
         from_nothing: whether training starts from random weights, as `from_scratch` has it.
+        base: name of the recipe.
 
     Returns:
         The configuration.
@@ -101,7 +132,7 @@ def training_with(part: Part, preset: str, *, from_nothing: bool) -> TrainConfig
         >>> training_with(find_part("light", "b14"), "b14", from_nothing=False).augmentation
         LightAugmentConfig(...)
     """
-    config = with_part(recipe(preset, "crisalad"), part)
+    config = with_part(recipe(preset, base), part)
     if not from_nothing:
         return config
     config = from_scratch(config)

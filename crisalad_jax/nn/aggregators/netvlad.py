@@ -63,8 +63,8 @@ class NetVladConfig(Aggregator):
     def from_centroids(
         self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
     ) -> NetVlad:
-        """Make parameters as the authors do; see the function `from_centroids`."""
-        return from_centroids(centroids, features)
+        """Make parameters as the authors do; see `scores_from_centroids`."""
+        return NetVlad(scores_from_centroids(centroids, features), centroids)
 
     def apply(
         self, params: NetVlad, features: Features, grid: tuple[int, int], *, key: Keys | None
@@ -73,10 +73,10 @@ class NetVladConfig(Aggregator):
         return Tokens.of_local(netvlad(params, features.patches))
 
 
-def from_centroids(
+def scores_from_centroids(
     centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
-) -> NetVlad:
-    """Make parameters as the authors do: scores are alpha times cosines to the k-means centroids.
+) -> Linear:
+    """Make the scores' layer as the authors do: alpha times cosines to the k-means centroids.
 
     alpha is chosen so that a feature's largest share is `RATIO` times its second largest, in the
     geometric mean over these features.
@@ -98,7 +98,7 @@ def from_centroids(
             f"features: found {len(features)} that are as near to two of {len(centroids)} "
             "centroids, expected features that differ"
         )
-    return NetVlad(Linear(math.log(RATIO) / gap * directions.T, None), centroids)
+    return Linear(math.log(RATIO) / gap * directions.T, None)
 
 
 def netvlad(

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.aggregators.netvlad import scores_from_centroids
 from crisalad_jax.nn.backbones.base import Backbone, Features
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
@@ -56,6 +57,16 @@ class SuperVladConfig(Aggregator):
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> SuperVlad:
         """Draw the scores' layer as torch's convolution."""
         return SuperVlad(init_linear(key, backbone.dim, self.clusters + self.ghosts, bias=False))
+
+    def from_centroids(
+        self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
+    ) -> SuperVlad:
+        """Make the scores as NetVLAD's; the centroids themselves are not kept."""
+        return SuperVlad(scores_from_centroids(centroids, features))
+
+    def count_centroids(self, dim: int) -> int:
+        """Return the number of all clusters, ghosts included."""
+        return self.clusters + self.ghosts
 
     def apply(
         self, params: SuperVlad, features: Features, grid: tuple[int, int], *, key: Keys | None

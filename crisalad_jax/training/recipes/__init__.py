@@ -8,6 +8,7 @@ from crisalad_jax.training.recipes.base import find_part as find_part
 from crisalad_jax.training.recipes.base import from_scratch as from_scratch
 from crisalad_jax.training.recipes.base import recipe as recipe
 from crisalad_jax.training.recipes.base import register_recipe as register_recipe
+from crisalad_jax.training.recipes.base import split_name as split_name
 from crisalad_jax.training.recipes.base import with_part as with_part
 
 for _module in pkgutil.iter_modules(__path__):

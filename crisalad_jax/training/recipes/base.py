@@ -1,4 +1,4 @@
-"""Recipes: how a published method is trained, by its name; or CriSALAD with one part swapped."""
+"""Recipes: how a published method is trained, by its name; or a recipe with one part swapped."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
@@ -11,11 +11,17 @@ from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
 
 Make = Callable[[ModelConfig, str], TrainConfig]
 """Takes the model of a preset and the preset's name; returns the configuration."""
 RECIPES: dict[str, Make] = {}
-"""Recipes by name. Rows of Table 2 that are missing here differ from `crisalad` by one flag."""
+"""Recipes by name. A published method's name is that of its own training. Rows of Table 2 that are
+missing here differ from `crisalad` by one flag."""
+RENAMED = {
+    "eigenplaces": "eigenplaces-vit",
+}
+"""Recipes of earlier versions by their old names."""
 
 
 def register_recipe(name: str) -> Callable[[Make], Make]:
@@ -60,9 +66,9 @@ def recipe(preset: str, name: str | None = None) -> TrainConfig:
 
     Args:
         preset: the size of the model (`PRESETS`).
-        name: what to reproduce (`RECIPES`), or a registered part, as NAME or KIND:NAME: CriSALAD's
-            recipe with that part in the place of its own. None is the paper's way, except for
-            `tiny`, which starts from nothing.
+        name: what to reproduce (`RECIPES`), or RECIPE+PART: a recipe with a registered part, as
+            NAME or KIND:NAME, in the place of its own. A part alone stands for crisalad+PART. None
+            is the paper's way, except for `tiny`, which starts from nothing.
 
     Returns:
         The configuration of a training run.
@@ -73,14 +79,32 @@ def recipe(preset: str, name: str | None = None) -> TrainConfig:
     Example:
         >>> recipe("b14").optimiser.learning_rate
         6e-05
-        >>> recipe("b14", "gem").model.descriptor_dim
+        >>> recipe("b14", "crisalad+gem").model.descriptor_dim
         768
     """
     model = choose("preset", preset, PRESETS)
     name = ("scratch" if preset == "tiny" else "crisalad") if name is None else name
+    if name in RENAMED:
+        tell(f"recipe: found {name}, which is called {RENAMED[name]}")
+        name = RENAMED[name]
     if name in RECIPES:
         return RECIPES[name](model, preset)
-    return with_part(TrainConfig(model=model), find_part(name, preset))
+    base, part = split_name(name)
+    found = find_part(part, preset)
+    if base is None:
+        tell(f"recipe: found {name}, which is a part: crisalad+{name}, CriSALAD with it in place")
+    return with_part(RECIPES[base or "crisalad"](model, preset), found)
+
+
+def split_name(name: str) -> tuple[str | None, str]:
+    """Split RECIPE+PART into the two; of a part alone the recipe is None.
+
+    Example:
+        >>> split_name("crisalad+step:newton"), split_name("gem")
+        (('crisalad', 'step:newton'), (None, 'gem'))
+    """
+    base, plus, part = name.partition("+")
+    return (base, part) if plus and base in RECIPES else (None, name)
 
 
 def find_part(
@@ -136,10 +160,11 @@ def with_part(config: TrainConfig, part: Part) -> TrainConfig:
 
 
 def _with_aggregator(config: TrainConfig, part: Any) -> TrainConfig:
-    """Replace CriSALAD's head by another aggregator, and train all else as the paper does.
+    """Replace a recipe's head by another aggregator, and train all else as it does.
 
-    The backbone stays frozen, with the same adapters, so that methods differ only in what they make
-    of its features. There is no cross-image encoder: a descriptor depends on its own image alone.
+    Of CriSALAD the backbone stays frozen, with the same adapters, so that methods differ only in
+    what they make of its features. There is no cross-image encoder: a descriptor depends on its own
+    image alone.
     """
     cross_image = dataclasses.replace(config.model.cross_image, layers=0)
     model = dataclasses.replace(config.model, aggregator=part, cross_image=cross_image)
@@ -201,7 +226,7 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         The configuration of a training run from random weights.
 
     Example:
-        >>> from_scratch(recipe("tiny", "gem")).trainable
+        >>> from_scratch(recipe("tiny", "crisalad+gem")).trainable
         'all'
     """
     loss = dataclasses.replace(config.loss, kind=config.loss.kind.from_scratch())

@@ -13,19 +13,20 @@ from crisalad_jax.training.recipes.base import register_recipe
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 
-@register_recipe("cosplace")
-def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of gmberton/CosPlace: Adam at 1e-5, a batch of 32 classes, an image of each.
+@register_recipe("cosplace-vit")
+def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make gmberton/CosPlace's recipe for our ViT: Adam at 1e-5, 32 classes, an image of each.
 
-    The classes are GSV-Cities' places, for each of them is one spot in one direction.
+    Adapters and head train on images of the ViT's size, with RandAugment. The classes are
+    GSV-Cities' places, for each of them is one spot in one direction.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(steps=10_000))
     return _classified(model, AGGREGATORS.make("cosplace", preset), loss, epochs=50)
 
 
-@register_recipe("eigenplaces")
-def eigenplaces(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make the recipe of gmberton/EigenPlaces: viewpoint classes, descriptors four times as long.
+@register_recipe("eigenplaces-vit")
+def eigenplaces_vit(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make gmberton/EigenPlaces' recipe for our ViT: viewpoint classes, longer descriptors.
 
     A step of the public code takes one batch of lateral and one of frontal classes. Here each kind
     has its own epochs, of which there are twice as many.

@@ -11,7 +11,11 @@ from crisalad_jax.training.recipes.crisalad import without_encoder
 
 @register_recipe("salad")
 def salad(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make SALAD's recipe: no adapter or encoder, the last four blocks train in mixed precision."""
+    """Make SALAD's recipe: no adapter or encoder, the last four blocks train in mixed precision.
+
+    Its code also moves the schedule on by a step at the end of each epoch, which is left out: a
+    learning rate lower by less than 1 part in 1,000.
+    """
     backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
     return TrainConfig(
         model=without_encoder(model, backbone=backbone, compute_dtype="bfloat16"),
@@ -19,5 +23,6 @@ def salad(model: ModelConfig, preset: str) -> TrainConfig:
         trainable="last-4-blocks+head",
         places_per_batch=60,
         epochs=4,
+        select_by="R@1",
         patience=None,
     )

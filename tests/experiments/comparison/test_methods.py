@@ -17,17 +17,29 @@ from tests.cli.test_cli import fails
 
 
 def test_what_names_stand_for():
-    assert method_of("netvlad", "tiny") is METHODS["netvlad"]
-    for name in ("crisalad-1e-4", "step:newton", "triplet"):
+    for name in METHODS:
+        assert method_of(name, "tiny") is METHODS[name]
+    for name, old in (
+        ("crisalad+netvlad", "netvlad"),
+        ("crisalad+patch-netvlad", "patch-netvlad"),
+        ("eigenplaces-vit", "eigenplaces"),
+    ):
+        assert method_of(old, "tiny") is METHODS[name]
+    for name, whole in (
+        ("crisalad-1e-4", "crisalad-1e-4"),
+        ("step:newton", "crisalad+step:newton"),
+        ("triplet", "crisalad+triplet"),
+        ("salad+newton", "salad+newton"),
+    ):
         method = method_of(name, "tiny")
-        assert (method.title, method.recipe, method.rerank) == (name, name, None)
+        assert (method.title, method.recipe, method.rerank) == (whole, whole, None)
     assert file_name("step:newton") == "step-newton"
     assert file_name("a/b c:d") == "a-b-c-d"
     assert {file_name(name) for name in METHODS} == set(METHODS)
 
 
 def test_a_method_is_trained_as_its_recipe_says():
-    for name in ("crisalad-1e-4", "step:newton", "gem"):
+    for name in ("crisalad-1e-4", "crisalad+step:newton", "crisalad+gem", "salad+newton"):
         expected = recipe("tiny", name)
         assert method_training(name, "tiny", from_nothing=False) == expected
         assert method_training(name, "tiny", from_nothing=True) == from_scratch(expected)
@@ -59,7 +71,7 @@ def test_variants_of_parts(settings):
     names = ("crisalad", "step:newton", "anyloc")
     prepared = prepare(ComparisonConfig(**settings | {"names": names}))
     assert [variant.labels[0] for variant in prepared.variants] == [
-        *("CriSALAD", "step:newton", "AnyLoc")
+        *("CriSALAD", "crisalad+step:newton", "AnyLoc")
     ]
     assert [variant.learns for variant in prepared.variants] == [True, True, False]
     ablation = prepare(ComparisonConfig(**settings | {"kind": "ablate", "names": names[:2]}))
@@ -105,8 +117,8 @@ def test_a_plug_ins_part_from_training_to_the_table(settings, tmp_path, monkeypa
     summary = compare(config, out, say=lines.append, quiet=True)
     assert lines[0] == "1 to compare, tiny, what is trained starts from nothing"
     (row,) = summary.rows
-    assert (row.name, row.labels, row.dimension) == (name, (name,), 32)
-    assert (out / "aggregator-average" / "seed-0" / "run" / "last.safetensors").is_file()
+    assert (row.name, row.labels, row.dimension) == (name, (f"crisalad+{name}",), 32)
+    assert (out / "crisalad+aggregator-average" / "seed-0" / "run" / "last.safetensors").is_file()
     assert json.loads((out / "results.json").read_text())["rows"][0]["name"] == name
     assert (out / "index.html").is_file()
     monkeypatch.setattr(runner, "source_digest", lambda part: "second")

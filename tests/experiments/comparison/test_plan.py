@@ -161,7 +161,7 @@ def test_more_ranked_anew_than_there_are(flags, capfd, tmp_path, monkeypatch):
 
 def test_another_size_for_parameters_of_one(settings):
     """MixVPR's parameters are for the patches of the size that is asked for, not the preset's."""
-    given = settings | {"names": ("mixvpr",), "image_size": (56, 70)}
+    given = settings | {"names": ("crisalad+mixvpr",), "image_size": (56, 70)}
     (variant,) = prepare(ComparisonConfig(**given)).variants
     assert variant.model.image_size == (56, 70)
 

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig, hard_vlad
-from crisalad_jax.nn.aggregators.netvlad import NetVlad, NetVladConfig, from_centroids, netvlad
+from crisalad_jax.nn.aggregators.netvlad import (
+    NetVlad,
+    NetVladConfig,
+    netvlad,
+    scores_from_centroids,
+)
+from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.backbones.base import FeatureRequest, Features
 from crisalad_jax.nn.backbones.vit import ViTConfig, vit
 from crisalad_jax.nn.config import ModelConfig
@@ -68,7 +74,11 @@ def test_hard_vlad_takes_the_nearest_word_alone() -> None:
 def test_the_start_shares_a_patch_out_a_hundred_to_one() -> None:
     """The mean logarithm of the largest share over the second largest; directions stay."""
     features = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
-    params = from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    params = NetVladConfig().from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    # SuperVLAD's code makes the same scores, and keeps no centroids.
+    other = SuperVladConfig().from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    np.testing.assert_array_equal(other.conv.weight, params.conv.weight)
+    assert SuperVladConfig(clusters=4, ghosts=1).count_centroids(32) == 5
     scores = features.astype(np.float64) @ np.asarray(params.conv.weight)
     shares = np.exp(scores) / np.exp(scores).sum(axis=1, keepdims=True)
     largest = np.sort(shares, axis=1)
@@ -87,7 +97,7 @@ def test_the_start_shares_a_patch_out_a_hundred_to_one() -> None:
 def test_a_start_from_features_that_are_all_alike_is_refused() -> None:
     features = jnp.tile(unit(PATCHES[0, 0]), (5, 1))
     with pytest.raises(InputError, match="found 5 that are as near to two of 2 centroids"):
-        from_centroids(features[:2], features)
+        scores_from_centroids(features[:2], features)
 
 
 def test_without_features_centroids_are_random_and_unit() -> None:
