@@ -12,6 +12,7 @@ from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.io import from_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.experiments.demo import DemoConfig
@@ -33,13 +34,14 @@ from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.retrieval.pca import PcaConfig
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes import RECIPES, recipe
+from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
 
@@ -198,6 +200,50 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
         assert config.images_per_place == 4
 
 
+def test_the_recipes_over_resnet_are_as_published():
+    """amaralibey/MixVPR, amaralibey/gsv-cities, amaralibey/Bag-of-Queries, gmberton/CosPlace."""
+    mix = recipe("b14", "mixvpr")
+    assert mix.model.backbone == ResNetConfig(layers=50, stages=3)
+    assert mix.model.aggregator == MixVprConfig(channels=1024, rows=4, depth=4)
+    assert (mix.model.image_size, mix.model.descriptor_dim) == ((320, 320), 4096)
+    assert (mix.trainable, mix.places_per_batch, mix.epochs) == ("last-1-blocks+head", 120, 80)
+    assert mix.optimiser == dataclasses.replace(
+        recipe("b14", "dino-mix").optimiser, learning_rate=0.05
+    )
+    conv = recipe("b14", "conv-ap")
+    assert conv.model.backbone == ResNetConfig(layers=50, stages=4)
+    assert (conv.model.image_size, conv.model.descriptor_dim) == ((320, 320), 4096)
+    assert (conv.trainable, conv.places_per_batch, conv.epochs) == ("last-2-blocks+head", 100, 30)
+    assert conv.optimiser == OptimiserConfig(
+        kind="adamw",
+        learning_rate=2e-4,
+        schedule="milestones",
+        milestones=(5, 10, 15, 25),
+        step_gamma=0.3,
+        warmup_steps=600,
+        weight_decay=0.0,
+    )
+    boq = recipe("b14", "boq-resnet50")
+    assert boq.model.backbone == ResNetConfig(layers=50, stages=3)
+    assert (boq.model.image_size, boq.model.descriptor_dim) == ((320, 320), 16_384)
+    assert boq.trainable == "last-2-blocks+head"
+    assert boq.optimiser == recipe("b14", "boq").optimiser
+    for config in (mix, conv, boq):
+        assert (config.batch_norm, config.select_by) == ("batch", "R@1")
+    cosplace = recipe("b14", "cosplace")
+    assert cosplace.model.backbone == ResNetConfig(layers=18, stages=4)
+    assert (cosplace.model.image_size, cosplace.model.descriptor_dim) == ((512, 512), 512)
+    assert (cosplace.trainable, cosplace.select_by) == ("last-2-blocks+head", "R@1")
+    assert cosplace.augmentation == ColourCropConfig(0.7, 0.7, 0.7, 0.5, 0.5)
+    classes = cosplace.loss.kind.classes
+    assert (classes.kind, classes.groups, cosplace.min_images) == ("cells", 8, 10)
+    edtformer = recipe("b14", "edtformer")
+    assert edtformer.model.descriptor_dim == 4096
+    assert edtformer.model.backbone.adapter_dim == 4
+    assert (edtformer.epochs, edtformer.patience, edtformer.select_by) == (15, 15, "R@5")
+    assert edtformer.optimiser.step_gamma == 0.7
+
+
 def test_a_part_alone_and_old_names_are_told():
     with pytest.warns(Note, match=r"^recipe: found gem, which is a part: crisalad\+gem, CriS"):
         assert recipe("tiny", "gem") == recipe("tiny", "crisalad+gem")
@@ -239,7 +285,12 @@ def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int
     "name", [*RECIPES, *(f"crisalad+aggregator:{name}" for name in AGGREGATORS)]
 )
 def test_every_recipe_fits_every_preset(preset: str, name: str):
-    assert recipe(preset, name).model.backbone.dim == PRESETS[preset].backbone.dim
+    found = recipe(preset, name)
+    assert from_scratch(found).trainable == "all"
+    if isinstance(found.model.backbone, ViTConfig):
+        assert found.model.backbone.dim == PRESETS[preset].backbone.dim
+    else:  # the published sizes, for every preset but one
+        assert (found.model == recipe("b14", name).model) == (preset != "tiny")
 
 
 def test_augmentation_is_the_one_named():

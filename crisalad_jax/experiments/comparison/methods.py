@@ -35,7 +35,7 @@ METHODS: Mapping[str, ComparedMethod] = {
         "CriSALAD + Patch-NetVLAD", "crisalad+netvlad", rerank="patch-netvlad"
     ),
     "crisalad+transvpr": ComparedMethod(
-        "CriSALAD + TransVPR", "crisalad+aggregator:transvpr", rerank="transvpr"
+        "CriSALAD + TransVPR", "crisalad+transvpr", rerank="transvpr"
     ),
     "cosplace-vit": ComparedMethod("CosPlace over our ViT", "cosplace-vit"),
     "crisalad+mixvpr": ComparedMethod("CriSALAD + MixVPR", "crisalad+mixvpr"),
@@ -50,13 +50,10 @@ METHODS: Mapping[str, ComparedMethod] = {
 another, on CriSALAD's backbone and with its training. Other names are recipes or parts, without a
 second stage."""
 OLD_NAMES: Mapping[str, str] = {
-    **{
-        name: f"crisalad+{name}"
-        for name in ("netvlad", "gem", "conv-ap", "patch-netvlad", "transvpr", "mixvpr")
-    },
-    **{name: f"{name}-vit" for name in ("cosplace", "eigenplaces")},
+    **{name: f"crisalad+{name}" for name in ("netvlad", "gem", "patch-netvlad", "transvpr")},
+    "eigenplaces": "eigenplaces-vit",
 }
-"""Names of methods in earlier versions, where they are neither a recipe."""
+"""Names of methods in earlier versions, but those that are now a recipe's."""
 
 
 def method_of(name: str, preset: str) -> ComparedMethod:

@@ -1,0 +1,114 @@
+"""CosPlace's and EigenPlaces' augmentation: changes of colour, then a crop (Berton et al. 2022).
+
+Torchvision's `ColorJitter` and `RandomResizedCrop` on tensors from 0 to 1, rounded to bytes at the
+end.
+"""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from crisalad_jax.config.checks import require, require_fraction
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
+from crisalad_jax.data.resize import resize_image
+
+_LUMA = np.array([0.2989, 0.587, 0.114], np.float32)
+"""Torchvision's weights of grey."""
+_ASPECTS = (3 / 4, 4 / 3)
+"""Least and largest aspect ratio of a crop."""
+_TRIES = 10
+"""Number of crops that are drawn before the largest central one is taken."""
+_Floats = Float32[np.ndarray, "h w 3"]
+
+
+@AUGMENTATIONS.register("colour-crop")
+@dataclasses.dataclass(frozen=True)
+class ColourCropConfig(Augmentation):
+    """Changes of colour in random order, then a crop at the size of the image (CosPlace)."""
+
+    brightness: float = 0.7
+    """Largest relative change of brightness."""
+    contrast: float = 0.7
+    """Largest relative change of contrast."""
+    saturation: float = 0.7
+    """Largest relative change of saturation."""
+    hue: float = 0.5
+    """Largest turn of the hue, of 1 for a whole circle."""
+    crop: float = 0.5
+    """Largest share of the area that a crop removes."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("brightness", "contrast", "saturation"):
+            value = getattr(self, name)
+            require(value >= 0, f"ColourCropConfig.{name}: found {value}, expected at least 0")
+        require(0 <= self.hue <= 0.5, f"ColourCropConfig.hue: found {self.hue}, expected 0 to 0.5")
+        require_fraction(self, "crop")
+
+    def apply(
+        self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
+    ) -> Image:
+        """Change the colours, then crop."""
+        pixels = image.astype(np.float32) / 255
+        strengths = [
+            generator.uniform(max(0.0, 1 - each), 1 + each)
+            for each in (self.brightness, self.contrast, self.saturation)
+        ]
+        turn = generator.uniform(-self.hue, self.hue)
+        for number in generator.permutation(4):
+            pixels = (
+                _turned(pixels, turn)
+                if number == 3
+                else _CHANGES[number](pixels, strengths[number])
+            )
+        top, left, height, width = _crop(image.shape[0], image.shape[1], self.crop, generator)
+        part = np.ascontiguousarray(pixels[top : top + height, left : left + width])
+        resized = resize_image(part, image.shape[:2], pixels="floats")
+        return np.clip(np.round(255 * resized), 0, 255).astype(np.uint8)
+
+
+def _blended(pixels: _Floats, other: np.ndarray | float, strength: float) -> _Floats:
+    mixed = strength * pixels + (1 - strength) * other
+    return np.clip(mixed, 0, 1).astype(np.float32)
+
+
+def _brightened(pixels: _Floats, strength: float) -> _Floats:
+    return _blended(pixels, 0.0, strength)
+
+
+def _contrasted(pixels: _Floats, strength: float) -> _Floats:
+    return _blended(pixels, float((pixels @ _LUMA).mean()), strength)
+
+
+def _saturated(pixels: _Floats, strength: float) -> _Floats:
+    return _blended(pixels, (pixels @ _LUMA)[..., None], strength)
+
+
+_CHANGES = (_brightened, _contrasted, _saturated)
+
+
+def _turned(pixels: _Floats, turn: float) -> _Floats:
+    """Turn the hue of every pixel by a share of the circle."""
+    hsv = cv2.cvtColor(pixels, cv2.COLOR_RGB2HSV)
+    hsv[..., 0] = (hsv[..., 0] + 360 * turn) % 360
+    return np.clip(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB), 0, 1)
+
+
+def _crop(
+    height: int, width: int, removed: float, generator: np.random.Generator
+) -> tuple[int, int, int, int]:
+    """Draw top, left, height and width of a crop: a share of the area, and an aspect ratio."""
+    least, most = _ASPECTS
+    for _ in range(_TRIES):
+        area = height * width * generator.uniform(1 - removed, 1)
+        aspect = math.exp(generator.uniform(math.log(least), math.log(most)))
+        across, down = round(math.sqrt(area * aspect)), round(math.sqrt(area / aspect))
+        if 0 < across <= width and 0 < down <= height:
+            top = int(generator.integers(height - down + 1))
+            return top, int(generator.integers(width - across + 1)), down, across
+    aspect = min(max(width / height, least), most)
+    across, down = min(width, round(height * aspect)), min(height, round(width / aspect))
+    return (height - down) // 2, (width - across) // 2, down, across
