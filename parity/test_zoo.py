@@ -14,12 +14,14 @@ import pytest
 
 from crisalad_jax import describe
 from crisalad_jax.checkpoints.layouts import infer, to_params, to_state
+from crisalad_jax.checkpoints.layouts.anyloc import vocabulary_model
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc, nearest_words
 from crisalad_jax.nn.aggregators.edtformer import decode
 from crisalad_jax.nn.aggregators.selavpr import local_features
 from crisalad_jax.nn.aggregators.vlad_buff import vlad_buff
 from crisalad_jax.nn.backbones import Features
 from crisalad_jax.nn.layers import l2_normalise
-from crisalad_jax.nn.model import Crisalad, extract_features
+from crisalad_jax.nn.model import Crisalad, extract_features, unit_features
 from parity import zoo
 
 BOUND = 2e-5
@@ -134,6 +136,32 @@ def test_steps_are_the_public_codes(name: str) -> None:
     assert found.keys() == golden.keys() - {"images", "descriptor"} - compared
     for key, array in found.items():
         compare(array, golden[key])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("facet", ["value", "query", "key", "token"])
+def test_anylocs_facets_are_the_public_codes(facet: str) -> None:
+    words, state = zoo.random_vocabulary()
+    golden = zoo.golden(zoo.ANYLOC)
+    _, base = infer(state, source="backbone")
+    backbone = to_params(state, base, "dinov2", source="backbone")[0].backbone
+    config = vocabulary_model(words, base, {"layer": 9, "facet": facet})
+    backbone = jax.tree.map(jnp.asarray, backbone)
+    params = Crisalad(backbone, AnyLoc(jnp.asarray(words)), None)
+    suffix = "" if facet == "value" else f"_{facet}"
+
+    patches = unit_features(params, golden["images"], config)
+    compare(patches[:, ::4, ::8], golden[f"features{suffix}"])
+    # The smallest gap of cosines between a patch's two nearest words is 4e-6, ten times what
+    # float32 makes here.
+    found = nearest_words(params.aggregator.words, patches, "cosine")
+    np.testing.assert_array_equal(found, golden[f"labels{suffix}"])
+    step = 1 if facet == "value" else 8
+    descriptors = describe(params, golden["images"], config)
+    compare(descriptors[:, ::step], golden[f"descriptor{suffix}"])
+    # By the distance, many patches have another word.
+    euclidean = nearest_words(params.aggregator.words, patches, "euclidean")
+    assert (euclidean != found).any()
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ import safetensors
 import safetensors.numpy
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS, State, check_holds, infer, to_params, to_state
+from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY, vocabulary_model
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX, read_matlab, write_matlab
 from crisalad_jax.checkpoints.safetensors_io import write_safetensors
 from crisalad_jax.checkpoints.weights import (
@@ -30,6 +31,7 @@ from crisalad_jax.checkpoints.weights import (
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.backbones.vit import ViT, ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -70,19 +72,7 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     if is_ours(path):
         params, config = load_weights(path, verify=verify)
         return Checkpoint(params, config, load_extras(path), None)
-    try:
-        with path.open("rb") as file:
-            start = file.read(9)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
-    if path.suffix == MATLAB_SUFFIX:
-        content: Any = read_matlab(path)
-    elif start[8:] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
-        content = _read_safetensors(path)
-    else:
-        content = _read_torch(path)
-    state, config = _unwrap(content, path)
+    state, config = _unwrap(_read(path), path)
     layout = "reference"
     if config is None:
         layout, config = infer(state, source=str(path))
@@ -95,6 +85,59 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     state = {name: _float32(name, array, path) for name, array in state.items()}
     params, extras = to_params(state, config, layout, source=str(path))
     return Checkpoint(jax.tree.map(jnp.asarray, params), config, extras, layout)
+
+
+def read_vocabulary(
+    path: str | os.PathLike[str],
+    backbone: str | os.PathLike[str],
+    fields: Mapping[str, Any] | None = None,
+) -> Checkpoint:
+    """Read a published vocabulary of AnyLoc, one tensor by itself, beside its backbone.
+
+    Args:
+        path: the vocabulary.
+        backbone: any checkpoint that `read_checkpoint` reads, whose backbone is taken.
+        fields: settings of `AnyLocConfig` that no shape tells: `layer`, `facet`, `assignment`.
+
+    Returns:
+        A whole model.
+
+    Raises:
+        InputError: what `read_checkpoint` raises of either file; or a vocabulary that is no tensor
+            of words by itself, or of words of another width than the backbone's features.
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a vocabulary")
+    words = _read(path)
+    if not isinstance(words, np.ndarray):
+        raise InputError(
+            f"{path}: found {type(words).__name__}, expected one tensor by itself, of a "
+            "vocabulary's words"
+        )
+    words = _float32("the vocabulary", words, path)
+    base = read_checkpoint(backbone)
+    try:
+        config = vocabulary_model(words, base.config, fields or {})
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    aggregator = config.aggregator.bind(AnyLoc(jnp.asarray(words)), base.params.backbone)
+    params = Crisalad(base.params.backbone, aggregator, None)
+    return Checkpoint(params, config, base.extras, VOCABULARY)
+
+
+def _read(path: pathlib.Path) -> Any:
+    """Read the content of a file of torch, safetensors or MATLAB, with numpy's arrays."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(9)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
+    if path.suffix == MATLAB_SUFFIX:
+        return read_matlab(path)
+    if start[8:] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
+        return _read_safetensors(path)
+    return _read_torch(path)
 
 
 def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -185,6 +228,11 @@ def _unwrap(content: Any, path: pathlib.Path) -> tuple[State, ModelConfig | None
                 )
             content = content[key]
             break
+    if isinstance(content, np.ndarray):
+        raise InputError(
+            f"{path}: found one tensor by itself, of shape {content.shape}, expected a dictionary "
+            "of tensors by name (a vocabulary needs its backbone: `crisalad convert --backbone`)"
+        )
     if not isinstance(content, Mapping) or not content:
         kind = "nothing" if isinstance(content, Mapping) else type(content).__name__
         raise InputError(f"{path}: found {kind}, expected a dictionary of tensors by name")
@@ -231,7 +279,7 @@ def layout_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
     stored = next((kind for kind, suffixes in SUFFIXES.items() if suffix in suffixes), "torch")
     fallback = {"safetensors": "huggingface", "matlab": "netvlad-matlab"}.get(stored, "reference")
     for name, layout in LAYOUTS.items():
-        if layout.stored == stored and name != fallback:
+        if layout.stored == stored and name != fallback and not layout.bare:
             try:
                 check_holds(config, name)
             except InputError:
@@ -269,6 +317,8 @@ def write_checkpoint(
     }
     if names.under is not None:
         content = {names.under: content}
+    if names.bare:
+        (content,) = content.values()
     if layout == "reference":
         content["config"] = json.dumps(to_plain(config))
     # Pass an open file, because torch writes the name of a path into the archive.
@@ -289,7 +339,12 @@ class Conversion(NamedTuple):
 
 
 def convert(
-    source: str | os.PathLike[str], target: str | os.PathLike[str], layout: str | None = None
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    layout: str | None = None,
+    *,
+    backbone: str | os.PathLike[str] | None = None,
+    fields: Mapping[str, Any] | None = None,
 ) -> Conversion:
     """Convert a public checkpoint to a file of this package, or such a file to a public one.
 
@@ -297,6 +352,8 @@ def convert(
         source: what `read_checkpoint` reads.
         target: for a public source, a .safetensors file. For one of ours, the public checkpoint.
         layout: one of `LAYOUTS`, for a source of ours; by default the one its parts came from.
+        backbone: the backbone's checkpoint, for a source that is a vocabulary of AnyLoc by itself.
+        fields: see `read_vocabulary`.
 
     Returns:
         What was read and written.
@@ -318,7 +375,10 @@ def convert(
     if layout is not None:
         choose("layout", layout, LAYOUTS)
     check_target(target)
-    checkpoint = read_checkpoint(source)
+    if backbone is None:
+        checkpoint = read_checkpoint(source)
+    else:
+        checkpoint = read_vocabulary(source, backbone, fields)
     if pathlib.Path(target).exists() and os.path.samefile(source, target):
         raise InputError(f"{target}: found the source itself, expected another file")
     suffix = pathlib.Path(target).suffix

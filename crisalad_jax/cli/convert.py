@@ -7,9 +7,11 @@ from typing import Annotated
 import tyro
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.torch_io import convert
 from crisalad_jax.cli.common import say
 from crisalad_jax.training.summary import model_words
+from crisalad_jax.utils.errors import InputError
 
 
 def _sources() -> str:
@@ -34,13 +36,31 @@ class Convert:
     target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST")]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
     layout: Annotated[str | None, tyro.conf.arg(help=_layouts())] = None
+    backbone: pathlib.Path | None = None
+    """The backbone's checkpoint, or a published model's name, as in dinov2-vitg14: for a vocabulary
+    of AnyLoc, which is one tensor by itself."""
+    layer: int | None = None
+    """With --backbone: the vocabulary's block, from 0, or from the end where negative; by default
+    -9, which is 31 of ViT-g's 40."""
+    facet: str | None = None
+    """With --backbone: query, key, value or token; by default value."""
+    assignment: str | None = None
+    """With --backbone: cosine, as published, or euclidean."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
 
 
 def run(arguments: Convert) -> None:
     """Convert the file, and print both layouts and the model."""
-    done = convert(arguments.source, arguments.target, arguments.layout)
+    names = ("layer", "facet", "assignment")
+    fields = {name: getattr(arguments, name) for name in names}
+    fields = {name: value for name, value in fields.items() if value is not None}
+    if fields and arguments.backbone is None:
+        raise InputError(f"--{next(iter(fields))}: found without --backbone, expected both")
+    backbone = None if arguments.backbone is None else find_weights(arguments.backbone)
+    done = convert(
+        arguments.source, arguments.target, arguments.layout, backbone=backbone, fields=fields
+    )
     source, target = map(_layout_words, (done.source, done.target))
     say(
         f"{arguments.source} ({source}) -> {arguments.target} ({target}): "

@@ -47,6 +47,8 @@ class Vocabulary:
     """AnyLoc's block, from 0, or from the end where negative; by default the preset's."""
     facet: str | None = None
     """What of that block AnyLoc takes: query, key, value or token; by default its values."""
+    assignment: str | None = None
+    """What AnyLoc's nearest word of a patch is nearest by: cosine (as published) or euclidean."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size (14); by default the model's."""
     resize: tuple[str, ...] = ()
@@ -92,7 +94,7 @@ def run(arguments: Vocabulary) -> None:
 def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
     fields = {
         name: value
-        for name in ("clusters", "layer", "facet")
+        for name in ("clusters", "layer", "facet", "assignment")
         if (value := getattr(arguments, name)) is not None
     }
     if arguments.weights is None:

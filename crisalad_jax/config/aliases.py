@@ -115,6 +115,12 @@ def _boq(value: Plain) -> None:
         value.setdefault("last_norm", True)
 
 
+def _anyloc(value: Plain) -> None:
+    # As for BoQ: without this field, a patch's word was always the one at the least distance.
+    if value.keys() >= {"clusters", "layer", "facet"}:
+        value.setdefault("assignment", "euclidean")
+
+
 def _sinkhorn(value: Plain) -> None:
     if "method" not in value:
         return
@@ -160,6 +166,7 @@ def _adapter_kind(training: Plain) -> Any:
 _CHANGES: Mapping[str, Callable[[Plain], None]] = {
     "ModelConfig": _model,
     "SaladConfig": _salad,
+    "AnyLocConfig": _anyloc,
     "BoqConfig": _boq,
     "SinkhornConfig": _sinkhorn,
     "LossConfig": _loss,

@@ -1,8 +1,8 @@
 """The vocabularies of NetVLAD and AnyLoc: k-means centroids of the features of images.
 
-It is Euclidean k-means of unit features, as in VLAD (Jegou et al. 2010) and at NetVLAD's start. A
-centroid is the mean of the features nearest to it, and no unit vector. AnyLoc's public code
-compares by the angle instead, which differs by the centroids' lengths.
+It is k-means of unit features: Euclidean, as in VLAD (Jegou et al. 2010) and at NetVLAD's start,
+or by the angle, as in AnyLoc's public code. A centroid is the mean of the features nearest to it,
+and no unit vector.
 """
 
 import dataclasses
@@ -101,7 +101,8 @@ def with_vocabulary(
         )
     if not np.isfinite(features).all():
         raise InputError("features: found NaN or infinity, expected a backbone's finite numbers")
-    centroids = jnp.asarray(_k_means(features, clusters, seed))
+    spherical = config.aggregator.spherical_centroids
+    centroids = jnp.asarray(_k_means(features, clusters, seed, spherical=spherical))
     aggregator = config.aggregator.from_centroids(centroids, jnp.asarray(features))
     aggregator = config.aggregator.bind(aggregator, params.backbone)
     return dataclasses.replace(params, aggregator=aggregator)
@@ -308,8 +309,9 @@ def _read_features(
 
 
 def _k_means(
-    features: Float[np.ndarray, "feature dim"], clusters: int, seed: int
+    features: Float[np.ndarray, "feature dim"], clusters: int, seed: int, *, spherical: bool
 ) -> Float32[np.ndarray, "cluster dim"]:
+    """Return the means of clusters; with `spherical` of those nearest by the angle."""
     import faiss as _faiss  # imported here: `needs_vocabulary` does without it
 
     faiss: Any = _faiss
@@ -318,9 +320,18 @@ def _k_means(
         clusters,
         niter=_ROUNDS,
         seed=seed % 2**31,
+        spherical=spherical,
         # All features are used, whatever their number.
         min_points_per_centroid=1,
         max_points_per_centroid=len(features),
     )
-    kmeans.train(np.ascontiguousarray(features))
-    return kmeans.centroids
+    features = np.ascontiguousarray(features)
+    kmeans.train(features)
+    if not spherical:
+        return kmeans.centroids
+    # faiss makes the means unit vectors, which moves no feature to another cluster.
+    nearest = kmeans.index.search(features, 1)[1][:, 0]
+    sums = np.zeros_like(kmeans.centroids)
+    np.add.at(sums, nearest, features)
+    counts = np.bincount(nearest, minlength=clusters)[:, None].astype(np.float32)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), kmeans.centroids)

@@ -35,7 +35,7 @@ SIZE = (14 * parts.GRID[0], 14 * parts.GRID[1])
 
 SALAD = SaladConfig(clusters=5, cluster_dim=16, token_dim=32, hidden=24, dropout=0.0)
 AGGREGATORS: Mapping[str, Aggregator] = {
-    "anyloc": AnyLocConfig(clusters=5, layer=-1, facet="token"),
+    "anyloc": AnyLocConfig(clusters=5, layer=-1, facet="token", assignment="euclidean"),
     # Two heads.
     "boq": BoqConfig(channels=128, queries=5, rows=3),
     "class-token": ClassTokenConfig(),

@@ -14,7 +14,9 @@ import zlib
 import numpy as np
 
 HERE = pathlib.Path(__file__).parent
-NAMES = tuple(sorted(path.stem for path in (HERE / "goldens").glob("*.npz")))
+ANYLOC = "anyloc_dinov2_vitb14_l9_value_c32"
+"""A vocabulary, beside the backbone's file."""
+NAMES = tuple(sorted(path.stem for path in (HERE / "goldens").glob("*.npz") if path.stem != ANYLOC))
 SEED = 11
 CHANGED: tuple[tuple[str, str, float], ...] = (
     ("^megaloc", r"aggregator\.linear\.bias$", 0.02),
@@ -24,6 +26,7 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
     ("netvlad", r"(pool\.conv|score_proj)\.weight$", 100.0),
     ("netvlad", r"(pool\.centroids|netvlad\.centers)$", 0.4),
     ("netvlad", r"(whiten|WPCA\.0)\.bias$", 0.02),
+    ("^anyloc", r"c_centers$", 0.36),
     ("^transvpr", r"pool\.fc\.1\.bias$", 0.1),
     ("^vladbuff", r"aggregator\.conv\.weight$", 100.0),
     ("^vladbuff", r"aggregator\.(centroids|pca_mean)$", 0.5),
@@ -39,6 +42,14 @@ def layout(name: str) -> dict[str, tuple[int, ...]]:
     """Return the shapes by name; "outer/inner" is a name within the file's dictionary `outer`."""
     shapes = json.loads((HERE / "layouts" / f"{name}.json").read_text(encoding="utf-8"))
     return {key: tuple(shape) for key, shape in shapes.items()}
+
+
+def random_vocabulary(seed: int = SEED) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return AnyLoc's random words, and the backbone's random weights by name."""
+    words = _array(ANYLOC, "c_centers", layout(ANYLOC)["c_centers"], seed)
+    path = HERE.parent / "layouts" / "dinov2_vitb14.json"
+    shapes = json.loads(path.read_text(encoding="utf-8"))
+    return words, {key: _array("dinov2", key, tuple(s), seed) for key, s in shapes.items()}
 
 
 def golden(name: str) -> dict[str, np.ndarray]:

@@ -12,6 +12,8 @@ from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH, assert_equal, random_params
 from tests.training.test_vocabulary import ANYLOC
 
+AT = "at 42 x 56, bilinear, antialiased, on bytes"
+
 
 @pytest.fixture
 def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -26,8 +28,8 @@ def test_it_leaves_a_whole_model(capfd, shared, tmp_path) -> None:
     save_weights(start, fresh, ANYLOC)
     command = ("vocabulary", "--weights", start, "--images", shared / "town", "--out", out)
     said = succeeds(capfd, *command, "--seed", 3, "--batch-size", BATCH, "--quiet")
-    words = "anyloc (key of block 0), 4 words from 12 images, descriptors of 128 numbers"
-    assert said == f"{out}: {words}"
+    words = "anyloc (key of block 0), 4 words from 12 images"
+    assert said == f"{out}: {words} {AT}, descriptors of 128 numbers"
     found, config = load_weights(out)
     assert config == ANYLOC
     paths = list_images(shared / "town")
@@ -55,7 +57,7 @@ def test_a_preset_and_a_backbone(capfd, shared, tmp_path) -> None:
         *("--clusters", 3, "--image-size", 42, 56, "--images", shared / "town", "--out", out),
         *("--max-images", 4, "--batch-size", BATCH, "--quiet"),
     )
-    assert said == f"{out}: netvlad, 3 words from 4 images, descriptors of 384 numbers"
+    assert said == f"{out}: netvlad, 3 words from 4 images {AT}, descriptors of 384 numbers"
     found, found_config = load_weights(out)
     assert (found_config.image_size, found_config.aggregator.clusters) == ((42, 56), 3)
     assert_equal(found.backbone, params.backbone)
@@ -138,7 +140,7 @@ def test_a_plug_ins_aggregator(capfd, shared, tmp_path, monkeypatch) -> None:
     words = "--facet: found with --aggregator bag-of-words, which has no such setting, expected one"
     fails(capfd, *start, "--facet", "key", words=(words, "clusters, layer"))
     said = succeeds(capfd, *start, "--clusters", 5, "--layer", 2, "--image-size", 42, 56)
-    assert said == f"{out}: bag-of-words, 5 words from 12 images, descriptors of 5 numbers"
+    assert said == f"{out}: bag-of-words, 5 words from 12 images {AT}, descriptors of 5 numbers"
     params, config = load_weights(out)
     assert (config.aggregator.clusters, config.aggregator.layer) == (5, 2)
     paths = list_images(shared / "town")

@@ -210,7 +210,7 @@ AGGREGATORS_OF_OLD: dict[str, Aggregator] = {
     "conv-ap": ConvApConfig(channels=96, side=3),
     "cosplace": CosPlaceConfig(dim=48),
     "mixvpr": MixVprConfig(channels=80, rows=2, depth=3),
-    "anyloc": AnyLocConfig(clusters=10, layer=-2, facet="key"),
+    "anyloc": AnyLocConfig(clusters=10, layer=-2, facet="key", assignment="euclidean"),
     "boq": BoqConfig(channels=128, queries=12, layers=3, rows=5, last_norm=True),
     "transvpr": TransVprConfig(levels=2, dim=40),
 }

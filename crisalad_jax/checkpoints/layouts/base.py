@@ -38,6 +38,8 @@ class Layout:
     """Key of the file's dictionary that holds the state; None: the file is the state."""
     stored: Stored = "torch"
     """Kind of the family's files."""
+    bare: bool = False
+    """Whether a file is one tensor by itself, which is a part of a model."""
 
 
 LAYOUTS: dict[str, Layout] = {}

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
@@ -42,6 +42,10 @@ class AnyLocConfig(Aggregator):
     AnyLoc's choice."""
     facet: Literal["query", "key", "value", "token"] = "value"
     """Facet of the block: queries, keys or values of its attention, or its output tokens."""
+    assignment: Literal["cosine", "euclidean"] = "cosine"
+    """What the nearest word of a patch is nearest by. The public code takes the angle; so does the
+    k-means that builds a vocabulary. In weight files that are older than this field it is the
+    distance."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -71,6 +75,11 @@ class AnyLocConfig(Aggregator):
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> AnyLoc:
         """Draw random unit vectors as words, until a vocabulary is built."""
         return AnyLoc(l2_normalise(jax.random.normal(key, (self.clusters, backbone.dim))))
+
+    @property
+    def spherical_centroids(self) -> bool:
+        """Whether k-means compares features with centroids by the angle."""
+        return self.assignment == "cosine"
 
     def from_centroids(
         self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
@@ -102,7 +111,8 @@ class AnyLocConfig(Aggregator):
         self, params: AnyLoc, features: Features, grid: tuple[int, int], *, key: Keys | None
     ) -> Tokens:
         """Return a sum of residuals for each word, of length 1, or 0 where no patch is near."""
-        return Tokens.of_local(hard_vlad(params.words, features.patches))
+        vlad = hard_vlad(params.words, features.patches, assignment=self.assignment)
+        return Tokens.of_local(vlad)
 
 
 def _digest(backbone: Any) -> str:
@@ -114,15 +124,30 @@ def _digest(backbone: Any) -> str:
 
 
 def hard_vlad(
-    words: Float[Array, "cluster dim"], patches: Float[Array, "*batch patch dim"]
+    words: Float[Array, "cluster dim"],
+    patches: Float[Array, "*batch patch dim"],
+    *,
+    assignment: Literal["cosine", "euclidean"],
 ) -> Float[Array, "*batch cluster dim"]:
     """Compute VLAD (Jegou et al. 2010) of unit patches, each at its nearest word, intra-normalised.
 
-    It computes in float32 at least, at the highest precision: rounding would change words.
+    Residuals are from the words as they are, whatever their lengths. It computes in float32 at
+    least, at the highest precision: rounding would change words.
     """
     patches = l2_normalise(at_least_float32(patches))
-    products = jnp.matmul(patches, words.T, precision="highest")
-    # |p - w|^2 = 1 - 2 p w + |w|^2.
-    nearest = jnp.argmax(products - 0.5 * jnp.square(words).sum(axis=-1), axis=-1)
+    nearest = nearest_words(words, patches, assignment)
     shares = jax.nn.one_hot(nearest, len(words), dtype=patches.dtype)
     return l2_normalise(residual_sums(shares, patches, words))
+
+
+def nearest_words(
+    words: Float[Array, "cluster dim"],
+    patches: Float[Array, "*batch patch dim"],
+    assignment: Literal["cosine", "euclidean"],
+) -> Int[Array, "*batch patch"]:
+    """Find the word nearest to every unit patch, by the angle or the distance."""
+    if assignment == "cosine":
+        return jnp.argmax(jnp.matmul(patches, l2_normalise(words).T, precision="highest"), axis=-1)
+    products = jnp.matmul(patches, words.T, precision="highest")
+    # |p - w|^2 = 1 - 2 p w + |w|^2.
+    return jnp.argmax(products - 0.5 * jnp.square(words).sum(axis=-1), axis=-1)

@@ -126,6 +126,14 @@ class Aggregator(Part, abc.ABC):
         return self.token_shape(dim).tokens
 
     @property
+    def spherical_centroids(self) -> bool:
+        """Whether k-means compares features with centroids by the angle; by default the distance.
+
+        A centroid is the mean of its features either way.
+        """
+        return False
+
+    @property
     def starts_from_centroids(self) -> bool:
         """Whether it has a vocabulary, which must be built before the model is used or trained."""
         return type(self).from_centroids is not Aggregator.from_centroids

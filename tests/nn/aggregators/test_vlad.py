@@ -57,14 +57,25 @@ def test_netvlad_is_the_papers_sum() -> None:
         np.testing.assert_allclose(clusters, [unit(row) for row in sums], atol=1e-6)
 
 
-def test_hard_vlad_takes_the_nearest_word_alone() -> None:
+def distance(patch: np.ndarray, word: np.ndarray) -> float:
+    return float(np.linalg.norm(patch - word))
+
+
+def angle(patch: np.ndarray, word: np.ndarray) -> float:
+    return float(-patch @ word / np.linalg.norm(word))
+
+
+@pytest.mark.parametrize(("assignment", "far"), [("euclidean", distance), ("cosine", angle)])
+def test_hard_vlad_takes_the_nearest_word_alone(assignment: Any, far: Any) -> None:
     """Jegou's VLAD by loops; a word that is nearest to nothing leaves zeros."""
-    words = np.concatenate([0.3 * CENTROIDS, np.full((1, 6), 9, np.float32)])
-    found = hard_vlad(jnp.asarray(words), jnp.asarray(PATCHES))
+    # Two of other lengths, which only the distance minds; and one that no patch is near to.
+    words = np.concatenate([0.3 * CENTROIDS, -9 * PATCHES.sum(axis=(0, 1))[None]])
+    words[1] *= 5
+    found = hard_vlad(jnp.asarray(words), jnp.asarray(PATCHES), assignment=assignment)
     for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
         sums = np.zeros((5, 6))
         for patch in map(unit, image):
-            nearest = min(range(5), key=lambda k: np.linalg.norm(patch - words[k]))
+            nearest = min(range(5), key=lambda k: far(patch, words[k]))
             sums[nearest] += patch - words[nearest]
         assert not sums[4].any()
         expected = [row if not row.any() else unit(row) for row in sums]

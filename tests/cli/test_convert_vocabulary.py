@@ -1,0 +1,79 @@
+"""AnyLoc's published vocabularies: one tensor by itself, beside its backbone's file."""
+
+import pathlib
+
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax.checkpoints.layouts import public_shapes
+from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY
+from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint, read_vocabulary
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
+from tests.cli.test_cli import fails, succeeds
+from tests.random_checkpoints import random_state, save
+
+BARE = ModelConfig(
+    backbone=ViTConfig(
+        dim=64, depth=2, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
+    ),
+    aggregator="class-token",
+    cross_image=CrossImageConfig(layers=0),
+)
+
+
+@pytest.fixture
+def files(tmp_path: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
+    """A vocabulary of three words, and its backbone."""
+    words = tmp_path / "c_centers.pt"
+    with words.open("wb") as file:
+        torch.save(torch.randn(3, 64, generator=torch.Generator().manual_seed(0)), file)
+    state = random_state(public_shapes(BARE, "dinov2"))
+    return words, save(tmp_path / "dinov2.pth", dict(state))
+
+
+def test_there_and_back_are_the_same_bytes(files, capfd, tmp_path: pathlib.Path) -> None:
+    words, backbone = files
+    ours, back = tmp_path / "anyloc.safetensors", tmp_path / "back.pt"
+    flags = ("--backbone", backbone, "--layer", 1, "--facet", "key")
+    said = succeeds(capfd, "convert", words, ours, *flags)
+    assert said.startswith(f"{words} (AnyLoc c_centers.pt) -> {ours} (crisalad-jax): ")
+    params, config = load_weights(ours)  # which compares the backbone with the vocabulary's
+    assert config.aggregator == AnyLocConfig(3, 1, "key", "cosine")
+    assert config.preprocessing.size_rule == "native"
+    np.testing.assert_array_equal(params.aggregator.words, torch.load(words).numpy())
+    expected = named_leaves(read_checkpoint(backbone).params.backbone)
+    for name, leaf in named_leaves(params.backbone).items():
+        np.testing.assert_array_equal(leaf, expected[name])
+
+    succeeds(capfd, "convert", ours, back, "--layout", VOCABULARY)
+    assert back.read_bytes() == words.read_bytes()
+    # Unless asked for the words alone, the whole model goes.
+    assert convert(ours, tmp_path / "whole.pth").target == "reference"
+
+
+def test_what_does_not_belong_together(files, capfd, tmp_path: pathlib.Path) -> None:
+    words, backbone = files
+    wide = tmp_path / "wide.pt"
+    torch.save(torch.ones(3, 96), wide)
+    with pytest.raises(InputError, match=r"wide.pt: found a tensor of shape .3, 96., .* 64 num"):
+        read_vocabulary(wide, backbone)
+    with pytest.raises(InputError, match=r"c_centers.pt: .*layer: found 5, expected -2 to 1"):
+        read_vocabulary(words, backbone, {"layer": 5})
+    with pytest.raises(InputError, match=r"dinov2.pth: found dict, expected one tensor"):
+        read_vocabulary(backbone, backbone)
+    with pytest.raises(InputError, match=r"one tensor by itself, of shape .3, 64., .*--backbone"):
+        read_checkpoint(words)
+    torch.save(torch.full((3, 64), torch.nan), wide)
+    with pytest.raises(InputError, match=r"wide.pt: the vocabulary holds NaN or infinity"):
+        read_vocabulary(wide, backbone)
+    command = ("convert", words, tmp_path / "x.safetensors", "--layer", 1)
+    fails(capfd, *command, words=("--layer: found without --backbone, expected both",))
+    assert not (tmp_path / "x.safetensors").exists()
