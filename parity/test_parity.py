@@ -20,7 +20,8 @@ NAMES = [what.name for what in (*CASES, *RUNS)]
 SLOW = {
     "Sinkhorn: 100 iterations, epsilon 1.0",
     "DINO-SALAD",  # a part of CriSALAD
-    "BoQ",  # tests/nn compares a smaller one
+    # tests/nn/aggregators compare smaller ones.
+    *("BoQ", "CosPlace's head", "MixVPR", "Conv-AP", "GeM", "SuperVLAD"),
     "NetVLAD's descriptor",  # the aggregators have rows of their own
     "AnyLoc's descriptor",
     "training CriSALAD's adapters and head",  # quick in float64
@@ -29,11 +30,9 @@ SLOW = {
 }
 QUICK = {
     "float32": set(NAMES) - SLOW,
-    "bfloat16": {"attention", "MLP", "block, no adapter"},
+    "bfloat16": {"attention", "block, no adapter"},
     "float64": {
         "pixels to numbers",
-        "positions: not square",
-        "SwiGLU",
         "Sinkhorn: 3 iterations, epsilon 0.1",
         "loss",
     },

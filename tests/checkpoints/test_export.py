@@ -143,6 +143,7 @@ def test_the_manifest_tells_what_lies_there(beside: pathlib.Path, params: Crisal
     assert manifest["model_sha256"] == model_hash(params, MODEL)
 
 
+@pytest.mark.slow
 def test_a_script_without_this_package(
     beside: pathlib.Path, params: Crisalad, tmp_path: pathlib.Path
 ):

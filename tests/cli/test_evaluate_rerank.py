@@ -19,6 +19,7 @@ def weights(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_rows_come_in_pairs(capfd, tmp_path, shared, weights):
     out = succeeds(
         capfd,

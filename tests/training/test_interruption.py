@@ -111,7 +111,8 @@ def assert_same_end(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert (found / name).read_bytes() == (expected / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.slow  # tests/attack kills training too
+@pytest.mark.parametrize("kills", [1, 50])
 def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tmp_path, kills):
     generator = random.Random(kills)
     out, killed = tmp_path / "run", 0

@@ -214,6 +214,7 @@ def test_a_split_state_does_not_change_a_run(shared, by_devices, tmp_path):
     assert_same_run(tmp_path / "split", by_devices / "1")
 
 
+@pytest.mark.slow
 def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
     out = tmp_path / "run"
     codes = ends(start(shared, out))

@@ -27,6 +27,7 @@ CONFIG = ModelConfig(
 )
 
 
+@pytest.mark.slow
 def test_the_tokens_run_through_the_last_blocks_by_hand() -> None:
     params = random_params(CONFIG)
     image = jax.random.normal(jax.random.key(1), (28, 42, 3))
