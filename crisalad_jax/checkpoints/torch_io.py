@@ -33,6 +33,7 @@ from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViT, ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
@@ -410,6 +411,7 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     """Read the backbone of any checkpoint, for a model of `config`.
 
     Adapters are read if the file has the same kind and sizes; otherwise they are those of `fresh`.
+    Of a ResNet with more stages the first ones are taken.
 
     Args:
         path: what `load` reads.
@@ -438,12 +440,18 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     theirs = checkpoint.config.backbone
     if isinstance(theirs, ViTConfig) and isinstance(config, ViTConfig):
         theirs = dataclasses.replace(theirs, adapter=config.adapter)
+    params = checkpoint.params.backbone
+    if isinstance(theirs, ResNetConfig) and isinstance(config, ResNetConfig):
+        # A head over fewer stages takes the first ones, as torchvision's files have four.
+        stages = min(theirs.stages, config.stages)
+        theirs = dataclasses.replace(theirs, stages=stages)
+        params = dataclasses.replace(params, blocks=params.blocks[:stages])
     # Ignore free fields, such as the initialisation: weights do not depend on them.
     wrong = differences(with_free_fields_of(config, theirs), config)
     if wrong:
         raise InputError(f"{path}: this backbone is of another size: {'; '.join(wrong)}")
-    if checkpoint.config.backbone == theirs or not isinstance(checkpoint.params.backbone, ViT):
-        return checkpoint.params.backbone
-    stack: Any = checkpoint.params.backbone.blocks  # one stack: only training cuts it
+    if checkpoint.config.backbone == theirs or not isinstance(params, ViT):
+        return params
+    stack: Any = params.blocks  # one stack: only training cuts it
     blocks = dataclasses.replace(stack, adapter=fresh.blocks.adapter)
-    return dataclasses.replace(checkpoint.params.backbone, blocks=blocks)
+    return dataclasses.replace(params, blocks=blocks)

@@ -36,22 +36,23 @@ class Names(NamedTuple):
         return f"{self.stem('conv1')}.weight"
 
 
-def batch_norm_lines(ours: str, theirs: str) -> Lines:
-    """Yield the lines of a batch norm: gain, shift, statistics, and the count of batches."""
+def batch_norm_lines(ours: str, theirs: str, *, counts: bool = True) -> Lines:
+    """Yield the lines of a batch norm: gain, shift, statistics, and the count of batches if kept."""
     yield from affine(ours, theirs, SAME)
     for name in ("running_mean", "running_var"):
         yield Entry((f"{ours}.{name}",), (f"{theirs}.{name}",), SAME)
-    count = "num_batches_tracked"
-    yield Extra(f"{ours}.{count}", f"{theirs}.{count}", (), np.int64)
+    if counts:
+        count = "num_batches_tracked"
+        yield Extra(f"{ours}.{count}", f"{theirs}.{count}", (), np.int64)
 
 
-def cnn_lines(config: Backbone, names: Names) -> Lines:
-    """Yield the table of a ResNet or a VGG."""
+def cnn_lines(config: Backbone, names: Names, *, counts: bool = True) -> Lines:
+    """Yield the table of a ResNet or a VGG; see `batch_norm_lines` for `counts`."""
     if isinstance(config, VggConfig):
         yield from _vgg_lines(names)
     else:
         assert isinstance(config, ResNetConfig)
-        yield from _resnet_lines(config, names)
+        yield from _resnet_lines(config, names, counts)
 
 
 def _vgg_lines(names: Names) -> Lines:
@@ -70,9 +71,9 @@ def vgg_numbers() -> Iterator[tuple[tuple[int, int], int]]:
         number += 1  # a maximum follows
 
 
-def _resnet_lines(config: ResNetConfig, names: Names) -> Lines:
+def _resnet_lines(config: ResNetConfig, names: Names, counts: bool) -> Lines:
     yield from affine("backbone.stem.conv", names.stem("conv1"), CONV, bias=False)
-    yield from batch_norm_lines("backbone.stem.norm", names.stem("bn1"))
+    yield from batch_norm_lines("backbone.stem.norm", names.stem("bn1"), counts=counts)
     width = config.widths(0)[0]
     for stage in range(config.stages):
         for i in range(BLOCKS[config.layers][stage]):
@@ -83,11 +84,13 @@ def _resnet_lines(config: ResNetConfig, names: Names) -> Lines:
                 yield from affine(
                     f"{ours}.convs.{j}.conv", f"{theirs}.conv{1 + j}", CONV, bias=False
                 )
-                yield from batch_norm_lines(f"{ours}.convs.{j}.norm", f"{theirs}.bn{1 + j}")
+                norm = f"{theirs}.bn{1 + j}"
+                yield from batch_norm_lines(f"{ours}.convs.{j}.norm", norm, counts=counts)
             if width != widths[-1]:
                 shortcut = f"{theirs}.downsample"
                 yield from affine(f"{ours}.shortcut.conv", f"{shortcut}.0", CONV, bias=False)
-                yield from batch_norm_lines(f"{ours}.shortcut.norm", f"{shortcut}.1")
+                norm = f"{shortcut}.1"
+                yield from batch_norm_lines(f"{ours}.shortcut.norm", norm, counts=counts)
             width = widths[-1]
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import FIRST, UPCONV, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 
 _LOCAL = "LocalAdapt"
@@ -32,6 +33,7 @@ register_over_dinov2(
     prefix="backbone.",
     mark=f"{_LOCAL}.upconv1.weight",
     adapter="serial-parallel",
+    preprocessing=PreprocessingConfig(pixels="floats"),
     module="module.",
     under="model_state_dict",
 )

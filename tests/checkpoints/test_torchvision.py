@@ -1,0 +1,93 @@
+"""torchvision's ResNet and VGG-16, by its names, against the torch reference."""
+
+import dataclasses
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax import describe, init_crisalad
+from crisalad_jax.checkpoints.layouts import infer, public_shapes
+from crisalad_jax.checkpoints.torch_io import convert, read_backbone, read_checkpoint
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vgg import VggConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.utils.errors import InputError
+from parity.reference.model import Crisalad
+
+CHILDREN = {"0": "conv1", "1": "bn1"} | {str(4 + i): f"layer{1 + i}" for i in range(4)}
+"""torchvision's names of a ResNet's children, by their places."""
+MODEL = ModelConfig(
+    image_size=(64, 96),
+    backbone=ResNetConfig(layers=18),
+    aggregator="gem",
+    cross_image=CrossImageConfig(layers=0),
+)
+
+
+def resnet(counts: bool) -> tuple[Crisalad, dict[str, torch.Tensor]]:
+    """The reference, and its weights as torchvision stores them."""
+    torch.manual_seed(0)
+    model = Crisalad(MODEL).eval()
+    state = {"fc.weight": torch.randn(1000, 512), "fc.bias": torch.randn(1000)}
+    for name, array in model.backbone.state_dict().items():
+        place, _, rest = name.partition(".")
+        if counts or not name.endswith("num_batches_tracked"):
+            state[f"{CHILDREN[place]}.{rest}"] = array
+    return model, state
+
+
+@pytest.mark.parametrize("counts", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_a_resnet_and_back(tmp_path: pathlib.Path, counts: bool) -> None:
+    model, state = resnet(counts)
+    # torchvision's ResNet-18 has 122 tensors, and its older files 102.
+    assert len(state) == (122 if counts else 102)
+    torch.save(state, tmp_path / "resnet18.pth")
+    read = read_checkpoint(tmp_path / "resnet18.pth")
+    assert read.layout == ("torchvision-resnet" if counts else "torchvision-resnet-old")
+    images = np.random.default_rng(0).normal(size=(2, 64, 96, 3)).astype(np.float32)
+    with torch.no_grad():
+        expected = model(torch.from_numpy(images).permute(0, 3, 1, 2))
+    # Unit vectors, after some thirty layers in float32.
+    np.testing.assert_allclose(describe(read.params, images, read.config), expected, atol=1e-6)
+    convert(tmp_path / "resnet18.pth", tmp_path / "ours.safetensors")
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", read.layout)
+    back = torch.load(tmp_path / "back.pth", weights_only=True)
+    assert back.keys() == state.keys()
+    for name, array in state.items():
+        assert torch.equal(back[name], array), name
+
+
+def test_training_starts_from_the_first_stages(tmp_path: pathlib.Path) -> None:
+    _, state = resnet(counts=True)
+    torch.save(state, tmp_path / "resnet18.pth")
+    config = ResNetConfig(layers=18, stages=3)
+    fresh = init_crisalad(jax.random.key(0), dataclasses.replace(MODEL, backbone=config)).backbone
+    found = read_backbone(tmp_path / "resnet18.pth", config, fresh)
+    assert jax.tree.structure(found) == jax.tree.structure(fresh)
+    last = found.blocks[2].layers[1].convs[1].conv.weight
+    expected = state["layer3.1.conv2.weight"].numpy().transpose(2, 3, 1, 0)
+    np.testing.assert_array_equal(last, expected)
+    with pytest.raises(InputError, match=r"of another size: layers: found 18, expected 50"):
+        read_backbone(tmp_path / "resnet18.pth", ResNetConfig(), None)
+
+
+def test_vgg_16s_names_and_shapes() -> None:
+    config = dataclasses.replace(MODEL, backbone=VggConfig())
+    shapes = public_shapes(config, "torchvision-vgg")
+    # 13 convolutions and 3 linear layers; 138,357,544 parameters, as torchvision's page says.
+    assert len(shapes) == 32
+    assert sum(int(np.prod(shape)) for shape in shapes.values()) == 138_357_544
+    blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
+    layout, found = infer(blank, source="vgg16.pth")
+    assert (layout, found.backbone) == ("torchvision-vgg", VggConfig())
+
+
+def test_another_resnet_is_told(tmp_path: pathlib.Path) -> None:
+    _, state = resnet(counts=True)
+    torch.save({n: x for n, x in state.items() if "layer2.1" not in n}, tmp_path / "odd.pth")
+    with pytest.raises(InputError, match=r"found a ResNet with \(2, 1, 2, 2\) blocks of two conv"):
+        read_checkpoint(tmp_path / "odd.pth")
