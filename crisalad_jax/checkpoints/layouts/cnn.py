@@ -37,7 +37,7 @@ class Names(NamedTuple):
 
 
 def batch_norm_lines(ours: str, theirs: str, *, counts: bool = True) -> Lines:
-    """Yield the lines of a batch norm: gain, shift, statistics, and the count of batches if kept."""
+    """Yield the lines of a batch norm: gain, shift, statistics, and, if kept, the batch count."""
     yield from affine(ours, theirs, SAME)
     for name in ("running_mean", "running_var"):
         yield Entry((f"{ours}.{name}",), (f"{theirs}.{name}",), SAME)
