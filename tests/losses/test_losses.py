@@ -127,7 +127,18 @@ OTHERS = [
 ]
 
 
-@pytest.mark.parametrize("config", OTHERS, ids=lambda c: f"{c.kind.part_name}, miner {c.miner}")
+def _name(config: LossConfig) -> str:
+    return f"{config.kind.part_name}, miner {config.miner}"
+
+
+A_HALF_SLOW = [
+    pytest.param(config, marks=pytest.mark.slow if number % 2 else ())
+    for number, config in enumerate(OTHERS)
+]
+"""Each kind once in the test command, with a miner or without."""
+
+
+@pytest.mark.parametrize("config", OTHERS, ids=_name)
 def test_every_loss_and_its_gradient_equal_the_librarys(config: LossConfig) -> None:
     """In float64: float32 tells little of the distance of descriptors that are nearly equal."""
     # The library's triplets know no such zero, and its FastAP none either.
@@ -155,7 +166,9 @@ def along_sphere(gradient: np.ndarray, x: np.ndarray) -> np.ndarray:
     return gradient - (gradient * x).sum(axis=1, keepdims=True) * x
 
 
-@pytest.mark.parametrize("config", OTHERS, ids=lambda c: f"{c.kind.part_name}, miner {c.miner}")
+@pytest.mark.parametrize(
+    "config", A_HALF_SLOW, ids=lambda c: f"{c.kind.part_name}, miner {c.miner}"
+)
 def test_every_loss_has_finite_gradients_where_images_are_the_same_or_pairs_are_missing(
     config: LossConfig,
 ) -> None:
@@ -173,7 +186,9 @@ def test_every_loss_has_finite_gradients_where_images_are_the_same_or_pairs_are_
         assert np.isfinite(gradient).all()
 
 
-@pytest.mark.parametrize("config", OTHERS, ids=lambda c: f"{c.kind.part_name}, miner {c.miner}")
+@pytest.mark.parametrize(
+    "config", A_HALF_SLOW, ids=lambda c: f"{c.kind.part_name}, miner {c.miner}"
+)
 def test_images_that_are_not_valid_take_no_part_in_any_loss(config: LossConfig) -> None:
     x, labels = random_batch(2)
     padded = np.concatenate([x, unit(np.random.default_rng(9).standard_normal((3, 6)))])

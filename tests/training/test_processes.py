@@ -200,6 +200,7 @@ def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert error <= 1e-5 * np.linalg.norm(theirs[name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["2", "4", "8"])
 def test_devices_do_not_change_a_run(by_devices: pathlib.Path, name: str):
     assert_same_run(by_devices / name, by_devices / "1")
