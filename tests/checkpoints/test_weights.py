@@ -307,7 +307,8 @@ def changed(config: Any, fields: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("built", [True, False])
 def test_a_vocabulary_of_version_0_1_is_bound_to_its_backbone(tmp_path, built):
     """Which a checksum among the parameters told; a vocabulary not yet built had 0."""
-    config = dataclasses.replace(WITHOUT_ENCODER, aggregator=AnyLocConfig(layer=0))
+    anyloc_of_then = AnyLocConfig(layer=0, assignment="euclidean")
+    config = dataclasses.replace(WITHOUT_ENCODER, aggregator=anyloc_of_then)
     params = random_params(config)
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
     checksum = 0
