@@ -375,13 +375,17 @@ def test_only_what_trains_moves(trainable: str, moving: tuple[str, ...], kind: K
     config = TrainConfig(trainable=trainable, optimiser=OptimiserConfig(learning_rate=1e-3))
     train(model, [batch()] * 2, config, steps=4)
     moved = {name for name, x in model.state_dict().items() if not torch.equal(x, before[name])}
+    # Frozen or not, batch norms follow their batches.
+    buffers = {name for name, _ in model.named_buffers()}
+    assert len(buffers) == (0 if kind == "depthwise" else 2 * 5 * 3)
+    assert buffers <= moved
     # The mask token is in no output: it has no gradient, and does not decay either.
     expected = {
         name
         for name, _ in model.named_parameters()
         if name.startswith(moving) and name != "backbone.mask_token"
     }
-    assert moved == expected
+    assert moved - buffers == expected
 
 
 def test_loss_falls() -> None:
