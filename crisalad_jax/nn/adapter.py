@@ -197,36 +197,26 @@ def adapter(
     as in CricaVPR. The MLP and side adapters have neither convolutions nor skip, and the latter has
     GELU.
     """
-    return _adapter(params, tokens, grid, None)[0]
+    return train_adapter(params, tokens, grid, None)[0]
 
 
 def train_adapter(
-    params: SingleAdapter,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
-    valid: Bool[Array, " image"],
-) -> tuple[Float[Array, "image token dim"], SingleAdapter]:
-    """Apply an adapter to a training batch, whose statistics its batch norms normalise by.
-
-    Args:
-        params: the adapter.
-        tokens: see `adapter`.
-        grid: rows and columns of patches.
-        valid: which images the statistics are taken of.
-
-    Returns:
-        (tokens, updated): the adapter's output, and the adapter with updated running statistics.
-    """
-    return _adapter(params, tokens, grid, valid)
-
-
-def _adapter(
     params: SingleAdapter,
     tokens: Float[Array, "*batch token dim"],
     grid: tuple[int, int],
     valid: Bool[Array, " image"] | None,
 ) -> tuple[Float[Array, "*batch token dim"], SingleAdapter]:
-    """Apply an adapter; with `valid` None by the stored statistics, which then stay."""
+    """Apply an adapter to a training batch, whose statistics its batch norms normalise by.
+
+    Args:
+        params: the adapter.
+        tokens: see `adapter`; of a batch of images where `valid` is given.
+        grid: rows and columns of patches.
+        valid: which images the statistics are taken of; None takes the stored ones, which stay.
+
+    Returns:
+        (tokens, updated): the adapter's output, and the adapter with updated running statistics.
+    """
     narrow = checkpoint_name(linear(params.down, tokens), "down")
     if isinstance(params, SideAdapter):
         return linear(params.up, gelu(narrow)), params

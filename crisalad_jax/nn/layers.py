@@ -77,6 +77,12 @@ def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) 
     )
 
 
+def init_small_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
+    """Draw a linear layer as vision transformers': normal of deviation 0.02, cut at two; bias 0."""
+    weight = 0.02 * jax.random.truncated_normal(key, -2.0, 2.0, (d_in, d_out))
+    return Linear(weight, jnp.zeros(d_out) if bias else None)
+
+
 def init_layer_norm(dim: int) -> LayerNorm:
     """Make a layer norm with gain 1 and shift 0."""
     return LayerNorm(jnp.ones(dim), jnp.zeros(dim))

@@ -18,7 +18,7 @@ from crisalad_jax.nn.attention import (
     cross_attention,
     init_torch_attention,
 )
-from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.cross_image import NORM_EPSILON
 from crisalad_jax.nn.layers import (
     Keys,
@@ -88,6 +88,10 @@ class EdtFormerConfig(Aggregator):
             f"EdtFormerConfig.width: found {self.width}, expected a multiple of the {self.heads} "
             "heads",
         )
+
+    def features(self, depth: int) -> FeatureRequest:
+        """Request the last patches and the class token."""
+        return FeatureRequest(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one token for each row."""

@@ -110,14 +110,14 @@ def netvlad(
     rounding error.
     """
     patches = l2_normalise(at_least_float32(patches))
-    return l2_normalise(residual_sums(shares(params, patches), patches, params.centroids))
+    return l2_normalise(residual_sums(shares(params.conv, patches), patches, params.centroids))
 
 
 def shares(
-    params: NetVlad, patches: Float[Array, "*batch patch dim"]
+    conv: Linear, patches: Float[Array, "*batch patch dim"]
 ) -> Float[Array, "*batch patch cluster"]:
     """Assign unit patches softly: compute a softmax over the clusters (the paper's Eq. 3)."""
-    scores = jnp.matmul(patches, params.conv.weight, precision="highest")
+    scores = jnp.matmul(patches, conv.weight, precision="highest")
     return jax.nn.softmax(scores, axis=-1)
 
 

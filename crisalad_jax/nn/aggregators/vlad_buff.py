@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.aggregators.netvlad import residual_sums
+from crisalad_jax.nn.aggregators.netvlad import residual_sums, shares
 from crisalad_jax.nn.backbones.base import Backbone, Features
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
@@ -103,9 +103,8 @@ def vlad_buff(
         centred = patches - params.reduction.mean
         reduced = jnp.matmul(centred, params.reduction.rotation, precision="highest")
         patches = l2_normalise(reduced)
-    scores = jnp.matmul(patches, params.conv.weight, precision="highest")
-    shares = jax.nn.softmax(scores, axis=-1) / burst_weights(params.burst, patches)[..., None]
-    return l2_normalise(residual_sums(shares, patches, params.centroids))
+    weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]
+    return l2_normalise(residual_sums(weighed, patches, params.centroids))
 
 
 def burst_weights(

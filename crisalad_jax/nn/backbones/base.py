@@ -156,6 +156,53 @@ class Backbone(Part, abc.ABC):
         return height // size, width // size
 
 
+class BackboneWithStatistics(Backbone):
+    """A backbone with batch norms, whose one method `run` serves inference and training."""
+
+    @abc.abstractmethod
+    def run(
+        self,
+        params: Any,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+        valid: Bool[Array, " image"] | None,
+    ) -> tuple[Features, Any]:
+        """Return the features, and parameters with updated running statistics.
+
+        The arguments are those of `apply_training`; `valid` None takes the stored statistics, which
+        stay.
+
+        Raises:
+            InputError: as `apply`.
+        """
+
+    def apply(
+        self,
+        params: Any,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+    ) -> Features:
+        """Return the features of normalised images, by the stored statistics."""
+        return self.run(params, images, request, remat=remat, valid=None)[0]
+
+    def apply_training(
+        self,
+        params: Any,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+        valid: Bool[Array, " image"],
+    ) -> tuple[Features, Any]:
+        """Return the features of a training batch, and the running statistics after it."""
+        features, updated = self.run(params, images, request, remat=remat, valid=valid)
+        return features, split_statistics(updated)[0]
+
+
 def _nearest(side: int, size: int) -> int:
     return max(size, round(side / size) * size)
 

@@ -8,8 +8,7 @@ import jax
 from jaxtyping import Array, Bool, Float
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
-from crisalad_jax.nn.layers import split_statistics
+from crisalad_jax.nn.backbones.base import BackboneWithStatistics, FeatureRequest, Features
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Map = Float[Array, "image _ _ _"]
@@ -42,7 +41,7 @@ class Stages:
 
 
 @dataclasses.dataclass(frozen=True)
-class StagedBackbone(Backbone):
+class StagedBackbone(BackboneWithStatistics):
     """A backbone whose blocks are stages, and whose features are the last stage's positions.
 
     Its width and its number of stages follow from its other settings.
@@ -64,14 +63,15 @@ class StagedBackbone(Backbone):
     def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
         """Return the output of the stage of this number, from 0, and the stage as `run_stem`."""
 
-    def apply(
+    def run(
         self,
         params: Stages,
         images: Float[Array, "image height width 3"],
         request: FeatureRequest,
         *,
         remat: str,
-    ) -> Features:
+        valid: Bool[Array, " image"] | None,
+    ) -> tuple[Features, Stages]:
         """Return the last stage's vectors, in row order; there is no class token, and no last norm.
 
         With remat "full" the backward pass computes every stage again from its input.
@@ -79,24 +79,6 @@ class StagedBackbone(Backbone):
         Raises:
             InputError: while tracing, for another level than the last, or a facet of attention.
         """
-        return self._run(params, images, request, remat, None)[0]
-
-    def apply_training(
-        self,
-        params: Stages,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-        valid: Bool[Array, " image"],
-    ) -> tuple[Features, Any]:
-        """Return the features of a training batch, and the running statistics after it."""
-        features, updated = self._run(params, images, request, remat, valid)
-        return features, split_statistics(updated)[0]
-
-    def _run(
-        self, params: Stages, images: Map, request: FeatureRequest, remat: str, valid: Valid
-    ) -> tuple[Features, Stages]:
         require(
             request.levels in (None, (self.depth,)) and request.facet == "token",
             f"features: found a request for levels {request.levels} and facet {request.facet} of "

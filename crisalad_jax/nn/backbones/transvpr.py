@@ -5,7 +5,7 @@ RuotongWANG/TransVPR-model-implementation.
 """
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.attention import Attention, attention
-from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
+from crisalad_jax.nn.backbones.base import (
+    BACKBONES,
+    BackboneWithStatistics,
+    FeatureRequest,
+    Features,
+)
 from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_he_conv, max_pool
 from crisalad_jax.nn.layers import (
     Conv,
@@ -24,9 +29,9 @@ from crisalad_jax.nn.layers import (
     gelu,
     init_batch_norm,
     init_layer_norm,
+    init_small_linear,
     layer_norm,
     linear,
-    split_statistics,
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -61,7 +66,7 @@ class TransVprNet:
 
 @BACKBONES.register("transvpr-net", tiny={"dim": 64, "depth": 4})
 @dataclasses.dataclass(frozen=True)
-class TransVprNetConfig(Backbone):
+class TransVprNetConfig(BackboneWithStatistics):
     """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
 
     patch_size: ClassVar[int] = 16
@@ -102,28 +107,27 @@ class TransVprNetConfig(Backbone):
         )
 
     def _init_block(self, key: PRNGKeyArray) -> TransVprBlock:
-        def draw(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
-            weight = 0.02 * jax.random.truncated_normal(key, -2.0, 2.0, (d_in, d_out))
-            return Linear(weight, jnp.zeros(d_out) if bias else None)
-
         qkv, proj, first, second = jax.random.split(key, 4)
         dim, hidden = self.dim, self.hidden
         return TransVprBlock(
             pre_norm=init_layer_norm(dim),
-            self_attn=Attention(draw(qkv, dim, 3 * dim, bias=False), draw(proj, dim, dim)),
+            self_attn=Attention(
+                init_small_linear(qkv, dim, 3 * dim, bias=False), init_small_linear(proj, dim, dim)
+            ),
             norm1=init_layer_norm(dim),
-            linear1=draw(first, dim, hidden),
-            linear2=draw(second, hidden, dim),
+            linear1=init_small_linear(first, dim, hidden),
+            linear2=init_small_linear(second, hidden, dim),
         )
 
-    def apply(
+    def run(
         self,
         params: TransVprNet,
         images: Float[Array, "image height width 3"],
         request: FeatureRequest,
         *,
         remat: str,
-    ) -> Features:
+        valid: Bool[Array, " image"] | None,
+    ) -> tuple[Features, TransVprNet]:
         """Return the patches of the requested levels side by side, and the last one's class token.
 
         With remat "full" the backward pass computes every block again from its input.
@@ -131,29 +135,6 @@ class TransVprNetConfig(Backbone):
         Raises:
             InputError: while tracing, for levels out of order, or a facet of attention.
         """
-        return self._run(params, images, request, remat, None)[0]
-
-    def apply_training(
-        self,
-        params: TransVprNet,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-        valid: Bool[Array, " image"],
-    ) -> tuple[Features, Any]:
-        """Return the features of a training batch, and the running statistics after it."""
-        features, updated = self._run(params, images, request, remat, valid)
-        return features, split_statistics(updated)[0]
-
-    def _run(
-        self,
-        params: TransVprNet,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        remat: str,
-        valid: Bool[Array, " image"] | None,
-    ) -> tuple[Features, TransVprNet]:
         levels = (self.depth,) if request.levels is None else request.levels
         require(
             list(levels) == sorted(set(levels)) and levels[0] > 0 and levels[-1] <= self.depth,

@@ -36,6 +36,7 @@ from crisalad_jax.nn.layers import (
     at_least_float32,
     gelu,
     init_layer_norm,
+    init_small_linear,
     layer_norm,
     linear,
     split_statistics,
@@ -217,7 +218,7 @@ def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
     else:
         positions = 0.02 * jax.random.normal(position_key, (side, side, dim))
     return ViT(
-        patch_embed=_init_linear(patch_key, 3 * PATCH_SIZE**2, dim),
+        patch_embed=init_small_linear(patch_key, 3 * PATCH_SIZE**2, dim),
         cls_token=1e-6 * jax.random.normal(class_key, (dim,)),
         register_tokens=1e-6 * jax.random.normal(register_key, (config.registers, dim)),
         pos_embed_cls=jnp.zeros(dim),
@@ -229,21 +230,18 @@ def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
     )
 
 
-def _init_linear(key: PRNGKeyArray, d_in: int, d_out: int) -> Linear:
-    weight = 0.02 * jax.random.truncated_normal(key, -2.0, 2.0, (d_in, d_out))
-    return Linear(weight, jnp.zeros(d_out))
-
-
 def _init_block(key: PRNGKeyArray, config: ViTConfig) -> Block:
     qkv, proj, first, second, adapter_key = jax.random.split(key, 5)
     dim, hidden = config.dim, config.hidden
     if config.ffn == "swiglu":
-        mlp = SwiGlu(_init_linear(first, dim, 2 * hidden), _init_linear(second, hidden, dim))
+        mlp = SwiGlu(
+            init_small_linear(first, dim, 2 * hidden), init_small_linear(second, hidden, dim)
+        )
     else:
-        mlp = Mlp(_init_linear(first, dim, hidden), _init_linear(second, hidden, dim))
+        mlp = Mlp(init_small_linear(first, dim, hidden), init_small_linear(second, hidden, dim))
     return Block(
         norm1=init_layer_norm(dim),
-        attn=Attention(_init_linear(qkv, dim, 3 * dim), _init_linear(proj, dim, dim)),
+        attn=Attention(init_small_linear(qkv, dim, 3 * dim), init_small_linear(proj, dim, dim)),
         ls1=jnp.full(dim, config.layer_scale_init, jnp.float32),
         norm2=init_layer_norm(dim),
         mlp=mlp,

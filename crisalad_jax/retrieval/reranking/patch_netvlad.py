@@ -87,7 +87,7 @@ def describe(
     aggregator = params.aggregator
     assert isinstance(aggregator, NetVlad)
     features = unit_features(params, images, config)
-    assignment = shares(aggregator, features)
+    assignment = shares(aggregator.conv, features)
 
     def of_one(image: tuple[Array, Array]) -> Array:
         parts = [
