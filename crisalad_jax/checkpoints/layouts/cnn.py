@@ -4,13 +4,12 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
-
 from crisalad_jax.checkpoints.layouts.base import Lines, Reader, State
-from crisalad_jax.checkpoints.layouts.forms import CONV, SAME, Entry, Extra, affine
+from crisalad_jax.checkpoints.layouts.forms import CONV, affine, batch_norm_lines
 from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.resnet import BLOCKS, STEM_SIDE, ResNetConfig
 from crisalad_jax.nn.backbones.vgg import WIDTHS, VggConfig
+from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.utils.errors import InputError
 
 
@@ -34,16 +33,6 @@ class Names(NamedTuple):
     def first(self) -> str:
         """Name of the first convolution's weights."""
         return f"{self.stem('conv1')}.weight"
-
-
-def batch_norm_lines(ours: str, theirs: str, *, counts: bool = True) -> Lines:
-    """Yield the lines of a batch norm: gain, shift, statistics, and, if kept, the batch count."""
-    yield from affine(ours, theirs, SAME)
-    for name in ("running_mean", "running_var"):
-        yield Entry((f"{ours}.{name}",), (f"{theirs}.{name}",), SAME)
-    if counts:
-        count = "num_batches_tracked"
-        yield Extra(f"{ours}.{count}", f"{theirs}.{count}", (), np.int64)
 
 
 def cnn_lines(config: Backbone, names: Names, *, counts: bool = True) -> Lines:
@@ -114,6 +103,27 @@ def infer_cnn(state: State, names: Names) -> Backbone:
         f"found a ResNet with {found} blocks of {of} convolutions, expected one of "
         f"{', '.join(f'ResNet-{layers} {blocks}' for layers, blocks in BLOCKS.items())}"
     )
+
+
+def accepts_head_over(
+    config: ModelConfig,
+    aggregator: str,
+    backbones: tuple[type[Backbone], ...],
+    *,
+    projection: bool = False,
+) -> str | None:
+    """Accept this aggregator over one of these backbones; else return what is expected in words."""
+    fits = (
+        isinstance(config.backbone, backbones)
+        and config.aggregator.part_name == aggregator
+        and not config.cross_image.layers
+        and bool(config.projection.dim) == projection
+    )
+    names = " or ".join(kind.part_name for kind in backbones)
+    expected = (
+        f"aggregator {aggregator}, backbone {names}, no encoder" + ", a projection" * projection
+    )
+    return None if fits else expected
 
 
 def square_image(state: State, name: str, patch_size: int) -> tuple[int, int]:

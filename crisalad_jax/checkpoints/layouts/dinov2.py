@@ -19,6 +19,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
     Entry,
     Extra,
     affine,
+    batch_norm_lines,
     side,
 )
 from crisalad_jax.nn.adapter import AdapterConfig
@@ -134,11 +135,7 @@ def adapter_lines(config: ViTConfig, ours: str, theirs: str) -> Lines:
         for branch in ("branch1", "branch2.0", "branch2.1", "branch3.0", "branch3.1"):
             here, there = f"{ours}.{branch}", f"{theirs}.{branch}"
             yield from affine(f"{here}.conv", f"{there}.conv", CONV)
-            yield from affine(f"{here}.norm", f"{there}.bn", SAME)
-            for name in ("running_mean", "running_var"):
-                yield Entry((f"{here}.norm.{name}",), (f"{there}.bn.{name}",), SAME)
-            count = "num_batches_tracked"
-            yield Extra(f"{here}.norm.{count}", f"{there}.bn.{count}", (), np.int64)
+            yield from batch_norm_lines(f"{here}.norm", f"{there}.bn")
     depthwise, bias = kind == "depthwise", config.adapter.bias == "convolutions"
     yield from affine(f"{ours}.down", f"{theirs}.D_fc1", LINEAR, bias=not depthwise)
     if depthwise:

@@ -79,6 +79,16 @@ def affine(ours: str, theirs: str, form: Form, *, bias: bool = True) -> Iterator
         yield Entry((f"{ours}.bias",), (f"{theirs}.bias",), SAME)
 
 
+def batch_norm_lines(ours: str, theirs: str, *, counts: bool = True) -> Iterator[Entry | Extra]:
+    """Yield the lines of a batch norm: gain, shift, statistics, and, if kept, the batch count."""
+    yield from affine(ours, theirs, SAME)
+    for name in ("running_mean", "running_var"):
+        yield Entry((f"{ours}.{name}",), (f"{theirs}.{name}",), SAME)
+    if counts:
+        count = "num_batches_tracked"
+        yield Extra(f"{ours}.{count}", f"{theirs}.{count}", (), np.int64)
+
+
 def transformer_layer(ours: str, theirs: str) -> Iterator[Entry]:
     """Yield the lines of one layer, under torch.nn.TransformerEncoderLayer's names."""
     yield from torch_attention(f"{ours}.attn", f"{theirs}.self_attn")

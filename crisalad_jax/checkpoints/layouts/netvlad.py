@@ -37,7 +37,7 @@ for _name, _holds, _inner in (
         backbones=(VggConfig,),
         names=Names(f"encoder.{_inner}", numbered=True),
         mark=f"{_pool}centroids",
-        lines_of_head=functools.partial(netvlad_lines, prefix=_pool),
+        head=functools.partial(netvlad_lines, prefix=_pool),
         image_size=lambda state: (480, 640),
         preprocessing=lambda head: PreprocessingConfig(size_rule="native"),
         under="state_dict",

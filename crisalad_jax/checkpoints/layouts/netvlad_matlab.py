@@ -15,7 +15,7 @@ from crisalad_jax.checkpoints.layouts.base import (
     State,
     register_layout,
 )
-from crisalad_jax.checkpoints.layouts.cnn import Names, vgg_numbers
+from crisalad_jax.checkpoints.layouts.cnn import Names, accepts_head_over, vgg_numbers
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, SAME, Entry, Extra, Form
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.checkpoints.matlab_io import AVERAGE
@@ -80,22 +80,12 @@ register_over_cnn(
     backbones=(VggConfig,),
     names=Names("backbone.", numbered=True),
     mark="netvlad.centers",
-    lines_of_head=_hloc_lines,
+    head=_hloc_lines,
     projection="whiten",
     projection_form=_WHITENING_COLUMNS,
     image_size=lambda state: _LARGEST,
     preprocessing=lambda head: _chain(_MEAN),
 )
-
-
-def _matlab_accepts(config: ModelConfig) -> str | None:
-    fits = (
-        isinstance(config.backbone, VggConfig)
-        and isinstance(config.aggregator, NetVladConfig)
-        and not config.cross_image.layers
-        and bool(config.projection.dim)
-    )
-    return None if fits else "aggregator netvlad, backbone vgg, no encoder, a projection"
 
 
 def _matlab_lines(config: ModelConfig) -> Lines:
@@ -136,7 +126,7 @@ register_layout(
     Layout(
         "netvlad-matlab",
         "NetVLAD .mat",
-        _matlab_accepts,
+        lambda config: accepts_head_over(config, "netvlad", (VggConfig,), projection=True),
         _matlab_lines,
         lambda state: AVERAGE in state,
         _matlab_infer,

@@ -11,7 +11,7 @@ from crisalad_jax.checkpoints.layouts.base import (
     head_lines,
     register_layout,
 )
-from crisalad_jax.checkpoints.layouts.cnn import Names, cnn_lines, infer_cnn
+from crisalad_jax.checkpoints.layouts.cnn import Names, accepts_head_over, cnn_lines, infer_cnn
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, Form, affine
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import Aggregator
@@ -32,17 +32,16 @@ def register_over_cnn(
     names: Names,
     mark: str,
     image_size: Callable[[State], tuple[int, int]],
-    lines_of_head: Callable[[Any], Lines] | None = None,
+    head: Callable[[Any], Lines] | None = None,
     projection: str | None = None,
     projection_form: Form = LINEAR,
-    module: str = "",
     under: str | None = None,
     preprocessing: Callable[[Any], PreprocessingConfig] = lambda head: PreprocessingConfig(),
 ) -> None:
     """Register the layout of one family of models.
 
     Args:
-        name: see `Layout`, and so are `holds`, `module` and `under`.
+        name: see `Layout`, and so are `holds` and `under`.
         holds: see `name`.
         aggregator: name of the head's aggregator.
         infer_head: makes the aggregator's configuration from names and shapes.
@@ -50,29 +49,20 @@ def register_over_cnn(
         names: how its files name their layers.
         mark: a name that only files of this family, or of the same names, have.
         image_size: returns the height and width in pixels that the models are evaluated at.
-        lines_of_head: yields the aggregator's table; by default the registered one.
+        head: yields the aggregator's table; by default the registered one.
         projection: their name of the projection; None without one.
         projection_form: form of the projection's weight.
-        module: see `name`.
         under: see `name`.
         preprocessing: returns how a model with this head resizes and normalises images.
     """
-    expected = f"aggregator {aggregator}, backbone "
-    expected += " or ".join(kind.part_name for kind in backbones) + ", no encoder"
-    expected += ", a projection" * (projection is not None)
 
     def accepts(config: ModelConfig) -> str | None:
-        fits = (
-            isinstance(config.backbone, backbones)
-            and config.aggregator.part_name == aggregator
-            and not config.cross_image.layers
-            and bool(config.projection.dim) == (projection is not None)
-        )
-        return None if fits else expected
+        projects = projection is not None
+        return accepts_head_over(config, aggregator, backbones, projection=projects)
 
     def lines(config: ModelConfig) -> Lines:
         yield from cnn_lines(config.backbone, names)
-        yield from head_lines(config) if lines_of_head is None else lines_of_head(config.aggregator)
+        yield from head_lines(config) if head is None else head(config.aggregator)
         if projection is not None:
             yield from affine("projection", projection, projection_form)
 
@@ -81,13 +71,13 @@ def register_over_cnn(
         if not isinstance(backbone, backbones):
             wanted = " or ".join(kind.part_name for kind in backbones)
             raise InputError(f"found backbone {backbone.part_name}, expected {wanted}")
-        head = infer_head(state)
+        found = infer_head(state)
         dim = 0 if projection is None else Reader(state).size(f"{projection}.weight", 0)
         return ModelConfig(
             image_size=image_size(state),
-            preprocessing=preprocessing(head),
+            preprocessing=preprocessing(found),
             backbone=backbone,
-            aggregator=head,
+            aggregator=found,
             cross_image=CrossImageConfig(layers=0),
             projection=ProjectionConfig(dim=dim),
         )
@@ -95,4 +85,4 @@ def register_over_cnn(
     def detects(state: State) -> bool:
         return names.first in state and mark in state
 
-    register_layout(Layout(name, holds, accepts, lines, detects, infer, module, under))
+    register_layout(Layout(name, holds, accepts, lines, detects, infer, under=under))

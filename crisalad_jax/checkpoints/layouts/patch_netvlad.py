@@ -16,7 +16,7 @@ register_over_cnn(
     backbones=(VggConfig,),
     names=Names("encoder.", numbered=True),
     mark="WPCA.0.weight",
-    lines_of_head=functools.partial(netvlad_lines, prefix="pool."),
+    head=functools.partial(netvlad_lines, prefix="pool."),
     projection="WPCA.0",
     projection_form=POINTWISE,
     image_size=lambda state: (480, 640),

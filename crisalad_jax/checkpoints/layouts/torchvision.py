@@ -8,7 +8,7 @@ import functools
 import numpy as np
 
 from crisalad_jax.checkpoints.layouts.base import Layout, Lines, State, register_layout
-from crisalad_jax.checkpoints.layouts.cnn import Names, cnn_lines, infer_cnn
+from crisalad_jax.checkpoints.layouts.cnn import Names, accepts_head_over, cnn_lines, infer_cnn
 from crisalad_jax.checkpoints.layouts.forms import Absent, Extra
 from crisalad_jax.nn.aggregators.gem import START, GemConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
@@ -26,13 +26,7 @@ _VGG_CLASSIFIER = {"0": (4096, 512 * 7 * 7), "3": (4096, 4096), "6": (_CLASSES, 
 def _accepts(config: ModelConfig, kind: type[StagedBackbone]) -> str | None:
     backbone = config.backbone
     whole = not isinstance(backbone, ResNetConfig) or backbone.stages == 4
-    fits = (
-        isinstance(backbone, kind)
-        and whole
-        and isinstance(config.aggregator, GemConfig)
-        and not config.cross_image.layers
-        and not config.projection.dim
-    )
+    fits = whole and accepts_head_over(config, "gem", (kind,)) is None
     return None if fits else f"aggregator gem, backbone {kind.part_name} of all stages, no encoder"
 
 

@@ -12,7 +12,7 @@ from crisalad_jax.checkpoints.layouts.base import (
     register_head,
     register_layout,
 )
-from crisalad_jax.checkpoints.layouts.cnn import batch_norm_lines
+from crisalad_jax.checkpoints.layouts.cnn import accepts_head_over
 from crisalad_jax.checkpoints.layouts.forms import (
     CLASS_TOKEN,
     CONV,
@@ -21,6 +21,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
     Entry,
     Extra,
     affine,
+    batch_norm_lines,
 )
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
@@ -38,16 +39,6 @@ def transvpr_lines(config: TransVprConfig) -> Iterator[Entry]:
     """Yield both linear layers, under our own names."""
     yield from affine("aggregator.attention", "aggregator.attention", LINEAR, bias=False)
     yield from affine("aggregator.reduction", "aggregator.reduction", LINEAR)
-
-
-def _accepts(config: ModelConfig) -> str | None:
-    fits = (
-        isinstance(config.backbone, TransVprNetConfig)
-        and isinstance(config.aggregator, TransVprConfig)
-        and not config.cross_image.layers
-        and not config.projection.dim
-    )
-    return None if fits else "aggregator transvpr, backbone transvpr-net, no encoder"
 
 
 def _lines(config: ModelConfig) -> Lines:
@@ -96,7 +87,7 @@ register_layout(
     Layout(
         "transvpr",
         "TransVPR .pth",
-        _accepts,
+        lambda config: accepts_head_over(config, "transvpr", (TransVprNetConfig,)),
         _lines,
         lambda state: "transformer.class_emb" in state,
         _infer,
