@@ -21,7 +21,7 @@ from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.files import read_json, user_cache, write_json
 from crisalad_jax.utils.locks import next_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.version import VERSION
@@ -41,8 +41,7 @@ def cache_folder() -> pathlib.Path:
     own = os.environ.get(CACHE)
     if own:
         return pathlib.Path(own).expanduser()
-    user = os.environ.get("XDG_CACHE_HOME")
-    return (pathlib.Path(user) if user else pathlib.Path.home() / ".cache") / "crisalad_jax"
+    return user_cache() / "crisalad_jax"
 
 
 def is_offline() -> bool:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, atomic_path, check_source
+from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.utils.mat_files import load_mat
 
 MATLAB_SUFFIX = ".mat"
 AVERAGE = "net.meta.normalization.averageImage"
@@ -25,18 +26,13 @@ def read_matlab(path: pathlib.Path) -> dict[str, np.ndarray]:
     Raises:
         InputError: the file is cut short, or no network.
     """
-    import scipy.io  # here: it takes half a second
-
-    check_source(path, _EXPECTED, largest=LARGEST)
-    try:
-        content = scipy.io.loadmat(path, struct_as_record=False, squeeze_me=True)
-    except NotImplementedError as error:
-        raise InputError(
-            f"{path}: found MATLAB's format 7.3, expected 7 or older (save it with '-v7')"
-        ) from error
-    except Exception as error:  # a damaged file may raise any exception
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path}: not a whole MATLAB file: {reason}") from error
+    content = load_mat(
+        path,
+        _EXPECTED,
+        damaged="not a whole MATLAB file",
+        struct_as_record=False,
+        squeeze_me=True,
+    )
     try:
         network = content["net"]
         average = network.meta.normalization.averageImage

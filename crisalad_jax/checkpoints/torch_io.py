@@ -455,3 +455,11 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     stack: Any = params.blocks  # one stack: only training cuts it
     blocks = dataclasses.replace(stack, adapter=fresh.blocks.adapter)
     return dataclasses.replace(params, blocks=blocks)
+
+
+def with_backbone_of(
+    params: Crisalad, config: ModelConfig, path: str | os.PathLike[str]
+) -> Crisalad:
+    """Return a model's parameters with the backbone of any checkpoint; see `read_backbone`."""
+    backbone = read_backbone(path, config.backbone, params.backbone)
+    return dataclasses.replace(params, backbone=backbone)

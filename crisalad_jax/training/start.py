@@ -1,12 +1,11 @@
 """The parameters that a run starts from: a whole model, a backbone, or random numbers."""
 
-import dataclasses
 import os
 
 import jax
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.places import Places
@@ -50,8 +49,7 @@ def read_start(
     backbone = find_weights(backbone, quiet=quiet)
     check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     fresh = init_crisalad(jax.random.key(config.seed), config.model)
-    pretrained = read_backbone(backbone, config.model.backbone, fresh.backbone)
-    return dataclasses.replace(fresh, backbone=pretrained)
+    return with_backbone_of(fresh, config.model, backbone)
 
 
 def with_vocabulary_of(

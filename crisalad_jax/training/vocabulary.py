@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32
 
-from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.data.images import list_images
@@ -164,8 +164,7 @@ def start_vocabulary(
         check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     params = init_crisalad(jax.random.key(seed), config)
     if backbone is not None:
-        pretrained = read_backbone(backbone, config.backbone, params.backbone)
-        params = dataclasses.replace(params, backbone=pretrained)
+        params = with_backbone_of(params, config, backbone)
     return params, config
 
 

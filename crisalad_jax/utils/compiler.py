@@ -4,7 +4,6 @@ import contextlib
 import contextvars
 import functools
 import os
-import pathlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -13,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
@@ -159,8 +159,7 @@ def set_up() -> None:
             jax.config.update("jax_num_cpu_devices", usable_cores())
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore
         with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
-            cache = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
-            cache /= "crisalad-jax"
+            cache = user_cache() / "crisalad-jax"
             cache.mkdir(parents=True, exist_ok=True)
             if os.access(cache, os.W_OK):
                 jax.config.update("jax_compilation_cache_dir", str(cache))

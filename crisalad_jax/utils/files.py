@@ -76,6 +76,11 @@ def _no_file(path: str | os.PathLike[str]) -> str | None:
     return next((words for is_kind, words in _KINDS if is_kind(mode)), None)
 
 
+def user_cache() -> pathlib.Path:
+    """Return the folder of the user's caches, which `XDG_CACHE_HOME` may name."""
+    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+
+
 def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
     """Read a regular file of at most `LARGEST` bytes.
 

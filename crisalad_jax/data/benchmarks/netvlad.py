@@ -16,7 +16,7 @@ from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, check_source
+from crisalad_jax.utils.mat_files import load_mat
 
 _FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
 _DATABASE_FOLDERS = (".", "images")
@@ -77,19 +77,7 @@ def read_netvlad(
 
 
 def _read_struct(path: pathlib.Path) -> np.void:
-    # Import here: scipy takes half a second, and no other layout needs it.
-    import scipy.io
-
-    check_source(path, "a .mat file with dbStruct", largest=LARGEST)
-    try:
-        contents = scipy.io.loadmat(path)
-    except NotImplementedError as error:
-        raise InputError(
-            f"{path}: found MATLAB's format 7.3, expected 7 or older (save it with '-v7')"
-        ) from error
-    except Exception as error:  # a damaged file can raise anything at all
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: cannot be read as a .mat file: {reason}") from error
+    contents = load_mat(path, "a .mat file with dbStruct", damaged="cannot be read as a .mat file")
     struct = contents.get("dbStruct")
     if struct is None or struct.size != 1 or struct.dtype.names is None:
         variables = ", ".join(name for name in contents if not name.startswith("__"))

@@ -8,6 +8,7 @@ from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import (
     RECIPES,
+    RENAMED,
     find_part,
     from_scratch,
     recipe,
@@ -50,10 +51,10 @@ METHODS: Mapping[str, ComparedMethod] = {
 another, on CriSALAD's backbone and with its training. Other names are recipes or parts, without a
 second stage."""
 OLD_NAMES: Mapping[str, str] = {
-    **{name: f"crisalad+{name}" for name in ("netvlad", "gem", "patch-netvlad", "transvpr")},
-    "eigenplaces": "eigenplaces-vit",
+    **RENAMED,
+    "patch-netvlad": "crisalad+patch-netvlad",
 }
-"""Names of methods in earlier versions, but those that are now a recipe's."""
+"""Names of methods in earlier versions, but those that are now a recipe's or are a part's."""
 
 
 def method_of(name: str, preset: str) -> ComparedMethod:

@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.config.parts import parts_of
@@ -258,8 +258,7 @@ def _start(
     key, _ = jax.random.split(jax.random.key(seed))
     params = init_crisalad(key, variant.model)
     if prepared.config.backbone is not None:
-        backbone = read_backbone(prepared.config.backbone, variant.model.backbone, params.backbone)
-        params = dataclasses.replace(params, backbone=backbone)
+        params = with_backbone_of(params, variant.model, prepared.config.backbone)
     if needs_vocabulary(variant.model):
         params = _with_vocabulary(prepared, params, variant.model, seed, quiet)
         save_weights(path, params, variant.model)
