@@ -202,7 +202,7 @@ def _manifest(
         "descriptors": {
             "shape": _shape(descriptors),
             "dtype": str(descriptors.dtype),
-            "norm": "unit length (L2)",
+            "norm": "unit length (L2)" if config.unit_length else "any length",
         },
         "grouping": how.grouping,
         "grouping_means": GROUPINGS[how.grouping],

@@ -3,7 +3,10 @@
 import dataclasses
 import pathlib
 
+from crisalad_jax.checkpoints.load import Model, find_weights, load
+from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.common import say
+from crisalad_jax.config.checks import require
 from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.files import check_target
@@ -16,7 +19,9 @@ class Pca:
     descriptors: pathlib.Path
     """A .npy file, such as `crisalad extract` writes; not of images that are evaluated on."""
     out: pathlib.Path
-    """A .safetensors file."""
+    """A .safetensors file: the components, or with --weights a model."""
+    weights: str | None = None
+    """Make a model of these weights with the components as its last layer."""
     dim: int = 512
     """Components that are kept."""
     whiten: bool = False
@@ -33,9 +38,26 @@ class Pca:
     """No progress bar."""
 
 
+def _model(arguments: Pca) -> Model:
+    """Load the model that the components become a part of.
+
+    Raises:
+        InputError: it has a projection already.
+    """
+    weights = find_weights(str(arguments.weights), quiet=arguments.quiet)
+    model = load(weights, verify=arguments.verify)
+    require(
+        not model.config.projection.dim,
+        f"{weights}: found a model with a projection to {model.config.projection.dim} numbers, "
+        "expected one without",
+    )
+    return model
+
+
 def run(arguments: Pca) -> None:
     """Fit components, write them, and print their share of the variance."""
     check_target(arguments.out, ".safetensors")
+    model = None if arguments.weights is None else _model(arguments)
     descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
     pca = fit_pca(
         descriptors,
@@ -46,7 +68,14 @@ def run(arguments: Pca) -> None:
         name=str(arguments.descriptors),
         quiet=arguments.quiet,
     )
-    save_pca(arguments.out, pca)
+    if model is None:
+        save_pca(arguments.out, pca)
+    else:
+        pca.check(model.config.descriptor_dim, str(arguments.weights))
+        layer, projection = pca.projection()
+        params = dataclasses.replace(model.params, projection=layer)
+        config = dataclasses.replace(model.config, projection=projection)
+        save_weights(arguments.out, params, config)
     say(
         f"{arguments.out}: {arguments.dim} of {descriptors.shape[1]} components, "
         f"{100 * pca.kept:.1f} % of the variance of "

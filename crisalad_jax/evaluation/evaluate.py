@@ -17,6 +17,7 @@ from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens, useful_batch_size
+from crisalad_jax.retrieval.euclidean import to_unit_vectors
 from crisalad_jax.retrieval.grouping import (
     DEFAULT_GROUPINGS,
     Grouping,
@@ -27,7 +28,6 @@ from crisalad_jax.retrieval.grouping import (
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
 from crisalad_jax.retrieval.search import Neighbours, search
-from crisalad_jax.utils.errors import InputError
 
 KS = (1, 5, 10, 20)
 
@@ -101,14 +101,10 @@ def evaluate(
     check_grouping((), batch_size, seed, seeds)
     if pca is not None:
         pca.check(config.descriptor_dim, "model")
-        if not pca.config.renormalise:
-            raise InputError(
-                "pca: found components that leave lengths as they are, expected some that make "
-                "unit vectors, which are ranked by cosine"
-            )
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
     check_params(params, config)
+    unit = config.unit_length if pca is None else pca.config.renormalise
     positives = benchmark.ground_truth()
     images = max(len(benchmark.database), len(benchmark.queries))
     batch_size = useful_batch_size(batch_size, images)
@@ -151,7 +147,7 @@ def evaluate(
                 _mean_share(side, kind, drawn, batch_size) for side, kind in sides
             )
             observer = observe and functools.partial(observe, name)
-            rankings = _rank(describe, sides, drawn, k, observer)
+            rankings = _rank(describe, sides, drawn, k, observer, unit=unit)
             for label, stage in stages.items():
                 ranked = {seed: _first(stage(each), max(KS)) for seed, each in rankings.items()}
                 results.append(
@@ -218,10 +214,13 @@ def _rank(
     seeds: Sequence[int],
     k: int,
     observe: Callable[..., None] | None,
+    *,
+    unit: bool,
 ) -> dict[int, Neighbours]:
     """Rank the k nearest neighbours for each seed; only shuffled sides are described anew.
 
-    `observe` is given the descriptors of the first seed.
+    `observe` is given the descriptors of the first seed. Those that are not `unit` vectors are
+    ranked by Euclidean distance.
     """
 
     def descriptors(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
@@ -238,6 +237,8 @@ def _rank(
         )
         if observe is not None and seed == seeds[0]:
             observe(database, queries)
+        if not unit:
+            database, queries = to_unit_vectors(database, queries)
         return search(database, queries, k=k)
 
     return {seed: ranking(seed) for seed in seeds}

@@ -129,6 +129,11 @@ class ModelConfig:
         return self.projection.dim or self.unprojected_dim
 
     @property
+    def unit_length(self) -> bool:
+        """Whether descriptors are unit vectors; a projection may leave their lengths alone."""
+        return not self.projection.dim or self.projection.renormalise
+
+    @property
     def unprojected_dim(self) -> int:
         """Width of a descriptor before `projection`."""
         shape = self.token_shape
@@ -252,6 +257,19 @@ PRESETS: Mapping[str, ModelConfig] = {
     "g14": _preset(1536, 40, 24, ffn="swiglu"),
 }
 """Sizes of models by name."""
+
+
+def check_unit_length(model: ModelConfig, name: str) -> None:
+    """Check that a model makes unit vectors, which are compared by cosine.
+
+    Raises:
+        InputError: it does not; the message begins with `name`.
+    """
+    require(
+        model.unit_length,
+        f"{name}: found a model whose projection leaves lengths as they are, expected one that "
+        "makes unit vectors, which are compared by cosine",
+    )
 
 
 def with_aggregator(model: ModelConfig, name: str, preset: str, **changes: Any) -> ModelConfig:

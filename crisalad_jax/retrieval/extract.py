@@ -10,7 +10,7 @@ from typing import NamedTuple
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import check_lines, list_images, names_in
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import group, read_tokens, useful_batch_size
@@ -140,7 +140,7 @@ def extract(
             params, config, tokens, grouping, batch_size=batch_size, seed=seed, quiet=quiet
         )[tokens.readable]
         source = f"{_source(images)}: descriptors"
-        check_rows(descriptors, source, range(len(descriptors)), unit=True)
+        check_rows(descriptors, source, range(len(descriptors)), unit=config.unit_length)
         if components is not None:
             descriptors = components.apply(descriptors)
         readable = [name for name, ok in zip(names, tokens.readable, strict=True) if ok]
@@ -219,6 +219,8 @@ def _components(
 ) -> Pca | None:
     """Load components, and check that they fit the model and, for pairs, give unit vectors."""
     if pca is None:
+        if unit:
+            check_unit_length(config, "--pairs")
         return None
     components = pca if isinstance(pca, Pca) else load_pca(pca, verify=verify)
     components.check(config.descriptor_dim, "model" if weights is None else str(weights))

@@ -7,13 +7,16 @@ import pathlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import check_seed, check_types
 from crisalad_jax.config.io import from_plain, to_plain
-from crisalad_jax.retrieval.chunks import as_rows, pieces, sample
+from crisalad_jax.nn.layers import Linear
+from crisalad_jax.nn.projection import ProjectionConfig
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import Bar, progress_bar
@@ -89,6 +92,17 @@ class Pca(NamedTuple):
             reduced[start : start + len(rows)] = part
             start += len(rows)
         return reduced
+
+    def projection(self) -> tuple[Linear, ProjectionConfig]:
+        """Return the same components as a model's last layer.
+
+        Returns:
+            Parameters in float32, and configuration, of `Crisalad.projection`.
+        """
+        scale = np.sqrt(self.variances) if self.config.whiten else np.float32(1)
+        weight = self.components.astype(np.float64).T / scale
+        layer = Linear(jnp.asarray(weight, WIDE), jnp.asarray(-(self.mean @ weight), WIDE))
+        return layer, ProjectionConfig(len(self.components), self.config.renormalise)
 
     def check(self, length: int, name: str) -> None:
         """Check that descriptors have the length of those that were fitted.

@@ -72,8 +72,47 @@ def test_evaluate_ranks_shorter_descriptors(capfd, tmp_path, shared, benchmark):
     right = [index in wanted for index, wanted in zip(best, benchmark.positives, strict=True)]
     assert result["recalls"]["R@1"] == np.mean(right)
 
-    save_pca(components, fit_pca(whole, 3, PcaConfig(renormalise=False)))
-    fails(capfd, *start, "--pca", components, words=("pca: found components that leave lengths",))
+    # Of their own lengths, components rank by Euclidean distance, as in CricaVPR.
+    plain = fit_pca(whole, 3, PcaConfig(renormalise=False))
+    save_pca(components, plain)
+    rows = dict(zip(names, plain.apply(whole), strict=True))
+    database, queries = (
+        np.stack([rows[path.relative_to(town).as_posix()] for path in paths])
+        for paths in (benchmark.database, benchmark.queries)
+    )
+    best = np.linalg.norm(queries[:, None] - database, axis=2).argmin(axis=1)
+    right = [index in wanted for index, wanted in zip(best, benchmark.positives, strict=True)]
+    # Alone, and as the last layer of a model.
+    model = tmp_path / "model.safetensors"
+    fit = ("pca", "--descriptors", tmp_path / "d.npy", "--weights", weights, "--no-renormalise")
+    succeeds(capfd, *fit, "--dim", 3, "--out", model, "--quiet")
+    for more in (("--pca", components), ("--weights", model)):
+        succeeds(capfd, *start, *more, "--json", tmp_path / "found.json")
+        (result,) = json.loads((tmp_path / "found.json").read_text())["results"]
+        assert result["recalls"]["R@1"] == np.mean(right)
+
+
+@pytest.mark.parametrize("whiten", [False, True])
+def test_components_become_the_last_layer_of_a_model(capfd, tmp_path, shared, whiten):
+    town, model = shared / "town", tmp_path / "model.safetensors"
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
+    whole = np.load(tmp_path / "d.npy")
+    fit = ("pca", "--descriptors", tmp_path / "d.npy", "--weights", shared / "weights.safetensors")
+    more = ("--whiten",) if whiten else ()
+    succeeds(capfd, *fit, *more, "--dim", 4, "--out", model, "--quiet")
+    out = ("extract", "--images", town, "--weights", model, "--out", tmp_path / "s.npy")
+    succeeds(capfd, *out, "--grouping", "single", "--quiet")
+    expected = fit_pca(whole, 4, PcaConfig(whiten=whiten)).apply(whole)
+    # Unit vectors of float32: whitening divides by small deviations.
+    np.testing.assert_allclose(np.load(tmp_path / "s.npy"), expected, atol=1e-4, rtol=0)
+
+    again = (*fit[:-1], model, "--dim", 2, "--out", tmp_path / "twice.safetensors", "--quiet")
+    fails(capfd, *again, words=(f"{model}: found a model with a projection to 4 numbers",))
+    plain = tmp_path / "plain.safetensors"
+    succeeds(capfd, *fit, "--no-renormalise", "--dim", 4, "--out", plain, "--quiet")
+    index = ("index", "--images", town, "--weights", plain, "--out", tmp_path / "map", "--quiet")
+    fails(capfd, *index, words=(f"{plain}: found a model whose projection leaves lengths",))
+    assert not (tmp_path / "map").exists()
 
 
 def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):

@@ -11,7 +11,7 @@ from typing import Any
 
 from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.io import from_plain
-from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.utils.checksums import sealed_json
@@ -64,8 +64,9 @@ def describe_map(
     """Make the description of a new map in `folder`, whose images this model will describe.
 
     Raises:
-        InputError: what `store_name` raises.
+        InputError: the model's descriptors are no unit vectors; what `store_name` raises.
     """
+    check_unit_length(config, str(weights))
     return MapDescription(
         model=model_hash(params, config),
         weights=str(real_path(weights)),
