@@ -71,8 +71,9 @@ class Evaluate:
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     rerank: str | None = None
-    """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad, of
-    a model with NetVLAD, or transvpr (docs/methods.md). Adds a row to each of the table."""
+    """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad,
+    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD, selavpr or transvpr
+    (docs/methods.md). Adds a row to each of the table."""
     rerank_weights: pathlib.Path | None = None
     """Model that makes these features, as --weights; by default the first stage's."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None

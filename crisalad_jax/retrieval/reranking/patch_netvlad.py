@@ -1,17 +1,22 @@
-"""Patch-NetVLAD: VLADs of windows of several sizes (Hausler et al., CVPR 2021, section 3)."""
+"""Patch-NetVLAD: VLADs of windows of several sizes (Hausler et al., CVPR 2021, section 3).
+
+What the authors' code (QVPR/Patch-NetVLAD) settles where the paper leaves it open is taken from it.
+"""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from crisalad_jax.nn.aggregators.netvlad import NetVlad, shares
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import at_least_float32, l2_normalise
 from crisalad_jax.nn.model import Crisalad, Images, unit_features
-from crisalad_jax.retrieval.reranking.matching import mutual_matches, spatial_score
+from crisalad_jax.nn.projection import project
+from crisalad_jax.retrieval.reranking.matching import inliers, mutual_matches, spatial_score
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 
@@ -76,52 +81,115 @@ def shape(config: ModelConfig) -> tuple[int, int]:
         InputError: what `windows_of` raises.
     """
     windows = sum(rows * columns for _, _, (rows, columns) in windows_of(config))
-    return windows, config.token_shape.tokens * config.backbone.dim
+    return windows, config.descriptor_dim
 
 
 @functools.partial(compiler.jit, static_argnames="config")
 def describe(
     params: Crisalad, images: Images, config: ModelConfig
-) -> Float[Array, "image window vlad"]:
-    """Compute unit descriptors of all windows, the smallest size first, in float16."""
-    aggregator = params.aggregator
+) -> Float[Array, "image window dim"]:
+    """Compute unit descriptors of all windows, the smallest size first, in float16.
+
+    The model's projection, if it has one, shortens every window's VLAD as it does the image's.
+    """
+    aggregator, projection = params.aggregator, params.projection
     assert isinstance(aggregator, NetVlad)
     features = unit_features(params, images, config)
     assignment = shares(aggregator.conv, features)
 
+    def of_size(assignment: Array, features: Array, side: int) -> Array:
+        centroids = at_least_float32(aggregator.centroids)
+        vlads = window_vlads(assignment, features, centroids, config.grid, side)
+        return vlads if projection is None else project(projection, vlads, config.projection)
+
     def of_one(image: tuple[Array, Array]) -> Array:
-        parts = [
-            window_vlads(*image, at_least_float32(aggregator.centroids), config.grid, side)
-            for side, _, _ in windows_of(config)
-        ]
+        parts = [of_size(*image, side) for side, _, _ in windows_of(config)]
         return jnp.concatenate(parts).astype(jnp.float16)
 
     # Images run one after the other: the residuals of one are as large as all of its windows.
     return jax.lax.map(of_one, (assignment, features))
 
 
-def score(
-    query: Float[np.ndarray, "window vlad"],
-    candidates: Float[np.ndarray, "candidate window vlad"],
+def spatial_scores(
+    query: Float[np.ndarray, "window dim"],
+    candidates: Float[np.ndarray, "candidate window dim"],
     config: ModelConfig,
-) -> Float[np.ndarray, " candidate"]:
-    """Sum the spatial scores of all sizes of windows, weighted (paper Eq. 6)."""
-    return np.asarray(_scores(query, candidates, config))
+) -> Float[np.ndarray, "candidate size"]:
+    """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
+    return np.asarray(_spatial_scores(query, candidates, config))
 
 
 @functools.partial(compiler.jit, static_argnames="config")
-def _scores(
-    query: Float[Array, "window vlad"],
-    candidates: Float[Array, "candidate window vlad"],
+def _spatial_scores(
+    query: Float[Array, "window dim"],
+    candidates: Float[Array, "candidate window dim"],
     config: ModelConfig,
-) -> Float[Array, " candidate"]:
+) -> Float[Array, "candidate size"]:
     def of_one(candidate: Array) -> Array:
-        total, start = jnp.zeros(()), 0
-        for _, weight, grid in windows_of(config):
-            part = slice(start, start + grid[0] * grid[1])
-            matches = mutual_matches(query[part], candidate[part])
-            total += weight * spatial_score(matches, grid)
-            start = part.stop
-        return total
+        return jnp.stack(
+            [
+                spatial_score(mutual_matches(query[part], candidate[part]), grid)
+                for part, grid in _parts(config)
+            ]
+        )
 
     return jax.vmap(of_one)(candidates)
+
+
+def inlier_scores(
+    query: Float[np.ndarray, "window dim"],
+    candidates: Float[np.ndarray, "candidate window dim"],
+    config: ModelConfig,
+) -> Float[np.ndarray, "candidate size"]:
+    """Compute the share of windows of each size that RANSAC calls inliers (paper section 3.4).
+
+    As in the authors' code the homography maps the candidate's windows to the query's.
+    """
+    by_size = jax.device_get(_matches_to(query, candidates, config))
+    scores = [
+        [inliers(each, grid) / len(each) for each in matches]
+        for matches, (_, grid) in zip(by_size, _parts(config), strict=True)
+    ]
+    return np.array(scores, np.float32).T
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def _matches_to(
+    query: Float[Array, "window dim"],
+    candidates: Float[Array, "candidate window dim"],
+    config: ModelConfig,
+) -> list[Int[Array, "candidate part"]]:
+    def of_one(candidate: Array) -> list[Array]:
+        return [mutual_matches(candidate[part], query[part]) for part, _ in _parts(config)]
+
+    return jax.vmap(of_one)(candidates)
+
+
+def _parts(config: ModelConfig) -> list[tuple[slice, Grid]]:
+    """List which windows have each size, and their rows and columns."""
+    grids = [grid for _, _, grid in windows_of(config)]
+    bounds = itertools.accumulate((rows * columns for rows, columns in grids), initial=0)
+    return [
+        (slice(*pair), grid) for pair, grid in zip(itertools.pairwise(bounds), grids, strict=True)
+    ]
+
+
+def weighted_sum(
+    scores: Float[np.ndarray, "candidate size"], config: ModelConfig
+) -> Float[np.ndarray, " candidate"]:
+    """Sum the scores of all sizes, weighted (paper Eq. 6)."""
+    return scores @ np.array([weight for _, weight, _ in windows_of(config)])
+
+
+def standardised_sum(
+    scores: Float[np.ndarray, "candidate size"], config: ModelConfig
+) -> Float[np.ndarray, " candidate"]:
+    """Standardise each size's scores over a query's candidates, then sum them, weighted.
+
+    The authors' code does so before Eq. 6. A size at which all score the same adds 0.
+    """
+    # In float64 the mean of equal float32 numbers is exact, so that their deviation is 0.
+    scores = scores.astype(np.float64)
+    deviation = scores.std(axis=0)
+    off = scores - scores.mean(axis=0)
+    return weighted_sum(off / np.where(deviation > 0, deviation, 1), config)

@@ -6,7 +6,6 @@ import pathlib
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
@@ -23,12 +22,39 @@ from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
 
-_METHODS: Mapping[str, tuple[str, ModuleType]] = {
-    "patch-netvlad": ("netvlad", patch_netvlad),
-    "selavpr": ("selavpr", selavpr),
-    "transvpr": ("transvpr", transvpr),
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A second stage's local features, and its scores of pairs of images."""
+
+    aggregator: str
+    """Name of the aggregator whose models it takes."""
+    shape: Callable[[ModelConfig], tuple[int, int]]
+    """Returns the number of an image's features, and their length."""
+    describe: Callable[[Crisalad, Any, ModelConfig], Any]
+    """Computes the features of a batch of images."""
+    score: Callable[[np.ndarray, np.ndarray, ModelConfig], Float[np.ndarray, "candidate *part"]]
+    """Scores any number of a query's candidates, each by itself: one score, or one of each part."""
+    fuse: Callable[[np.ndarray, ModelConfig], Float[np.ndarray, " candidate"]] = (
+        lambda scores, config: scores
+    )
+    """Makes one score of the parts, of all candidates of a query together."""
+
+
+_PATCH_NETVLAD = Method(
+    "netvlad",
+    patch_netvlad.shape,
+    patch_netvlad.describe,
+    patch_netvlad.spatial_scores,
+    patch_netvlad.standardised_sum,
+)
+_METHODS: Mapping[str, Method] = {
+    "patch-netvlad": _PATCH_NETVLAD,
+    "patch-netvlad-ransac": dataclasses.replace(_PATCH_NETVLAD, score=patch_netvlad.inlier_scores),
+    "patch-netvlad-sum": dataclasses.replace(_PATCH_NETVLAD, fuse=patch_netvlad.weighted_sum),
+    "selavpr": Method("selavpr", selavpr.shape, selavpr.describe, selavpr.score),
+    "transvpr": Method("transvpr", transvpr.shape, transvpr.describe, transvpr.score),
 }
-"""The aggregator that each method needs, and its module with `shape`, `describe` and `score`."""
 _AT_ONCE = 16
 """Largest number of candidates of a query that are scored together."""
 _NUMBERS = 2**25
@@ -40,7 +66,8 @@ class Reranking:
     """Which retrievals are re-ranked, by which method, with which model."""
 
     name: str
-    """patch-netvlad, by a model with NetVLAD; selavpr or transvpr, by one with that aggregator."""
+    """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; selavpr or
+    transvpr, by one with that aggregator."""
     top: int
     """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
     params: Crisalad | None = None
@@ -76,13 +103,13 @@ class Reranking:
             InputError: the model that makes local features has another aggregator, or its images
                 too few patches; more retrievals than the database has images, if that is given.
         """
-        aggregator, method = _METHODS[self.name]
+        method = _METHODS[self.name]
         own = self.config or config
-        if own.aggregator.part_name != aggregator:
+        if own.aggregator.part_name != method.aggregator:
             raise InputError(
                 f"rerank: found a model with aggregator {own.aggregator.part_name}, expected "
-                f"{aggregator}, whose local features {self.name} compares (--rerank-weights takes "
-                "another model than the first stage's)"
+                f"{method.aggregator}, whose local features {self.name} compares (--rerank-weights "
+                "takes another model than the first stage's)"
             )
         rule = own.preprocessing.size_rule
         if rule != "fixed":
@@ -162,10 +189,10 @@ class Reranker:
             raise InputError("rerank: found no model, expected one, or `over` the first stage's")
         reranking.check(reranking.config, len(database))
         self._top, self._config = reranking.top, reranking.config
-        _, self._method = _METHODS[reranking.name]
+        self._method = _METHODS[reranking.name]
         self._label, self._quiet = reranking.name, quiet
         self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
-        self._scores: dict[tuple[int, int], float] = {}
+        self._scores: dict[tuple[int, int], float | list[float]] = {}
 
         def describe(images: Any) -> Any:
             return self._method.describe(shared, devices.shard_batch(images), self._config)
@@ -227,7 +254,7 @@ class Reranker:
     def _score(
         self, query: int, candidates: Int[np.ndarray, " candidate"]
     ) -> Float[np.ndarray, " candidate"]:
-        """Score all candidates of one query; scores of earlier calls are reused."""
+        """Score all candidates of one query; scores of pairs are kept for later calls."""
         new = np.array([c for c in candidates if (query, int(c)) not in self._scores], int)
         patches, dim = self._queries.features.shape[1:]
         step = max(1, min(_AT_ONCE, self._top, _NUMBERS // (patches * dim)))
@@ -239,9 +266,10 @@ class Reranker:
                 self._queries.features[query], self._database.features[filled], self._config
             )
             self._scores |= {
-                (query, int(c)): float(s) for c, s in zip(part, values[: len(part)], strict=True)
+                (query, int(c)): s for c, s in zip(part, values[: len(part)].tolist(), strict=True)
             }
-        return np.array([self._scores[query, int(c)] for c in candidates], np.float32)
+        scores = np.array([self._scores[query, int(c)] for c in candidates])
+        return self._method.fuse(scores, self._config).astype(np.float32)
 
 
 class _Features:

@@ -1,7 +1,9 @@
 """Windows' VLADs and the score of a pair, against loops over the definitions in float64."""
 
 import dataclasses
+from collections.abc import Iterator
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import linear
 from crisalad_jax.nn.model import describe, unit_features
+from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.reranking import patch_netvlad
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
@@ -77,31 +80,100 @@ def test_windows_that_do_not_fit_twice_are_left_out() -> None:
         windows(28, 224)
 
 
-def test_a_pairs_score_is_the_weighted_sum_over_sizes() -> None:
+GRIDS = ((5, 6), (2, 3))
+"""Rows and columns of the windows of CONFIG, of sides 2 and 5."""
+
+
+def pair_matches(
+    query: np.ndarray, candidate: np.ndarray
+) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
+    """Grids, and places (row, column) of matched windows of the query and of the candidate."""
+    start = 0
+    for rows, columns in GRIDS:
+        part = slice(start, start + rows * columns)
+        start = part.stop
+        matches = np.array(brute_force(query[part], candidate[part]))
+        here = np.flatnonzero(matches >= 0)
+        places = (np.stack(np.divmod(each, columns), axis=1) for each in (here, matches[here]))
+        yield (rows, columns), *places
+
+
+@pytest.fixture(scope="module")
+def local() -> tuple[np.ndarray, np.ndarray]:
+    """Windows of a query and of four candidates that are more and less like it."""
     windows, dim = patch_netvlad.shape(CONFIG)
     assert (windows, dim) == (5 * 6 + 2 * 3, 48)
     rng = np.random.default_rng(0)
     query = unit(rng.standard_normal((windows, dim)))
-    candidates = unit(query + 0.5 * rng.standard_normal((4, windows, dim)))
+    noise = rng.standard_normal((4, windows, dim))
+    # They leave most, half and few of the matches.
+    candidates = unit(query + np.array([0.5, 1, 1.5, 2])[:, None, None] * noise)
+    return query.astype(np.float16), candidates.astype(np.float16)
+
+
+def test_spatial_scores_are_those_of_loops(local) -> None:
+    query, candidates = local
     expected = []
     for candidate in candidates:
-        total, start = 0.0, 0
-        for weight, (rows, columns) in ((0.45, (5, 6)), (0.15, (2, 3))):
-            part = slice(start, start + rows * columns)
-            start = part.stop
-            matches = brute_force(query[part], candidate[part])
-            pairs = [(i, there) for i, there in enumerate(matches) if there >= 0]
-            moved = np.array(
-                [np.subtract(divmod(j, columns), divmod(i, columns)) for i, j in pairs]
-            )
+        scores = []
+        for (rows, columns), here, there in pair_matches(query, candidate):
+            moved = there - here
             off = np.abs(moved - moved.mean(axis=0))
             near = np.maximum([rows - 1, columns - 1] - off, 0)
-            total += weight * (near**2).sum() / (rows * columns)
-        expected.append(total)
-    found = patch_netvlad.score(query.astype(np.float16), candidates.astype(np.float16), CONFIG)
-    assert len(set(np.round(expected, 3))) == 4
+            scores.append((near**2).sum() / (rows * columns))
+        expected.append(scores)
+    found = patch_netvlad.spatial_scores(query, candidates, CONFIG)
+    assert len(set(np.round(np.array(expected)[:, 0], 3))) == 4
     # The matches are the same; then a dozen roundings of float32.
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_inlier_scores_are_shares_of_the_windows(local) -> None:
+    """From candidate to query, as in the public code: 24 pixels of tolerance, patches of 16."""
+    query, candidates = local
+    expected = []
+    for candidate in candidates:
+        scores = []
+        for (rows, columns), here, there in pair_matches(candidate, query):
+            before, after = (each[:, ::-1].astype(np.float32) for each in (here, there))
+            mask = np.zeros(0)
+            if len(here) > 3:
+                _, mask = cv2.findHomography(before, after, cv2.RANSAC, 24 / 16)
+            scores.append(np.sum(mask) / (rows * columns))
+        expected.append(scores)
+    found = patch_netvlad.inlier_scores(query, candidates, CONFIG)
+    assert found.dtype == np.float32
+    assert len(set(np.array(expected)[:, 0])) >= 3
+    np.testing.assert_allclose(found, expected, rtol=1e-7)  # float32's rounding of a quotient
+    np.testing.assert_array_equal(patch_netvlad.inlier_scores(query, candidates, CONFIG), found)
+
+
+def test_scores_of_sizes_are_summed_weighted() -> None:
+    scores = np.array([[1, 10], [3, 20]], np.float32)
+    expected = [0.45 * 1 + 0.15 * 10, 0.45 * 3 + 0.15 * 20]
+    np.testing.assert_allclose(patch_netvlad.weighted_sum(scores, CONFIG), expected, rtol=1e-12)
+
+
+def test_standardised_scores_by_hand() -> None:
+    """Three candidates: means 2 and 40, deviations (2/3)^0.5 and 200^0.5."""
+    scores = np.array([[3, 20], [2, 50], [1, 50]], np.float32)
+    first, second = np.array([1, 0, -1]) * 1.5**0.5, np.array([-20, 10, 10]) / 200**0.5
+    found = patch_netvlad.standardised_sum(scores, CONFIG)
+    np.testing.assert_allclose(found, 0.45 * first + 0.15 * second, rtol=1e-12)
+    # The weighted sum puts the first one last: the second size has the larger numbers.
+    assert found.argmax() == 0
+    assert patch_netvlad.weighted_sum(scores, CONFIG).argmin() == 0
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.1, 1 / 3])
+def test_a_size_at_which_all_score_alike_adds_nothing(alike: float) -> None:
+    """Their mean has no rounding error, which the division by a deviation of 0 would blow up."""
+    scores = np.full((7, 2), alike, np.float32)
+    np.testing.assert_array_equal(patch_netvlad.standardised_sum(scores, CONFIG), np.zeros(7))
+    scores[:, 0] = np.arange(7)
+    expected = 0.45 * (np.arange(7) - 3) / 2
+    found = patch_netvlad.standardised_sum(scores, CONFIG)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_one_window_over_all_patches_is_the_aggregators_own_descriptor() -> None:
@@ -114,3 +186,18 @@ def test_one_window_over_all_patches_is_the_aggregators_own_descriptor() -> None
     (whole,) = patch_netvlad.window_vlads(shares, features, aggregator.centroids, (6, 6), 6)
     # The same 36 residuals, summed in another order.
     np.testing.assert_allclose(whole, describe(params, images, CONFIG)[0], atol=1e-5)
+
+
+def test_windows_are_projected_as_the_whole_image_is() -> None:
+    config = dataclasses.replace(CONFIG, projection=ProjectionConfig(dim=5))
+    params = random_params(config)
+    images = jax.random.normal(jax.random.key(0), (2, *config.image_size, 3))
+    assert patch_netvlad.shape(config) == (36, 5)
+    plain = dataclasses.replace(params, projection=None)
+    vlads = np.asarray(patch_netvlad.describe(plain, images, CONFIG), np.float64)
+    weight, bias = (np.asarray(each, np.float64) for each in jax.tree.leaves(params.projection))
+    found = patch_netvlad.describe(params, images, config)
+    assert (found.shape, found.dtype) == ((2, 36, 5), np.float16)
+    # Numbers below 1, which float16 rounds by up to 2.4e-4, before the projection and after it.
+    np.testing.assert_allclose(found, unit(vlads @ weight + bias), atol=1e-3)
+    assert (np.ptp(np.asarray(found, np.float32), axis=1) > 0.1).any()

@@ -1,6 +1,7 @@
 """The new order against scores of single pairs; each image is described once; bad input."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,13 +13,12 @@ from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.reranking import (
     Reranker,
     Reranking,
     parse_reranking,
-    patch_netvlad,
     rerank,
-    selavpr,
     stage,
     transvpr,
 )
@@ -29,16 +29,21 @@ from tests.conftest import BATCH, MODEL, random_params
 PLAIN = dataclasses.replace(MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0))
 TRANSVPR = dataclasses.replace(PLAIN, aggregator=TransVprConfig(levels=2, dim=16))
 SELAVPR = dataclasses.replace(PLAIN, aggregator=SelaVprConfig(hidden=16, local=8))
-NETVLAD = dataclasses.replace(PLAIN, aggregator=NetVladConfig(clusters=4))
+NETVLAD = dataclasses.replace(
+    PLAIN,
+    image_size=(98, 112),  # of windows of two sizes
+    aggregator=NetVladConfig(clusters=4),
+    projection=ProjectionConfig(dim=24),
+)
+
+
+OWN = {"transvpr": TRANSVPR, "selavpr": SELAVPR}
 
 
 def model_of(name: str) -> tuple:
-    """Random parameters of a re-ranker, its configuration and module."""
-    if name == "transvpr":
-        return random_params(TRANSVPR), TRANSVPR, transvpr
-    if name == "selavpr":
-        return random_params(SELAVPR), SELAVPR, selavpr
-    return random_params(NETVLAD), NETVLAD, patch_netvlad
+    """Random parameters of a re-ranker's model, and its configuration."""
+    config = OWN.get(name, NETVLAD)
+    return random_params(config), config
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +56,19 @@ def first_stage() -> Neighbours:
 
 
 def reranking(name: str, top: int) -> Reranking:
-    own, config, _ = model_of(name)
+    own, config = model_of(name)
     return Reranking(name, top, own, config)
 
 
-NAMES = pytest.mark.parametrize("name", ["transvpr", "selavpr", "patch-netvlad"])
+NAMES = pytest.mark.parametrize("name", list(stage._METHODS))
 
 
 @NAMES
-def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark) -> None:
-    own, config, method = model_of(name)
+def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark, monkeypatch) -> None:
+    """Which are fused for each query over all its candidates, however few are scored together."""
+    own, config = model_of(name)
+    method = stage._METHODS[name]
+    monkeypatch.setattr(stage, "_AT_ONCE", 2)
 
     def local(paths) -> np.ndarray:
         images = np.stack([resize_image(read_image(p), config.image_size) for p in paths])
@@ -73,8 +81,8 @@ def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark) ->
         for paths in (benchmark.database, benchmark.queries)
     )
     assert database.shape[1:] == method.shape(config)
-    scores = np.stack([[method.score(q, d[None], config)[0] for d in database] for q in queries])
-    assert len(np.unique(scores)) > 5
+    parts = np.stack([[method.score(q, d[None], config)[0] for d in database] for q in queries])
+    assert len(np.unique(parts)) > 5
     top = 5
     found = rerank(
         reranking(name, top),
@@ -85,10 +93,12 @@ def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark) ->
         quiet=True,
     )
     for query, row in enumerate(first_stage.indices):
-        kept = sorted(row[:top], key=lambda image, query=query: -scores[query, image])
+        scores = dict(zip(row, method.fuse(parts[query, row[:top]], config), strict=False))
+        kept = sorted(row[:top], key=lambda image, scores=scores: -scores[image])
         np.testing.assert_array_equal(found.indices[query], [*kept, *row[top:]])
         # The same float32 sums, vectorised over another number of candidates.
-        np.testing.assert_allclose(found.similarities[query, :top], scores[query, kept], rtol=1e-5)
+        expected = [scores[image] for image in kept]
+        np.testing.assert_allclose(found.similarities[query, :top], expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_array_equal(found.similarities[:, top:], first_stage.similarities[:, top:])
     assert (found.indices != first_stage.indices).any()
 
@@ -105,12 +115,19 @@ def test_an_image_is_most_like_itself(name: str, first_stage, benchmark) -> None
     np.testing.assert_array_equal(found.indices[:, 0], np.arange(5))
 
 
-def test_equal_scores_keep_the_first_stages_order(first_stage, benchmark, monkeypatch) -> None:
-    monkeypatch.setattr(
-        transvpr, "score", lambda query, candidates, config: np.ones(len(candidates), np.float32)
-    )
+def changed(monkeypatch, name: str, **functions: Callable) -> None:
+    method = dataclasses.replace(stage._METHODS[name], **functions)
+    monkeypatch.setattr(stage, "_METHODS", {**stage._METHODS, name: method})
+
+
+@pytest.mark.parametrize(("name", "parts"), [("transvpr", ()), ("patch-netvlad", (2,))])
+def test_equal_scores_keep_the_first_stages_order(
+    name: str, parts: tuple[int, ...], first_stage, benchmark, monkeypatch
+) -> None:
+    """Also where they are divided by their deviation, which is 0."""
+    changed(monkeypatch, name, score=lambda q, c, _: np.full((len(c), *parts), 0.1, np.float32))
     found = rerank(
-        reranking("transvpr", 6),
+        reranking(name, 6),
         first_stage,
         benchmark.database,
         benchmark.queries,
@@ -118,15 +135,18 @@ def test_equal_scores_keep_the_first_stages_order(first_stage, benchmark, monkey
         quiet=True,
     )
     np.testing.assert_array_equal(found.indices, first_stage.indices)
+    assert np.isfinite(found.similarities).all()
 
 
 def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monkeypatch) -> None:
     described, scored = [], []
     describe, score = transvpr.describe, transvpr.score
-    monkeypatch.setattr(
-        transvpr, "describe", lambda p, x, c: described.append(x) or describe(p, x, c)
+    changed(
+        monkeypatch,
+        "transvpr",
+        describe=lambda p, x, c: described.append(x) or describe(p, x, c),
+        score=lambda q, x, c: scored.append(x) or score(q, x, c),
     )
-    monkeypatch.setattr(transvpr, "score", lambda q, x, c: scored.append(x) or score(q, x, c))
     two = Neighbours(first_stage.indices[:, :2], first_stage.similarities[:, :2])
     candidates = len(np.unique(two.indices))
     with Reranker(
@@ -168,12 +188,14 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
     assert both[1].intervals.keys() == plain[0].intervals.keys()
 
 
-def test_the_first_stages_model_serves_where_it_can(benchmark) -> None:
-    own = random_params(TRANSVPR)
+@pytest.mark.parametrize("name", ["transvpr", "patch-netvlad-ransac"])
+def test_the_first_stages_model_serves_where_it_can(name: str, benchmark) -> None:
+    own, config = model_of(name)
     results = [
-        evaluate(own, TRANSVPR, benchmark, batch_size=BATCH, rerank=given, quiet=True)[1]
-        for given in (Reranking("transvpr", 7), Reranking("transvpr", 7, own, TRANSVPR))
+        evaluate(own, config, benchmark, batch_size=BATCH, rerank=given, quiet=True)[1]
+        for given in (Reranking(name, 7), Reranking(name, 7, own, config))
     ]
+    assert results[0].rerank == f"{name}:7"
     for a, b in zip(*(result.neighbours for result in results), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -187,7 +209,7 @@ def test_the_first_stages_model_serves_where_it_can(benchmark) -> None:
         ("transvpr:" + 5000 * "1", "expected NAME:TOPK"),
         ("transvpr:ten", "expected NAME:TOPK"),
         ("transvpr:1", "found transvpr:1, expected at least 2 retrievals"),
-        ("superglue:10", "rerank: found 'superglue', expected one of patch-netvlad, selavpr, tran"),
+        ("superglue:10", "rerank: found 'superglue', expected one of patch-netvlad, patch-n"),
     ],
 )
 def test_what_cannot_be_read_is_named(text: str, words: str) -> None:
@@ -197,6 +219,7 @@ def test_what_cannot_be_read_is_named(text: str, words: str) -> None:
 
 def test_what_is_read() -> None:
     assert parse_reranking("patch-netvlad:100") == Reranking("patch-netvlad", 100)
+    assert parse_reranking("patch-netvlad-ransac:7") == Reranking("patch-netvlad-ransac", 7)
     assert parse_reranking("transvpr:20").label == "transvpr:20"
 
 
