@@ -147,7 +147,7 @@ def _carry_out(prepared: Prepared, out: pathlib.Path, say: Say, quiet: bool) -> 
         _one(prepared, out, variant, seed, quiet)
     if not (out / "speed.json").exists():
         say("images described a second, all models in turns")
-        write_json(out / "speed.json", _race(prepared, out))
+        write_json(out / "speed.json", _race(prepared, out, quiet))
 
 
 def _start_words(config: ComparisonConfig) -> str:
@@ -309,7 +309,7 @@ def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) ->
     }
 
 
-def _race(prepared: Prepared, out: pathlib.Path) -> dict[str, Any]:
+def _race(prepared: Prepared, out: pathlib.Path, quiet: bool) -> dict[str, Any]:
     """Time a batch of every model in turns; variants of one model run once."""
     size = prepared.config.batch_size
     models = {variant.run: variant for variant in prepared.variants}
@@ -321,7 +321,7 @@ def _race(prepared: Prepared, out: pathlib.Path) -> dict[str, Any]:
         "device": machine(),
         "absolute": is_absolute(),
         "batch_size": size,
-        "rounds": race(calls, _ROUNDS).rounds,
+        "rounds": race(calls, _ROUNDS, quiet=quiet).rounds,
     }
 
 

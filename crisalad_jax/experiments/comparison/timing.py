@@ -12,6 +12,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens, self_mask
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.host import usable_cores
+from crisalad_jax.utils.progress import progress_bar
 
 _CALLS = 3
 """Number of calls of each in a round; their median counts."""
@@ -32,25 +33,34 @@ class Race(NamedTuple):
         return statistics.median(ratios), min(ratios), max(ratios)
 
 
-def race(contenders: Mapping[str, Callable[[], Callable[[], Any]]], rounds: int) -> Race:
+def race(
+    contenders: Mapping[str, Callable[[], Callable[[], Any]]],
+    rounds: int,
+    *,
+    quiet: bool = True,
+) -> Race:
     """Time calls in turns; each call does all of its work and waits for it.
 
     The first call of each, which compiles, does not count, nor does the first of each turn. A
-    contender makes its call for a turn and drops it: one model is in memory at a time.
+    contender makes its call for a turn and drops it: one model is in memory at a time. A progress
+    bar counts the turns, unless `quiet`.
     """
-    for ready in contenders.values():
-        ready()()
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(rounds):
-        for name, ready in contenders.items():
-            call = ready()
-            call()
-            times = []
-            for _ in range(_CALLS):
-                started = time.perf_counter()
+    with progress_bar("speed", (1 + rounds) * len(contenders), "turns", quiet=quiet) as bar:
+        for ready in contenders.values():
+            ready()()
+            bar.advance(1)
+        for _ in range(rounds):
+            for name, ready in contenders.items():
+                call = ready()
                 call()
-                times.append(time.perf_counter() - started)
-            seconds[name].append(statistics.median(times))
+                times = []
+                for _ in range(_CALLS):
+                    started = time.perf_counter()
+                    call()
+                    times.append(time.perf_counter() - started)
+                seconds[name].append(statistics.median(times))
+                bar.advance(1)
     return Race(seconds)
 
 
