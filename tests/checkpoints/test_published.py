@@ -5,6 +5,8 @@ import functools
 import json
 import pathlib
 import re
+from collections.abc import Callable
+from typing import Any
 from urllib.parse import urlsplit
 
 import jax
@@ -54,7 +56,28 @@ STORED = {
     "vlad-buff-4096": "zoo/layouts/vladbuff_192_wpca4096",
     "selavpr-msls": "zoo/layouts/selavpr",
     "selavpr-pitts30k": "zoo/layouts/selavpr",
+    "fol-large": "layouts/dinov2_vitl14",
+    "fol-base": "layouts/dinov2_vitb14",
 }
+
+
+def fol(backbone: dict[str, list[int]]) -> dict[str, Any]:
+    """FoL's names: the backbone's, SALAD's for its width, and the transposed convolutions'."""
+    width = backbone["cls_token"][2]
+    salad = json.loads((PARITY / "layouts/dino_salad.json").read_text(encoding="utf-8"))
+    head = {key: shape for key, shape in salad.items() if key.startswith("aggregator.")}
+    return {
+        **{f"backbone.model.{key}": shape for key, shape in backbone.items()},
+        **{key: [width if side == 768 else side for side in head[key]] for key in head},
+        "upconv.weight": [width, 256, 3, 3],
+        "upconv.bias": [256],
+        "upconv2.weight": [256, 128, 3, 3],
+        "upconv2.bias": [128],
+    }
+
+
+MADE: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {"fol-large": fol, "fol-base": fol}
+"""Functions that make a file's shapes of those that are stored of a part of it."""
 CHANGED: dict[str, dict[str, tuple[int, ...] | None]] = {
     # The README's one cluster and two ghosts.
     "supervlad-1-cluster": {"aggregation.conv.weight": (3, 768, 1, 1)},
@@ -86,6 +109,7 @@ def stored(name: str) -> tuple[str, ModelConfig]:
     """The layout and configuration of a published file."""
     shapes = json.loads((PARITY / f"{STORED[name]}.json").read_text(encoding="utf-8"))
     plain = {key.rpartition("/")[2].removeprefix("module."): shapes[key] for key in shapes}
+    plain = MADE.get(name, lambda shapes: shapes)(plain)
     plain |= CHANGED.get(name, {})
     plain = {key: shape for key, shape in plain.items() if shape is not None}
     blank = {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in plain.items()}
