@@ -48,6 +48,31 @@ SUFFIXES = {
 """Suffixes of files by `Layout.stored`."""
 
 
+class _Unread:
+    """A stand-in for an array of NumPy beside the weights, such as the recalls of a training run.
+
+    Torch refuses a whole file with one, and NumPy itself would run on bytes of the file.
+    """
+
+    def __init__(self, *_: Any) -> None:
+        """Take what the array would be made of, and keep nothing."""
+
+    def __setstate__(self, _: Any) -> None:
+        """Take its numbers, and keep nothing."""
+
+
+_NUMPY = (
+    "numpy.dtype",
+    "numpy.ndarray",
+    *(
+        f"numpy.{core}.multiarray.{name}"
+        for core in ("core", "_core")  # before NumPy 2, and since
+        for name in ("_reconstruct", "scalar")
+    ),
+)
+"""What a pickled array or number of NumPy asks for."""
+
+
 class Checkpoint(NamedTuple):
     """A model from any file we can read."""
 
@@ -156,7 +181,8 @@ def _read_torch(path: pathlib.Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about deprecated formats, which are refused below
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            with torch.serialization.safe_globals([(_Unread, name) for name in _NUMPY]):
+                content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         # Torch's message is a page of advice on how to run the code anyway: shorten it.
         refused = re.search(r"GLOBAL ([\w.]+)", str(error)) or re.search(

@@ -244,6 +244,34 @@ def test_any_nesting_and_prefix_is_read(tmp_path: pathlib.Path, name: str, under
     assert same_bits({k: torch.tensor(v) for k, v in again.items()}, plain)
 
 
+@pytest.mark.parametrize("core", ["numpy._core", "numpy.core"])
+@pytest.mark.parametrize("new", [True, False])
+def test_numpys_records_beside_the_weights_are_not_read(
+    tmp_path: pathlib.Path, core: str, new: bool
+) -> None:
+    """As CricaVPR's code and those that began from it save them; NumPy 1 has the second name."""
+    content = nested(random_state(SMALL["cricavpr"]))
+    content |= {"recalls": np.array([90.5, 97.1]), "best_r5": np.float64(97.1), "n": np.int64(3)}
+    path = tmp_path / "file.pth"
+    torch.save(content, path, _use_new_zipfile_serialization=new)
+    whole = {path.name: path.read_bytes()}
+    if new:
+        with zipfile.ZipFile(path) as archive:
+            whole = {name: archive.read(name) for name in archive.namelist()}
+    assert any(b"numpy._core" in data for data in whole.values())
+    named = {name: data.replace(b"numpy._core", core.encode()) for name, data in whole.items()}
+    if new:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in named.items():
+                archive.writestr(name, data)
+    else:
+        path.write_bytes(named[path.name])
+    found = read_checkpoint(path)
+    again = to_state(found.params, found.config, "cricavpr", found.extras)
+    state = {key.removeprefix("module."): x for key, x in content[UNDER[:-1]].items()}
+    assert same_bits({k: torch.tensor(v) for k, v in again.items()}, state)
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("kind", ["torch", "safetensors"])
 def test_half_precision_is_widened_exactly(tmp_path: pathlib.Path, dtype, kind: str) -> None:
@@ -380,6 +408,8 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         torch.save(state | {"norm.bias": state["norm.bias"].double()}, path)
     elif kind == "nan":
         torch.save(state | {"norm.bias": state["norm.bias"] * float("nan")}, path)
+    elif kind == "an array of NumPy":
+        torch.save(state | {"norm.bias": state["norm.bias"].numpy()}, path)
     elif kind == "sparse":
         torch.save(state | {"norm.bias": state["norm.bias"].to_sparse()}, path)
     elif kind == "eight bits":
@@ -432,6 +462,7 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         ("no tensor", "found epoch, expected nothing but tensors by name"),
         ("double", "norm.bias found float64, expected float32, float16 or bfloat16"),
         ("nan", "norm.bias holds NaN or infinity"),
+        ("an array of NumPy", "found norm.bias, expected nothing but tensors by name"),
         ("sparse", "norm.bias is no plain tensor: .*Sparse"),
         ("eight bits", "norm.bias is no plain tensor: .*Float8"),
         ("no data", "norm.bias is no plain tensor: .*meta"),
