@@ -29,7 +29,8 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
-from tests.conftest import MODEL, random_params
+from parity import zoo
+from tests.conftest import MODEL, assert_equal, random_params
 from tests.random_checkpoints import (
     UNDER,
     fewer_blocks,
@@ -93,6 +94,27 @@ def there_and_back(folder: pathlib.Path, source: pathlib.Path, width: int) -> No
 @pytest.mark.parametrize("name", SMALL)
 def test_there_and_back_are_the_same_bytes(tmp_path: pathlib.Path, name: str) -> None:
     there_and_back(tmp_path, written(tmp_path, name), WIDTHS[name])
+
+
+@pytest.mark.parametrize("kind", ["salad-indoor", "eigenplaces-indoor"])
+def test_indoor_vprs_files_are_the_same_network_within_a_module(
+    tmp_path: pathlib.Path, kind: str
+) -> None:
+    state = {
+        "salad-indoor": lambda: random_state(SMALL["dino-salad"]),
+        "eigenplaces-indoor": lambda: {
+            name: torch.tensor(x) for name, x in zoo.random_state("cosplace_resnet18_512").items()
+        },
+    }[kind]()
+    outside = read_checkpoint(save(tmp_path / "plain.pth", state))
+    within = save(tmp_path / "within.pth", {f"model.{name}": x for name, x in state.items()})
+    inside = read_checkpoint(within)
+    assert inside.layout == kind
+    assert inside.config.aggregator == outside.config.aggregator
+    assert_equal(inside.params, outside.params)
+    convert(within, tmp_path / "ours.safetensors")
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", kind)
+    assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
 
 
 @pytest.mark.parametrize(

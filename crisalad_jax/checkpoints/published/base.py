@@ -53,6 +53,9 @@ class Published:
     """Address of the file; None where it has none of its own, as in a folder or an archive."""
     paper: str
     """Authors, venue and year."""
+    backbone: str = ""
+    """Name of the published model whose backbone the file's vocabulary is of; empty where the file
+    is a whole model."""
     note: str = ""
     """What is not certain of these facts, or has to be done by hand."""
 
