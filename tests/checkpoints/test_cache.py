@@ -28,7 +28,7 @@ from crisalad_jax.checkpoints.layouts import public_shapes
 from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
-from crisalad_jax.checkpoints.published.base import MIT, NO_LICENCE
+from crisalad_jax.checkpoints.published.base import GPL, MIT, NO_LICENCE
 from crisalad_jax.checkpoints.torch_io import read_checkpoint
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.nn.adapter import AdapterConfig
@@ -148,6 +148,11 @@ def test_a_name_loads_what_its_file_holds_and_downloads_once(model, server, tmp_
         (
             Licence("CC-BY-NC-4.0", commercial=False),
             "tiny-model: licence CC-BY-NC-4.0: no commercial use (https://example.org/tiny)",
+        ),
+        (
+            GPL,
+            "tiny-model: licence GPL-3.0: copyleft, which what you publish may inherit "
+            "(https://example.org/tiny)",
         ),
         (
             NO_LICENCE,
