@@ -15,8 +15,8 @@ from typing import Any
 import jax
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS
-from crisalad_jax.checkpoints.published import Published
-from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.checkpoints.published import PUBLISHED, Published
+from crisalad_jax.checkpoints.torch_io import Checkpoint, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
@@ -85,7 +85,7 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
             fresh = not published.is_file()
             if fresh:
                 _download(model, published, quiet=quiet)
-            _convert(model, published, fresh=fresh)
+            _convert(model, published, fresh=fresh, quiet=quiet)
     return _weights(model)
 
 
@@ -200,7 +200,14 @@ def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> None:
             raise InputError(f"{model.name}: {error}") from error
 
 
-def _convert(model: Published, published: pathlib.Path, *, fresh: bool) -> None:
+def _read(model: Published, published: pathlib.Path, *, quiet: bool) -> Checkpoint:
+    """Read the published file; a vocabulary beside its backbone, which is in the cache too."""
+    if not model.backbone:
+        return read_checkpoint(published)
+    return read_vocabulary(published, cached_weights(PUBLISHED[model.backbone], quiet=quiet))
+
+
+def _convert(model: Published, published: pathlib.Path, *, fresh: bool, quiet: bool) -> None:
     """Make the weights of the published file, and record both.
 
     Raises:
@@ -211,7 +218,7 @@ def _convert(model: Published, published: pathlib.Path, *, fresh: bool) -> None:
     try:
         if record is not None:
             _check_same(model, record, digest)
-        checkpoint = read_checkpoint(published)
+        checkpoint = _read(model, published, quiet=quiet)
         parameters = sum(leaf.size for leaf in jax.tree.leaves(checkpoint.params))
         found = checkpoint.config.descriptor_dim, parameters
         if found != (model.descriptor, model.parameters):

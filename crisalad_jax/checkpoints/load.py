@@ -82,7 +82,8 @@ def find_weights(weights: str | os.PathLike[str], *, quiet: bool = False) -> pat
             tell(f"{name}: found a file of this name here, and took that, not the published model")
         return path
     if model is not None:
-        tell(f"{name}: {model.licence.words} ({model.repository})")
+        for each in (model, *filter(None, [PUBLISHED.get(model.backbone)])):
+            tell(f"{each.name}: {each.licence.words} ({each.repository})")
         return cached_weights(model, quiet=quiet)
     if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name) and not os.path.lexists(path):
         raise InputError(

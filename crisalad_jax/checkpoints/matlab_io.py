@@ -37,8 +37,12 @@ def read_matlab(path: pathlib.Path) -> dict[str, np.ndarray]:
         network = content["net"]
         average = network.meta.normalization.averageImage
         layers = [np.atleast_1d(getattr(layer, "weights", ())) for layer in network.layers]
-    except (KeyError, AttributeError, TypeError) as error:
+    except KeyError as error:
         raise InputError(f"{path}: found no {error}, expected {_EXPECTED}") from error
+    except (AttributeError, TypeError) as error:
+        raise InputError(
+            f"{path}: found a net without layers or averageImage, expected {_EXPECTED}"
+        ) from error
     state = {AVERAGE: _numbers(path, AVERAGE, average)}
     for number, weights in enumerate(layers):
         for i, array in enumerate(weights):

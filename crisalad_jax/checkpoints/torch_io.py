@@ -48,6 +48,31 @@ SUFFIXES = {
 """Suffixes of files by `Layout.stored`."""
 
 
+class _Unread:
+    """A stand-in for an array of NumPy beside the weights, such as the recalls of a training run.
+
+    Torch refuses a whole file with one, and NumPy itself would run on bytes of the file.
+    """
+
+    def __init__(self, *_: Any) -> None:
+        """Take what the array would be made of, and keep nothing."""
+
+    def __setstate__(self, _: Any) -> None:
+        """Take its numbers, and keep nothing."""
+
+
+_NUMPY = (
+    "numpy.dtype",
+    "numpy.ndarray",
+    *(
+        f"numpy.{core}.multiarray.{name}"
+        for core in ("core", "_core")  # before NumPy 2, and since
+        for name in ("_reconstruct", "scalar")
+    ),
+)
+"""What a pickled array or number of NumPy asks for."""
+
+
 class Checkpoint(NamedTuple):
     """A model from any file we can read."""
 
@@ -152,11 +177,12 @@ def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 def _read_torch(path: pathlib.Path) -> Any:
     torch = _torch(f"read {path}")
-    _check_unpacked_size(path)
+    _check_archive(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about deprecated formats, which are refused below
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            with torch.serialization.safe_globals([(_Unread, name) for name in _NUMPY]):
+                content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         # Torch's message is a page of advice on how to run the code anyway: shorten it.
         refused = re.search(r"GLOBAL ([\w.]+)", str(error)) or re.search(
@@ -186,21 +212,29 @@ def _read_torch(path: pathlib.Path) -> Any:
     return arrays(content, "its content")
 
 
-def _check_unpacked_size(path: pathlib.Path) -> None:
-    """Check that a torch archive does not unpack to more than its own size.
+def _check_archive(path: pathlib.Path) -> None:
+    """Check that a torch archive is whole, and does not unpack to more than its own size.
 
     Torch stores tensors as they are, but reads compressed ones too: some kilobytes could fill any
     memory.
 
     Raises:
-        InputError: it does.
+        InputError: it is cut short, or it does.
     """
+    size = path.stat().st_size
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(each.file_size for each in archive.infolist())
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        with path.open("rb") as file:
+            begins = file.read(4) == b"PK\3\4"
+        if begins and isinstance(error, zipfile.BadZipFile):
+            # Its table of contents is at the end; torch's own message is a page.
+            raise InputError(
+                f"{path}: not a whole torch checkpoint: found the beginning of one, {size} bytes "
+                "without an end, as an unfinished download leaves it"
+            ) from error
         return  # torch says what is wrong with it
-    size = path.stat().st_size
     if unpacked > size:
         raise InputError(
             f"{path}: found an archive of {size} bytes that unpacks to {unpacked}, expected a "
@@ -422,8 +456,8 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
         The backbone's parameters.
 
     Raises:
-        InputError: what `read_checkpoint` raises, or the backbone is of another size (all fields
-            that differ are listed).
+        InputError: what `read_checkpoint` raises, or the backbone is another (all fields that
+            differ are listed).
 
     Example:
         >>> import jax
@@ -447,9 +481,9 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
         theirs = dataclasses.replace(theirs, stages=stages)
         params = dataclasses.replace(params, blocks=params.blocks[:stages])
     # Ignore free fields, such as the initialisation: weights do not depend on them.
-    wrong = differences(with_free_fields_of(config, theirs), config)
+    wrong = differences(with_free_fields_of(config, theirs), config, "backbone")
     if wrong:
-        raise InputError(f"{path}: this backbone is of another size: {'; '.join(wrong)}")
+        raise InputError(f"{path}: this backbone is another than the model's: {'; '.join(wrong)}")
     if checkpoint.config.backbone == theirs or not isinstance(params, ViT):
         return params
     stack: Any = params.blocks  # one stack: only training cuts it

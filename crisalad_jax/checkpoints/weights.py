@@ -21,6 +21,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
@@ -167,6 +168,7 @@ def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         f"a .safetensors file of weights ({FORMAT!r}), as this package writes it; `crisalad "
         "convert` reads public checkpoints"
     )
+    _check_not_public(path, expected)
     key, plain, arrays = read_sealed(path, (FORMAT, FORMAT_2, FORMAT_1), expected, but=EXTRA)
     if key == FORMAT_1:
         mark = arrays.pop(_MARK, np.zeros(()))
@@ -181,6 +183,30 @@ def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             )
     pairs = {field: pair for field, pair in plain["parts"].items() if _is_pair(pair)}
     return arrays, plain | {"parts": pairs}
+
+
+_BEGINNINGS = {b"PK\3\4": "a torch file", b"\x80\2": "a torch file", b"MATLAB": "a MATLAB file"}
+"""What files of public checkpoints begin with; torch's are archives, older ones pickles."""
+
+
+def _check_not_public(path: pathlib.Path, expected: str) -> None:
+    """Check that a file is not plainly one that `crisalad convert` reads.
+
+    Raises:
+        InputError: it is.
+    """
+    check_source(path, expected)
+    try:
+        with path.open("rb") as file:
+            start = file.read(8)
+    except OSError:
+        return  # the reader tells
+    for beginning, kind in _BEGINNINGS.items():
+        if start.startswith(beginning):
+            ours = path.with_suffix(".safetensors")
+            raise InputError(
+                f"{path}: found {kind}, expected {expected}: crisalad convert {path} {ours}"
+            )
 
 
 def _is_pair(value: Any) -> bool:

@@ -16,6 +16,7 @@ from crisalad_jax.config.checks import check_seed
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
 from crisalad_jax.utils.output import printable
 
@@ -66,10 +67,16 @@ def find_given(weights: pathlib.Path | None, *, quiet: bool = False) -> pathlib.
     return None if weights is None else find_weights(weights, quiet=quiet)
 
 
+def check_one_model(weights: pathlib.Path | None, preset: str | None) -> None:
+    """Raise InputError where a preset is given beside weights, which have their own sizes."""
+    if weights is not None and preset is not None:
+        raise InputError("--preset: found beside --weights, expected only one of the two")
+
+
 def load_model(
     weights: pathlib.Path | None,
     *,
-    preset: str = "b14",
+    preset: str | None = None,
     seed: int = 0,
     image_size: tuple[int, int] | None = None,
     resize: Sequence[str] = (),
@@ -81,7 +88,7 @@ def load_model(
 
     Args:
         weights: the file, or a published model's name.
-        preset: the size of the untrained model.
+        preset: the size of the untrained model; None is b14.
         seed: draws the parameters of the untrained model.
         image_size: height and width in pixels; None is the model's.
         resize: words that change how images are resized; see `ModelConfig.resized`.
@@ -93,9 +100,12 @@ def load_model(
         (params, config, name); the name stands in tables and titles.
 
     Raises:
-        InputError: what `find_weights`, `load_weights`, `recipe` and `ModelConfig.resized` raise.
+        InputError: what `find_weights`, `load_weights`, `recipe` and `ModelConfig.resized` raise;
+            or both weights and a preset are given.
     """
+    check_one_model(weights, preset)
     if weights is None:
+        preset = preset or "b14"
         config = recipe(preset).model
         check_seed("seed", seed)
         params = init_crisalad(jax.random.key(seed), config)

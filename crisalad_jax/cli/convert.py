@@ -1,6 +1,7 @@
 """`crisalad convert`."""
 
 import dataclasses
+import os
 import pathlib
 from typing import Annotated
 
@@ -8,6 +9,7 @@ import tyro
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS
 from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.checkpoints.torch_io import convert
 from crisalad_jax.cli.common import say
 from crisalad_jax.training.summary import model_words
@@ -57,6 +59,12 @@ def run(arguments: Convert) -> None:
     fields = {name: value for name, value in fields.items() if value is not None}
     if fields and arguments.backbone is None:
         raise InputError(f"--{next(iter(fields))}: found without --backbone, expected both")
+    source = os.fspath(arguments.source)
+    if source in PUBLISHED and not arguments.source.exists():
+        raise InputError(
+            f"{source}: found the name of a published model, expected a file; --weights {source} "
+            "takes it by its name, and converts it by itself"
+        )
     backbone = None if arguments.backbone is None else find_weights(arguments.backbone)
     done = convert(
         arguments.source, arguments.target, arguments.layout, backbone=backbone, fields=fields

@@ -39,8 +39,8 @@ class Evaluate:
     weights: pathlib.Path | None = None
     """A .safetensors file of this package, or a published model's name (`crisalad models`); none
     evaluates an untrained model of --preset."""
-    preset: str = "b14"
-    """Model to start untrained where there are no weights."""
+    preset: str | None = None
+    """Model to start untrained where there are no weights, by default b14."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size (14); by default the model's."""
     resize: tuple[str, ...] = ()

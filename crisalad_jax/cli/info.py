@@ -8,6 +8,7 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     check_json,
+    check_one_model,
     console,
     say,
     talk_beside,
@@ -28,8 +29,8 @@ from crisalad_jax.utils.errors import InputError
 class Info:
     """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""
 
-    preset: str = "b14"
-    """tiny, s14, b14, l14 or g14."""
+    preset: str | None = None
+    """tiny, s14, b14 (the default), l14 or g14."""
     weights: pathlib.Path | None = None
     """Describe the model in this file of this package instead, or a published one, by its name."""
     map: pathlib.Path | None = None
@@ -64,12 +65,14 @@ def run(arguments: Info) -> None:
 
 
 def _model(arguments: Info) -> dict[str, Any]:
+    check_one_model(arguments.weights, arguments.preset)
     if arguments.weights is not None:
         _, config = load_weights(find_weights(arguments.weights))
         name, trainable = str(arguments.weights), arguments.trainable
     else:
-        defaults = recipe(arguments.preset)
-        config, name = defaults.model, arguments.preset
+        name = arguments.preset or "b14"
+        defaults = recipe(name)
+        config = defaults.model
         trainable = arguments.trainable or defaults.trainable
     config = config.resized(arguments.image_size, arguments.resize)
     summary = model_summary(config, trainable, images=arguments.batch_size)

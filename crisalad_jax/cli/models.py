@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import sys
 from typing import Annotated, Any
 
 import tyro
@@ -28,8 +29,10 @@ def run(arguments: Models) -> None:
     talk_beside(arguments.json)
     if arguments.name is None:
         models = tuple(PUBLISHED.values())
-        console.print(models_table(models))
+        width = console.width if sys.stdout.isatty() else None
+        console.print(models_table(models, width), crop=False)
         say(f"{len(models)} models; * in the cache, {cache_folder()}")
+        say("crisalad models NAME tells the rest of one: its paper, file and address")
         values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
     else:
         values = _facts(published_model(arguments.name))

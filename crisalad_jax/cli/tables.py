@@ -1,5 +1,6 @@
 """Tables that the commands print."""
 
+import itertools
 from collections.abc import Sequence
 
 import rich.box
@@ -69,25 +70,45 @@ def summary_table(summary: ModelSummary, name: str) -> Table:
     return table
 
 
-def models_table(models: Sequence[Published]) -> Table:
-    """Make a table of published models for the terminal; those in the cache have a star."""
+def models_table(models: Sequence[Published], width: int | None) -> Table:
+    """Make a table of published models for the terminal; those in the cache have a star.
+
+    Args:
+        models: its rows.
+        width: the terminal's. Columns at the right that it has no room for are left out. None
+            leaves out none, for a file or a pipe.
+
+    Returns:
+        A table that is printed without wrapping.
+    """
+    rows = [_model_cells(model) for model in models]
+    lengths = (max(map(len, cells)) for cells in zip(_MODEL_COLUMNS, *rows, strict=True))
+    # One space before the first column, and two after each.
+    ends = list(itertools.accumulate((length + 2 for length in lengths), initial=1))
+    shown = max(1, sum(width is None or end <= width for end in ends[1:]))
     # Without lines between the columns, longer names fit.
-    table = Table(box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("name", no_wrap=True)
-    table.add_column("descriptor", justify="right")
-    table.add_column("parameters", justify="right", no_wrap=True)
-    for name in ("images", "licence", "on GitHub"):
-        table.add_column(name, overflow="fold")
-    for model in models:
-        table.add_row(
-            f"{model.name} *" if is_cached(model) else model.name,
-            f"{model.descriptor:,}",
-            f"{model.parameters / 1e6:,.1f} M",
-            model.images,
-            model.licence.name,
-            model.repository.removeprefix(GITHUB),
-        )
+    table = Table(box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), width=ends[shown])
+    for name in _MODEL_COLUMNS[:shown]:
+        right = name in ("descriptor", "parameters")
+        table.add_column(name, no_wrap=True, justify="right" if right else "left")
+    for cells in rows:
+        table.add_row(*cells[:shown])
     return table
+
+
+_MODEL_COLUMNS = ("name", "descriptor", "parameters", "licence", "images", "on GitHub")
+
+
+def _model_cells(model: Published) -> tuple[str, ...]:
+    """Return what is told of a model, a text for each of `_MODEL_COLUMNS`."""
+    return (
+        f"{model.name} *" if is_cached(model) else model.name,
+        f"{model.descriptor:,}",
+        f"{model.parameters / 1e6:,.1f} M",
+        model.licence.name,
+        model.images,
+        model.repository.removeprefix(GITHUB),
+    )
 
 
 def answers_table(answers: Answers, title: str = "") -> Table:

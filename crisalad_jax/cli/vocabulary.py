@@ -36,8 +36,9 @@ class Vocabulary:
     backbone: pathlib.Path | None = None
     """Any checkpoint that `convert` reads, or a published model's name, as in dinov2-vitg14: the
     backbone is taken."""
-    preset: str = "b14"
-    """tiny, s14, b14, l14 or g14: the size of --backbone; without one the backbone is random."""
+    preset: str | None = None
+    """tiny, s14, b14 (the default), l14 or g14: the size of --backbone; without one the backbone is
+    random."""
     aggregator: str | None = None
     """With --preset: anyloc (the default), netvlad, or a part of yours that starts from
     centroids."""
@@ -100,14 +101,14 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
     if arguments.weights is None:
         return start_vocabulary(
             arguments.aggregator or "anyloc",
-            arguments.preset,
+            arguments.preset or "b14",
             backbone=find_given(arguments.backbone, quiet=arguments.quiet),
             fields=fields,
             image_size=arguments.image_size,
             resize=arguments.resize,
             seed=arguments.seed,
         )
-    for name in ("backbone", "aggregator", *fields):
+    for name in ("backbone", "preset", "aggregator", *fields):
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name}: found beside --weights, expected only one of the two")
     weights = find_weights(arguments.weights, quiet=arguments.quiet)

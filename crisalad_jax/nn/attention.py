@@ -98,6 +98,26 @@ def cross_attention(
     return linear(params.proj, mixed.reshape(*batch, queries.shape[-2], dim))
 
 
+def first_token_attention(
+    params: Attention, x: Float[Array, "*batch token dim"], heads: int
+) -> Float[Array, "*batch head token"]:
+    """Compute how much of each token the first token's `attention` takes, in float32 at least.
+
+    A head's shares sum to 1.
+    """
+    *batch, tokens, dim = x.shape
+    weight, bias = params.qkv.weight[:, : 2 * dim], params.qkv.bias
+    assert bias is not None
+    query = linear(Linear(weight[:, :dim], bias[:dim]), x[..., 0, :]) / math.sqrt(dim // heads)
+    keys = linear(Linear(weight[:, dim:], bias[dim : 2 * dim]), x)
+    scores = _product(
+        "...hd,...jhd->...hj",
+        query.reshape(*batch, heads, dim // heads),
+        keys.reshape(*batch, tokens, heads, dim // heads),
+    )
+    return jax.nn.softmax(scores, axis=-1)
+
+
 def _wide(x: Array) -> Any:
     return jnp.promote_types(x.dtype, jnp.float32)
 

@@ -70,6 +70,11 @@ class ModelConfig:
             f"backbone: found {self.backbone.part_name} for aggregator {name}, expected one "
             "through whose blocks tokens can run, such as vit",
         )
+        require(
+            self.backbone.attends or not request.class_attention,
+            f"backbone: found {self.backbone.part_name} for aggregator {name}, expected one whose "
+            "class token attends to patches, such as vit",
+        )
         self._check_size_rule()
         self.check_image_size(self.input_size)
         require(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import io
 import json
 import os
 import pathlib
@@ -13,23 +14,28 @@ import time
 import warnings
 from collections.abc import Iterator
 
+import jax
 import numpy as np
 import pytest
 import safetensors.numpy
+import torch
 
 import crisalad_jax as cj
 import crisalad_jax.utils.download
 from crisalad_jax.checkpoints import cache
 from crisalad_jax.checkpoints.cache import cache_folder, cached_weights, is_cached
 from crisalad_jax.checkpoints.layouts import public_shapes
+from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
-from crisalad_jax.checkpoints.published.base import MIT, NO_LICENCE
+from crisalad_jax.checkpoints.published.base import GPL, MIT, NO_LICENCE
 from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.download import Patience
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
@@ -142,6 +148,11 @@ def test_a_name_loads_what_its_file_holds_and_downloads_once(model, server, tmp_
         (
             Licence("CC-BY-NC-4.0", commercial=False),
             "tiny-model: licence CC-BY-NC-4.0: no commercial use (https://example.org/tiny)",
+        ),
+        (
+            GPL,
+            "tiny-model: licence GPL-3.0: copyleft, which what you publish may inherit "
+            "(https://example.org/tiny)",
         ),
         (
             NO_LICENCE,
@@ -340,6 +351,42 @@ def test_a_file_without_an_address_is_put_there_by_hand(model, monkeypatch, tmp_
     assert path.exists()  # the user's
     path.write_bytes(DATA)
     assert cj.load("tiny-model").config == CONFIG
+
+
+def test_a_vocabulary_brings_its_backbone(model, server, monkeypatch):
+    # AnyLoc's block is the ninth from the end.
+    deep = dataclasses.replace(CONFIG, backbone=dataclasses.replace(CONFIG.backbone, depth=9))
+    count = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(deep)))
+    server.files["/deep.safetensors"] = state_bytes(0, deep)
+    address = server.url("/deep.safetensors")
+    backbone = register(
+        model, monkeypatch, name="tiny-deep", parameters=count, file="deep", url=address
+    )
+    words = np.random.default_rng(1).normal(size=(3, 64)).astype(np.float32)
+    data = io.BytesIO()
+    torch.save(torch.tensor(words), data)
+    server.files["/words.pt"] = data.getvalue()
+    register(
+        model,
+        monkeypatch,
+        name="tiny-words",
+        layout=VOCABULARY,
+        descriptor=3 * 64,
+        parameters=count + words.size,
+        licence=NO_LICENCE,
+        file="words.pt",
+        url=server.url("/words.pt"),
+        backbone="tiny-deep",
+    )
+    with pytest.warns(Note) as notes:
+        params, config = cj.load("tiny-words")
+    told = [str(note.message) for note in notes]
+    assert told[0].startswith("tiny-words: no licence file")
+    assert told[1].startswith("tiny-deep: licence MIT")
+    assert is_cached(backbone)
+    assert config.descriptor_dim == 3 * 64
+    np.testing.assert_array_equal(params.aggregator.words, words)
+    assert_equal(params.backbone, load_weights(cached_weights(backbone))[0].backbone)
 
 
 def test_torch_is_asked_for_before_a_download(model, server, monkeypatch, tmp_path):

@@ -65,6 +65,11 @@ def test_a_written_file_is_what_scipy_and_we_read(tmp_path: pathlib.Path) -> Non
 def test_what_is_no_network(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "other.mat"
     scipy.io.savemat(path, {"dbStruct": {"whichSet": "test"}})
+    scipy.io.savemat(tmp_path / "numbers.mat", {"net": np.zeros(3)})
+    with pytest.raises(
+        InputError, match=r"numbers.mat: found a net without layers or averageImage"
+    ):
+        read_matlab(tmp_path / "numbers.mat")
     with pytest.raises(InputError, match=r"other.mat: found no 'net', expected a MATLAB file of a"):
         read_matlab(path)
     path.write_bytes(b"no MATLAB at all, but text of some length" * 10)

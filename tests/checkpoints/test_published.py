@@ -5,6 +5,8 @@ import functools
 import json
 import pathlib
 import re
+from collections.abc import Callable
+from typing import Any
 from urllib.parse import urlsplit
 
 import jax
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS, infer
+from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY, vocabulary_model
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
@@ -54,7 +57,44 @@ STORED = {
     "vlad-buff-4096": "zoo/layouts/vladbuff_192_wpca4096",
     "selavpr-msls": "zoo/layouts/selavpr",
     "selavpr-pitts30k": "zoo/layouts/selavpr",
+    **{
+        name: "zoo/layouts/cosplace_resnet50_2048"
+        if "eigenplaces" in name
+        else "layouts/dino_salad"
+        for name in PUBLISHED
+        if "-indoor-" in name
+    },
+    "fol-large": "layouts/dinov2_vitl14",
+    "fol-base": "layouts/dinov2_vitb14",
 }
+
+
+def fol(backbone: dict[str, list[int]]) -> dict[str, Any]:
+    """FoL's names: the backbone's, SALAD's for its width, and the transposed convolutions'."""
+    width = backbone["cls_token"][2]
+    salad = json.loads((PARITY / "layouts/dino_salad.json").read_text(encoding="utf-8"))
+    head = {key: shape for key, shape in salad.items() if key.startswith("aggregator.")}
+    return {
+        **{f"backbone.model.{key}": shape for key, shape in backbone.items()},
+        **{key: [width if side == 768 else side for side in head[key]] for key in head},
+        "upconv.weight": [width, 256, 3, 3],
+        "upconv.bias": [256],
+        "upconv2.weight": [256, 128, 3, 3],
+        "upconv2.bias": [128],
+    }
+
+
+def within_model(shapes: dict[str, Any]) -> dict[str, Any]:
+    """Indoor-VPR's names, which are another file's within a module `model`."""
+    return {f"model.{key}": shape for key, shape in shapes.items()}
+
+
+MADE: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "fol-large": fol,
+    "fol-base": fol,
+    **{name: within_model for name in PUBLISHED if "-indoor-" in name},
+}
+"""Functions that make a file's shapes of those that are stored of a part of it."""
 CHANGED: dict[str, dict[str, tuple[int, ...] | None]] = {
     # The README's one cluster and two ghosts.
     "supervlad-1-cluster": {"aggregation.conv.weight": (3, 768, 1, 1)},
@@ -86,6 +126,7 @@ def stored(name: str) -> tuple[str, ModelConfig]:
     """The layout and configuration of a published file."""
     shapes = json.loads((PARITY / f"{STORED[name]}.json").read_text(encoding="utf-8"))
     plain = {key.rpartition("/")[2].removeprefix("module."): shapes[key] for key in shapes}
+    plain = MADE.get(name, lambda shapes: shapes)(plain)
     plain |= CHANGED.get(name, {})
     plain = {key: shape for key, shape in plain.items() if shape is not None}
     blank = {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in plain.items()}
@@ -117,7 +158,8 @@ def test_another_size_has_its_own_facts(name):
 
 
 def test_cosplaces_sizes_differ_in_their_linear_layer():
-    of_family = [name for name in PUBLISHED if name.startswith(("cosplace-", "eigenplaces-"))]
+    families = ("cosplace-", "eigenplaces-")
+    of_family = [n for n in PUBLISHED if n.startswith(families) and "-indoor-" not in n]
     assert len(of_family) == 30 + 11
     backbones = {
         "vgg16": VggConfig(),
@@ -148,8 +190,21 @@ def test_patch_netvlads_sizes_differ_in_their_projection():
             assert model.parameters == known.parameters + rows * (size - known.descriptor)
 
 
+def test_anylocs_vocabularies_have_their_backbone():
+    words = np.broadcast_to(np.float32(0), (32, 1536))
+    for name, model in PUBLISHED.items():
+        if model.layout != VOCABULARY:
+            assert not model.backbone
+            continue
+        assert name.startswith("anyloc-")
+        _, base = stored(model.backbone)
+        config = vocabulary_model(words, base, {})
+        assert (model.descriptor, model.parameters) == (config.descriptor_dim, parameters(config))
+        assert config.aggregator.block(base.backbone.depth) == 31  # as the file's name says
+
+
 def test_every_model_is_checked_above():
-    families = ("cosplace-", "eigenplaces-", "patch-netvlad-")
+    families = ("cosplace-", "eigenplaces-", "patch-netvlad-", "anyloc-")
     others = {name for name in PUBLISHED if not name.startswith(families)}
     assert others <= STORED.keys() | SIZED.keys()
 

@@ -29,7 +29,8 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
-from tests.conftest import MODEL, random_params
+from parity import zoo
+from tests.conftest import MODEL, assert_equal, random_params
 from tests.random_checkpoints import (
     UNDER,
     fewer_blocks,
@@ -93,6 +94,27 @@ def there_and_back(folder: pathlib.Path, source: pathlib.Path, width: int) -> No
 @pytest.mark.parametrize("name", SMALL)
 def test_there_and_back_are_the_same_bytes(tmp_path: pathlib.Path, name: str) -> None:
     there_and_back(tmp_path, written(tmp_path, name), WIDTHS[name])
+
+
+@pytest.mark.parametrize("kind", ["salad-indoor", "eigenplaces-indoor"])
+def test_indoor_vprs_files_are_the_same_network_within_a_module(
+    tmp_path: pathlib.Path, kind: str
+) -> None:
+    state = {
+        "salad-indoor": lambda: random_state(SMALL["dino-salad"]),
+        "eigenplaces-indoor": lambda: {
+            name: torch.tensor(x) for name, x in zoo.random_state("cosplace_resnet18_512").items()
+        },
+    }[kind]()
+    outside = read_checkpoint(save(tmp_path / "plain.pth", state))
+    within = save(tmp_path / "within.pth", {f"model.{name}": x for name, x in state.items()})
+    inside = read_checkpoint(within)
+    assert inside.layout == kind
+    assert inside.config.aggregator == outside.config.aggregator
+    assert_equal(inside.params, outside.params)
+    convert(within, tmp_path / "ours.safetensors")
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", kind)
+    assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -244,6 +266,34 @@ def test_any_nesting_and_prefix_is_read(tmp_path: pathlib.Path, name: str, under
     assert same_bits({k: torch.tensor(v) for k, v in again.items()}, plain)
 
 
+@pytest.mark.parametrize("core", ["numpy._core", "numpy.core"])
+@pytest.mark.parametrize("new", [True, False])
+def test_numpys_records_beside_the_weights_are_not_read(
+    tmp_path: pathlib.Path, core: str, new: bool
+) -> None:
+    """As CricaVPR's code and those that began from it save them; NumPy 1 has the second name."""
+    content = nested(random_state(SMALL["cricavpr"]))
+    content |= {"recalls": np.array([90.5, 97.1]), "best_r5": np.float64(97.1), "n": np.int64(3)}
+    path = tmp_path / "file.pth"
+    torch.save(content, path, _use_new_zipfile_serialization=new)
+    whole = {path.name: path.read_bytes()}
+    if new:
+        with zipfile.ZipFile(path) as archive:
+            whole = {name: archive.read(name) for name in archive.namelist()}
+    assert any(b"numpy._core" in data for data in whole.values())
+    named = {name: data.replace(b"numpy._core", core.encode()) for name, data in whole.items()}
+    if new:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in named.items():
+                archive.writestr(name, data)
+    else:
+        path.write_bytes(named[path.name])
+    found = read_checkpoint(path)
+    again = to_state(found.params, found.config, "cricavpr", found.extras)
+    state = {key.removeprefix("module."): x for key, x in content[UNDER[:-1]].items()}
+    assert same_bits({k: torch.tensor(v) for k, v in again.items()}, state)
+
+
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("kind", ["torch", "safetensors"])
 def test_half_precision_is_widened_exactly(tmp_path: pathlib.Path, dtype, kind: str) -> None:
@@ -307,15 +357,15 @@ def test_adapters_come_along_where_they_are_the_same(tmp_path: pathlib.Path, kin
 
 def test_a_backbone_of_other_heads_is_refused(tmp_path: pathlib.Path) -> None:
     config, start = fresh("depthwise", heads=2)
-    with pytest.raises(InputError, match=r"another size: heads: found 1, expected 2$"):
+    with pytest.raises(InputError, match=r"model.s: backbone.heads: found 1, expected 2$"):
         read_backbone(written(tmp_path, "dinov2"), config.backbone, start)
 
 
 def test_a_backbone_of_another_size_is_refused(tmp_path: pathlib.Path) -> None:
     source = written(tmp_path, "registers")
     config, start = fresh("depthwise", depth=3)
-    words = f"{source}: this backbone is of another size: depth: found 2, expected 3; .*registers: "
-    with pytest.raises(InputError, match=words + "found 4, expected 0"):
+    words = f"{source}: this backbone is another than the model's: backbone.depth: found 2, exp"
+    with pytest.raises(InputError, match=f"{words}.* backbone.registers: found 4, expected 0"):
         read_backbone(source, config.backbone, start)
 
 
@@ -380,6 +430,8 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         torch.save(state | {"norm.bias": state["norm.bias"].double()}, path)
     elif kind == "nan":
         torch.save(state | {"norm.bias": state["norm.bias"] * float("nan")}, path)
+    elif kind == "an array of NumPy":
+        torch.save(state | {"norm.bias": state["norm.bias"].numpy()}, path)
     elif kind == "sparse":
         torch.save(state | {"norm.bias": state["norm.bias"].to_sparse()}, path)
     elif kind == "eight bits":
@@ -413,8 +465,8 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
     [
         ("missing", "found no such file, expected a checkpoint"),
         ("empty", "not a whole torch checkpoint"),
-        ("cut", "not a whole torch checkpoint"),
-        ("cut at the end", "not a whole torch checkpoint"),
+        ("cut", "not a whole torch checkpoint: found the beginning of one, .* unfinished downl"),
+        ("cut at the end", "not a whole torch checkpoint: found the beginning of one, .* without"),
         ("old format cut at 322", "not a whole torch checkpoint"),
         ("old format cut at 338", "not a whole torch checkpoint"),
         ("old format cut at 2000", "not a whole torch checkpoint"),
@@ -432,6 +484,7 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
         ("no tensor", "found epoch, expected nothing but tensors by name"),
         ("double", "norm.bias found float64, expected float32, float16 or bfloat16"),
         ("nan", "norm.bias holds NaN or infinity"),
+        ("an array of NumPy", "found norm.bias, expected nothing but tensors by name"),
         ("sparse", "norm.bias is no plain tensor: .*Sparse"),
         ("eight bits", "norm.bias is no plain tensor: .*Float8"),
         ("no data", "norm.bias is no plain tensor: .*meta"),

@@ -1,11 +1,13 @@
 """`crisalad models`, and published models by name at the verbs that take weights."""
 
 import dataclasses
+import io
 import json
 import pathlib
 
 import numpy as np
 import pytest
+import rich.console
 
 from crisalad_jax.checkpoints.cache import cached_weights
 from crisalad_jax.checkpoints.layouts import LAYOUTS
@@ -13,6 +15,7 @@ from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.published.base import NO_LICENCE
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli import main
+from crisalad_jax.cli.tables import models_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.start import read_start
 from tests.checkpoints.test_cache import CONFIG, DATA, FILE
@@ -63,6 +66,27 @@ def test_the_table_has_every_model_and_marks_those_in_the_cache(capfd, tmp_path)
     assert out.count(" * ") == 2  # with the line that explains it
 
 
+@pytest.mark.parametrize(
+    ("width", "last"), [(40, "name"), (80, "licence"), (120, "images"), (None, "on GitHub")]
+)
+def test_no_name_of_the_table_is_cut_or_wrapped(width: int | None, last: str) -> None:
+    """On a terminal the columns at the right are left out; into a pipe all are written."""
+    output = io.StringIO()
+    narrow = rich.console.Console(file=output, width=width or 120)
+    narrow.print(models_table(tuple(PUBLISHED.values()), width), crop=False)
+    lines = output.getvalue().splitlines()
+    head, rows = lines[1], lines[3:-1]
+    assert head.rstrip().endswith(last)
+    assert len(rows) == len(PUBLISHED)
+    assert all(len(line) <= (width or 300) for line in lines)
+    for row, model in zip(rows, PUBLISHED.values(), strict=True):
+        assert row.split()[0] == model.name
+        if last != "name":
+            assert model.licence.name in row
+        if width is None:
+            assert row.rstrip().endswith(model.repository.removeprefix("https://github.com/"))
+
+
 def test_one_model_is_told_with_all_that_is_known(capfd):
     out, _ = runs(capfd, "models", "tiny-model")
     facts = dict(line.split(maxsplit=1) for line in out.splitlines())
@@ -76,6 +100,7 @@ def test_one_model_is_told_with_all_that_is_known(capfd):
         "file": FILE,
         "url": "not said",
         "paper": "Nobody, 2026",
+        "backbone": "-",
         "note": "in an archive",
         "licence": "no licence file",
         "commercial": "not said",

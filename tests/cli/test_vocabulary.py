@@ -71,6 +71,7 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path) -> None:
         ((tmp_path / "w.npy",), "w.npy: found the suffix '.npy', expected .safetensors"),
         ((out, "--weights", weights), f"{weights}: found aggregator salad, expected one w"),
         ((out, "--weights", weights, "--backbone", weights), "--backbone: found beside --weights"),
+        ((out, "--weights", weights, "--preset", "b14"), "--preset: found beside --weights"),
         ((out, "--weights", weights, "--layer", 1), "--layer: found beside --weights"),
         ((out, "--preset", "tiny", "--layer", 4), "layer: found 4, expected -4 to 3"),
         (
@@ -83,7 +84,7 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path) -> None:
         ),
         (
             (out, "--preset", "tiny", "--backbone", weights),
-            f"{weights}: this backbone is of another size",
+            f"{weights}: this backbone is another than the model",
         ),
     ):
         fails(capfd, *start, *more, words=(words,))

@@ -19,6 +19,7 @@ from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
 from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
+from crisalad_jax.nn.aggregators.fol import FolConfig
 from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
@@ -199,6 +200,11 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
     ),
     # A descriptor needs no local features.
     "selavpr": (SelaVprConfig(hidden=8, local=4), 0),
+    # SALAD's; the dustbin comes from the backbone.
+    "fol": (
+        FolConfig(clusters=8, cluster_dim=32, token_dim=64, hidden=128),
+        salad_by_hand(),
+    ),
 }
 
 

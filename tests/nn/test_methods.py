@@ -17,6 +17,7 @@ from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
 from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
+from crisalad_jax.nn.aggregators.fol import FolConfig
 from crisalad_jax.nn.aggregators.gem import GemConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
@@ -60,6 +61,7 @@ PARTS: dict[str, Aggregator] = {
     "aggregation-tokens": AggregationTokensConfig(tokens=3, insertion=1),
     "vlad-buff": VladBuffConfig(clusters=4, reduced=12),
     "selavpr": SelaVprConfig(hidden=8, local=4),
+    "fol": FolConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, local_hidden=8, local=4),
 }
 METHODS = [
     # tests/test_model.py and others have enough of these.

@@ -40,6 +40,10 @@ class Layout:
     """Kind of the family's files."""
     bare: bool = False
     """Whether a file is one tensor by itself, which is a part of a model."""
+    has_backbone: Callable[[State], bool] = lambda state: False
+    """Function that returns whether a state has the family's backbone, with or without a head."""
+    has_head: Callable[[State], bool] = lambda state: False
+    """Function that returns whether a state has the family's head, with or without a backbone."""
 
 
 LAYOUTS: dict[str, Layout] = {}
@@ -72,6 +76,22 @@ def head_lines(config: ModelConfig) -> Iterator[Entry]:
     for name, leaf in named_leaves(parameter_shapes(config)).items():
         if name.startswith("aggregator") and leaf.size:
             yield Entry((name,), (name,), SAME)
+
+
+def tells_head(infer_head: Callable[[State], Any]) -> Callable[[State], bool]:
+    """Return a function that returns whether a head can be inferred from a state.
+
+    It is never so for a head that is inferred from no name at all.
+    """
+
+    def infers(state: State) -> bool:
+        try:
+            infer_head(state)
+        except InputError:
+            return False
+        return True
+
+    return lambda state: infers(state) and not infers({})
 
 
 class Reader(NamedTuple):

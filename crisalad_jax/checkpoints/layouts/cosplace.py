@@ -20,15 +20,15 @@ def gem_lines(config: GemConfig) -> Iterator[Entry]:
 
 
 @register_head("cosplace")
-def cosplace_lines(config: CosPlaceConfig) -> Iterator[Entry]:
-    """Yield the exponent and the linear layer."""
-    yield Entry(("aggregator.p",), ("aggregation.1.p",), FIRST)
-    yield from affine("aggregator.fc", "aggregation.3", LINEAR)
+def cosplace_lines(config: CosPlaceConfig, prefix: str = "") -> Iterator[Entry]:
+    """Yield the exponent and the linear layer, under their names after a prefix."""
+    yield Entry(("aggregator.p",), (f"{prefix}aggregation.1.p",), FIRST)
+    yield from affine("aggregator.fc", f"{prefix}aggregation.3", LINEAR)
 
 
-def infer_cosplace(state: State) -> CosPlaceConfig:
+def infer_cosplace(state: State, prefix: str = "") -> CosPlaceConfig:
     """Infer the width of the descriptor."""
-    return CosPlaceConfig(dim=Reader(state).size("aggregation.3.weight", 0))
+    return CosPlaceConfig(dim=Reader(state, prefix).size("aggregation.3.weight", 0))
 
 
 register_over_cnn(

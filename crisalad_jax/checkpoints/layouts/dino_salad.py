@@ -13,6 +13,11 @@ def salad_lines(config: SaladConfig, prefix: str = "aggregator.") -> Iterator[En
     """Yield SALAD's table, under serizba/salad's names after their prefix."""
     if config.dustbin.part_name in ("column", "row and column", "mass"):
         yield Entry(("aggregator.dust_bin",), (f"{prefix}dust_bin",), SAME)
+    yield from network_lines(prefix)
+
+
+def network_lines(prefix: str) -> Iterator[Entry]:
+    """Yield the three networks over features."""
     for name, second, form in (
         ("token_features", 2, LINEAR),
         ("cluster_features", 3, POINTWISE),

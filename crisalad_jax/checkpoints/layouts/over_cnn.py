@@ -10,6 +10,7 @@ from crisalad_jax.checkpoints.layouts.base import (
     State,
     head_lines,
     register_layout,
+    tells_head,
 )
 from crisalad_jax.checkpoints.layouts.cnn import Names, accepts_head_over, cnn_lines, infer_cnn
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, Form, affine
@@ -82,7 +83,22 @@ def register_over_cnn(
             projection=ProjectionConfig(dim=dim),
         )
 
-    def detects(state: State) -> bool:
-        return names.first in state and mark in state
+    def has_backbone(state: State) -> bool:
+        return names.first in state
 
-    register_layout(Layout(name, holds, accepts, lines, detects, infer, under=under))
+    def detects(state: State) -> bool:
+        return has_backbone(state) and mark in state
+
+    register_layout(
+        Layout(
+            name,
+            holds,
+            accepts,
+            lines,
+            detects,
+            infer,
+            under=under,
+            has_backbone=has_backbone,
+            has_head=tells_head(infer_head),
+        )
+    )

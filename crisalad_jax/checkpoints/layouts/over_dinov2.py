@@ -14,6 +14,7 @@ from crisalad_jax.checkpoints.layouts.base import (
     Stored,
     head_lines,
     register_layout,
+    tells_head,
 )
 from crisalad_jax.checkpoints.layouts.dinov2 import (
     accepts_parts,
@@ -105,10 +106,27 @@ def register_over_dinov2(
             projection=ProjectionConfig(dim=dim),
         )
 
-    def detects(state: State) -> bool:
-        return has_vit(state, prefix) and (mark is None or mark in state)
+    def has_backbone(state: State) -> bool:
+        return has_vit(state, prefix)
 
-    register_layout(Layout(name, holds, accepts, lines, detects, infer, module, under, stored))
+    def detects(state: State) -> bool:
+        return has_backbone(state) and (mark is None or mark in state)
+
+    register_layout(
+        Layout(
+            name,
+            holds,
+            accepts,
+            lines,
+            detects,
+            infer,
+            module,
+            under,
+            stored,
+            has_backbone=has_backbone,
+            has_head=tells_head(infer_head),
+        )
+    )
 
 
 def _projection_dim(state: State, projection: str) -> int:

@@ -49,14 +49,14 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
         InputError: naming `source`, if the names are of no layout or the widths of no model.
     """
     found: list[tuple[int, str, ModelConfig]] = []
-    problems: list[InputError] = []
+    problems: list[str] = []
     for layout in LAYOUTS.values():
         if layout.infer is not None and layout.detects(state):
             try:
                 config = layout.infer(state)
                 names = public_shapes(config, layout.name).keys()
             except InputError as error:
-                problems.append(error)
+                problems.append(f"{error}, as in {layout.holds}")
             else:
                 found.append((len(names ^ state.keys()), layout.name, config))
     if found:
@@ -64,12 +64,29 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
         _, name, config = min(found, key=lambda each: each[0])
         return name, config
     if problems:
-        raise InputError(f"{source}: {problems[0]}") from problems[0]
+        raise InputError(f"{source}: {problems[0]}")
+    _check_halves(state, source)
     names = ", ".join(sorted(state)[:3]) or "none"
     raise InputError(
-        f"{source}: found no checkpoint that we know (its first names: {names}); expected "
-        f"{', '.join(layout.holds for layout in LAYOUTS.values())}"
+        f"{source}: found no checkpoint that we know (its first names: {names}), expected one of "
+        f"the {len(LAYOUTS)} kinds that `crisalad convert --help` lists"
     )
+
+
+def _check_halves(state: State, source: str) -> None:
+    """Raise InputError where a state is the head of a family without its backbone, or the reverse.
+
+    Families share the names of their parts: the message has all that it may be of.
+    """
+    layouts = LAYOUTS.values()
+    heads = [layout.holds for layout in layouts if layout.has_head(state)]
+    backbones = [layout.holds for layout in layouts if layout.has_backbone(state)]
+    for here, families, missing in (("head", heads, "backbone"), ("backbone", backbones, "head")):
+        if families:
+            raise InputError(
+                f"{source}: found a {here} without its {missing}, expected both in one file, as in "
+                f"{' or '.join(families)}"
+            )
 
 
 def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -> None:

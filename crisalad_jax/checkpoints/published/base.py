@@ -14,19 +14,22 @@ class Licence:
     """SPDX identifier, or words where the repository has no licence."""
     commercial: bool | None
     """Whether it allows commercial use; None where nothing is said."""
+    terms: str = ""
+    """What else a user has to know of it, in words."""
 
     @property
     def words(self) -> str:
         """The licence, and what a user has to know of it."""
         if self.commercial is None:
             return f"{self.name}: its authors have not said who may use it"
-        return f"licence {self.name}" + ("" if self.commercial else ": no commercial use")
+        terms = self.terms if self.commercial else "no commercial use"
+        return f"licence {self.name}" + (f": {terms}" if terms else "")
 
 
 MIT = Licence("MIT", commercial=True)
 APACHE = Licence("Apache-2.0", commercial=True)
 BSD = Licence("BSD-3-Clause", commercial=True)
-GPL = Licence("GPL-3.0", commercial=True)
+GPL = Licence("GPL-3.0", commercial=True, terms="copyleft, which what you publish may inherit")
 NO_LICENCE = Licence("no licence file", commercial=None)
 
 
@@ -53,6 +56,9 @@ class Published:
     """Address of the file; None where it has none of its own, as in a folder or an archive."""
     paper: str
     """Authors, venue and year."""
+    backbone: str = ""
+    """Name of the published model whose backbone the file's vocabulary is of; empty where the file
+    is a whole model."""
     note: str = ""
     """What is not certain of these facts, or has to be done by hand."""
 

@@ -119,26 +119,17 @@ class SaladConfig(Aggregator):
 
     def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
         """Require more patches than clusters, where the dustbin's mass is the difference."""
-        if not self.dustbin.takes_difference:
-            return
-        clusters, patches = self.clusters, math.prod(grid)
-        height, width = (patch_size * side for side in grid)
-        side = patch_size * (math.isqrt(clusters) + 1)
-        require(
-            patches > clusters,
-            f"image size: found {height} x {width}, which is {patches} patches for {clusters} "
-            "clusters; expected more patches than clusters (the smallest square that works: "
-            f"{side} x {side})",
-        )
+        if self.dustbin.takes_difference:
+            require_more_patches(self.clusters, grid, patch_size)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Salad:
         """Draw parameters as the public code: torch's default linears, dustbin score 1."""
         token_key, cluster_key, score_key = jax.random.split(key, 3)
         dim = backbone.dim
         return Salad(
-            token_features=_init_two_layer(token_key, dim, self.hidden, self.token_dim),
-            cluster_features=_init_two_layer(cluster_key, dim, self.hidden, self.cluster_dim),
-            score=_init_two_layer(score_key, dim, self.hidden, self.scores),
+            token_features=init_two_layer(token_key, dim, self.hidden, self.token_dim),
+            cluster_features=init_two_layer(cluster_key, dim, self.hidden, self.cluster_dim),
+            score=init_two_layer(score_key, dim, self.hidden, self.scores),
             # Start at 3: `split` may derive the keys above from 0 to 2.
             dust_bin=self.dustbin.init(jax.random.fold_in(key, 3), dim),
             log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
@@ -153,7 +144,7 @@ class SaladConfig(Aggregator):
         Raises:
             InputError: no more patches than clusters.
         """
-        scores = at_least_float32(_two_layer(params.score, patches, self.dropout, key))
+        scores = at_least_float32(two_layer(params.score, patches, self.dropout, key))
         learnt = params.log_epsilon
         return assign_with_dustbin(
             scores,
@@ -179,15 +170,10 @@ class SaladConfig(Aggregator):
             InputError: no more patches than clusters.
         """
         cluster_key, score_key = split_key(key, 2)
-        global_token = _two_layer(params.token_features, features.class_token, 0.0, None)
-        local = _two_layer(params.cluster_features, features.patches, self.dropout, cluster_key)
+        global_token = two_layer(params.token_features, features.class_token, 0.0, None)
+        local = two_layer(params.cluster_features, features.patches, self.dropout, cluster_key)
         result = self.transport(params, features.patches, key=score_key)
-        plan = jnp.exp(result.log_plan[..., : self.clusters])
-        clusters = jnp.einsum("...nm,...nd->...md", plan, local.astype(plan.dtype))
-        statistics = jax.lax.stop_gradient(_statistics(result, self.clusters))
-        return Tokens(
-            l2_normalise(at_least_float32(global_token)), l2_normalise(clusters), statistics
-        )
+        return transported_tokens(global_token, local, result, self.clusters)
 
     def plan(self, params: Salad, features: Features) -> Float[Array, "*batch patch column"]:
         """Return the mass that each patch sends to each cluster and to the dustbin."""
@@ -198,16 +184,58 @@ class SaladConfig(Aggregator):
         return local.T
 
 
-def _init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
+def require_more_patches(clusters: int, grid: tuple[int, int], patch_size: int) -> None:
+    """Check that there are more patches than clusters, as a dustbin of the difference needs.
+
+    Raises:
+        InputError: there are not.
+    """
+    patches = math.prod(grid)
+    height, width = (patch_size * side for side in grid)
+    side = patch_size * (math.isqrt(clusters) + 1)
+    require(
+        patches > clusters,
+        f"image size: found {height} x {width}, which is {patches} patches for {clusters} "
+        "clusters; expected more patches than clusters (the smallest square that works: "
+        f"{side} x {side})",
+    )
+
+
+def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
+    """Draw a network of one hidden layer, each layer as torch's `nn.Linear`."""
     first, second = jax.random.split(key)
     return TwoLayer(init_linear(first, d_in, hidden), init_linear(second, hidden, d_out))
 
 
-def _two_layer(
+def two_layer(
     params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys | None
 ) -> Float[Array, "*batch d_out"]:
+    """Apply the network, with dropout of this rate before the ReLU where there is a key."""
     hidden = dropout(linear(params.fc1, x), rate, key=key)
     return linear(params.fc2, jax.nn.relu(hidden))
+
+
+def transported_tokens(
+    global_token: Float[Array, "*batch token"],
+    local: Float[Array, "*batch patch dim"],
+    result: SinkhornResult,
+    clusters: int,
+) -> Tokens:
+    """Sum patches by the transport's plan to cluster tokens (paper Eq. 6); make all unit vectors.
+
+    Args:
+        global_token: before normalisation.
+        local: features of every patch.
+        result: the transport, whose columns after the first `clusters` are the dustbin's.
+        clusters: number of clusters.
+
+    Returns:
+        The tokens in float32 at least, with the transport's statistics, without a gradient.
+    """
+    plan = jnp.exp(result.log_plan[..., :clusters])
+    sums = jnp.einsum("...nm,...nd->...md", plan, local.astype(plan.dtype))
+    statistics = jax.lax.stop_gradient(_statistics(result, clusters))
+    return Tokens(l2_normalise(at_least_float32(global_token)), l2_normalise(sums), statistics)
 
 
 def _statistics(result: SinkhornResult, clusters: int) -> TransportStatistics:

@@ -64,8 +64,8 @@ class SelaVprConfig(Aggregator):
         first, second = jax.random.split(key)
         return SelaVpr(
             p=jnp.full((), START),
-            upconv1=_init_upconv(first, backbone.dim, self.hidden),
-            upconv2=_init_upconv(second, self.hidden, self.local),
+            upconv1=init_upconv(first, backbone.dim, self.hidden),
+            upconv2=init_upconv(second, self.hidden, self.local),
         )
 
     def apply(
@@ -76,7 +76,8 @@ class SelaVprConfig(Aggregator):
         return Tokens.of_global(mean)
 
 
-def _init_upconv(key: PRNGKeyArray, d_in: int, d_out: int) -> Conv:
+def init_upconv(key: PRNGKeyArray, d_in: int, d_out: int) -> Conv:
+    """Draw a transposed convolution of 3 x 3, weight and bias uniform within 1 / sqrt(9 d_out)."""
     weight_key, bias_key = jax.random.split(key)
     bound = 1 / (3 * math.sqrt(d_out))
     return Conv(

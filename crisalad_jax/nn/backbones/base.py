@@ -20,6 +20,9 @@ class Features(NamedTuple):
     """One vector for each patch, in row order."""
     inserted: Float[Array, "*batch inserted dim"] | None = None
     """One vector for each of `FeatureRequest.inserted`; None without them."""
+    class_attention: Float[Array, "*batch patch"] | None = None
+    """Share of each patch in the class token's attention, summed over the last block's heads, in
+    float32 at least; None where `FeatureRequest.class_attention` does not ask for it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +39,8 @@ class FeatureRequest:
     """Whether tokens go through the last layer norm."""
     class_token: bool = False
     """Whether the class token is used, which not every backbone has."""
+    class_attention: bool = False
+    """Whether the class token's attention in the last block is used."""
     insertion: int | None = None
     """Number of blocks after which the aggregator's own tokens are put in front of all others.
     None where it has none."""
@@ -60,6 +65,8 @@ class Backbone(Part, abc.ABC):
     """Whether its features have a class token."""
     inserts: ClassVar[bool] = False
     """Whether an aggregator's own tokens can run through its blocks."""
+    attends: ClassVar[bool] = False
+    """Whether its features can have the class token's attention."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:

@@ -28,7 +28,7 @@ from crisalad_jax.nn.adapter import (
     init_adapter,
     train_adapter,
 )
-from crisalad_jax.nn.attention import Attention, attention
+from crisalad_jax.nn.attention import Attention, attention, first_token_attention
 from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
     LayerNorm,
@@ -111,6 +111,7 @@ class ViTConfig(Backbone):
     """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
 
     inserts: ClassVar[bool] = True
+    attends: ClassVar[bool] = True
     heads: int = 12
     mlp_ratio: float = 4.0
     ffn: Literal["mlp", "swiglu"] = "mlp"
@@ -277,7 +278,8 @@ def vit(
     Raises:
         InputError: while tracing, levels that are not in order or more than there are blocks,
             several levels of a facet or without the last block, or, of adapters on a path beside
-            the blocks, other tokens than the last block's, or inserted ones.
+            the blocks, other tokens than the last block's, inserted ones, or the class token's
+            attention.
     """
     return train_vit(params, images, config, request, remat=remat, valid=None)[0]
 
@@ -320,9 +322,15 @@ def train_vit(
     )
     tokens = jax.vmap(lambda image: embed(params, image, config))(images)
     grid = grid_of(images[0])
-    blocks, outputs = params.blocks, []
+    blocks, outputs, attended = params.blocks, [], None
     if request.inserted is not None:
         tokens, measured = _with_inserted(
+            params, tokens, grid, config, request, remat=remat, valid=valid
+        )
+        blocks = _as_cut(measured, params.blocks)
+        outputs.append(tokens)
+    elif request.class_attention:
+        tokens, measured, attended = _with_class_attention(
             params, tokens, grid, config, request, remat=remat, valid=valid
         )
         blocks = _as_cut(measured, params.blocks)
@@ -348,7 +356,7 @@ def train_vit(
     joined = patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1)
     inserted = None if request.inserted is None else outputs[-1][:, :front]
     statistics, _ = split_statistics(dataclasses.replace(params, blocks=blocks))
-    return Features(outputs[-1][:, front], joined, inserted), statistics
+    return Features(outputs[-1][:, front], joined, inserted, attended), statistics
 
 
 def _with_inserted(
@@ -375,6 +383,37 @@ def _with_inserted(
     front = jnp.broadcast_to(request.inserted, (len(tokens), *request.inserted.shape))
     tokens, last = run(after, jnp.concatenate([front.astype(tokens.dtype), tokens], axis=1))
     return tokens, first + last
+
+
+def _with_class_attention(
+    params: ViT,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: ViTConfig,
+    request: FeatureRequest,
+    *,
+    remat: str,
+    valid: Bool[Array, " image"] | None,
+) -> tuple[Float[Array, "image token dim"], list[Block], Float[Array, "image patch"]]:
+    """Run all blocks, and return how much of each patch the last one's class token takes.
+
+    The shares are summed over heads. The blocks' own attention does not keep its weights, so that
+    one row of them is computed a second time.
+    """
+    require(
+        config.adapter.kind != "side" and request.levels is None and request.facet == "token",
+        "features: found the class token's attention with levels, a facet or adapters beside the "
+        "blocks, expected none of these",
+    )
+    before, after = _cut_at(params.blocks, (config.depth - 1, config.depth))
+    run = functools.partial(_run_stacks, grid=grid, config=config, remat=remat, valid=valid)
+    tokens, first = run(before, tokens)
+    with jax.named_scope("blocks"):
+        last = jax.tree.map(operator.itemgetter(-1), after[-1])
+        normed = layer_norm(last.norm1, tokens, epsilon=NORM_EPSILON)
+        shares = first_token_attention(last.attn, normed, config.heads).sum(axis=-2)
+    tokens, final = run(after, tokens)
+    return tokens, first + final, shares[:, 1 + config.registers :]
 
 
 def _cut_at(

@@ -1,0 +1,193 @@
+"""Files that are no whole model, at each door that takes one: one line, and nothing written."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.io
+import torch
+
+import crisalad_jax as cj
+from crisalad_jax.checkpoints.layouts import public_shapes
+from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.utils.errors import InputError
+from tests.cli.test_cli import Capture, fails, succeeds
+from tests.random_checkpoints import random_state, save
+
+Tensors = dict[str, torch.Tensor]
+SALAD = ModelConfig(
+    backbone=ViTConfig(
+        dim=64, depth=2, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
+    ),
+    aggregator=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
+    cross_image=CrossImageConfig(layers=0),
+)
+WIDE = dataclasses.replace(SALAD, backbone=dataclasses.replace(SALAD.backbone, dim=128, heads=2))
+
+
+def salad(config: ModelConfig = SALAD) -> Tensors:
+    return random_state(public_shapes(config, "dino-salad"))
+
+
+def cosplace(layers: int = 18) -> Tensors:
+    """Of the true names and shapes; each tensor stores one number."""
+    config = dataclasses.replace(
+        SALAD, backbone=ResNetConfig(layers=layers), aggregator=CosPlaceConfig(dim=3)
+    )
+    return {
+        name: torch.zeros((), dtype=torch.float32 if shape else torch.int64).expand(shape)
+        for name, shape in public_shapes(config, "cosplace").items()
+    }
+
+
+def part(state: Tensors, of: str) -> Tensors:
+    return {name: tensor for name, tensor in state.items() if name.startswith(of)}
+
+
+def wide_backbone() -> Tensors:
+    return salad() | part(salad(WIDE), "backbone.")
+
+
+def resnet_101_with_18s_layer() -> Tensors:
+    return part(cosplace(101), "backbone.") | part(cosplace(18), "aggregation.")
+
+
+def without_a_block() -> Tensors:
+    return {k: x for k, x in cosplace().items() if not k.startswith("backbone.6.1.")}
+
+
+STATES: dict[str, tuple[Callable[[], Tensors], str]] = {
+    "SALAD's head": (
+        lambda: part(salad(), "aggregator."),
+        "found a head without its backbone, expected both in one file, as in DINO-SALAD .ckpt",
+    ),
+    "SALAD's backbone": (
+        lambda: part(salad(), "backbone."),
+        "found no aggregator.score.3.weight, expected it beside the others, as in DINO-SALAD",
+    ),
+    "CosPlace's head": (
+        lambda: part(cosplace(), "aggregation."),
+        "found a head without its backbone, expected both in one file, as in CosPlace and Eigen",
+    ),
+    "CosPlace's backbone": (
+        lambda: part(cosplace(), "backbone."),
+        "found a backbone without its head, expected both in one file, as in CosPlace and Eigen",
+    ),
+    "a head of another width": (
+        wide_backbone,
+        "does not fit the layout dino-salad of width 128 and 2 blocks: "
+        "aggregator.cluster_features.0.weight found (16, 64, 1, 1), expected (16, 128, 1, 1)",
+    ),
+    "a linear layer of another ResNet": (
+        resnet_101_with_18s_layer,
+        "does not fit the layout cosplace of width 2048 and 4 blocks: aggregation.3.weight found "
+        "(3, 512), expected (3, 2048)",
+    ),
+    "a ResNet without a block": (
+        without_a_block,
+        "found a ResNet with (2, 2, 1, 2) blocks of two convolutions, expected one of ResNet-18",
+    ),
+    "another network": (
+        lambda: {"stem.weight": torch.zeros(3)},
+        "found no checkpoint that we know (its first names: stem.weight), expected one of the",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_part_of_a_model_or_one_of_another_size(
+    capfd: Capture, tmp_path: pathlib.Path, name: str
+) -> None:
+    make, words = STATES[name]
+    file = save(tmp_path / "file.pth", make())
+    fails(capfd, "convert", file, tmp_path / "ours.safetensors", words=(f"{file}: {words}",))
+    with pytest.raises(InputError) as caught:
+        cj.load(file)
+    assert str(caught.value).startswith(f"{file}: {words}")
+    assert [path.name for path in tmp_path.iterdir()] == ["file.pth"]
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".ckpt", ".safetensors", ".mat"])
+@pytest.mark.parametrize("kept", [0.0, 0.001, 0.5, 0.99])
+def test_a_file_that_is_cut_short(
+    capfd: Capture, tmp_path: pathlib.Path, suffix: str, kept: float
+) -> None:
+    file = tmp_path / f"file{suffix}"
+    if suffix == ".mat":
+        scipy.io.savemat(file, {"net": {"layers": np.zeros((64, 64))}})
+    else:
+        save(file, salad())
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(kept * len(whole))])
+    words = f"{file}: not a whole "
+    fails(capfd, "convert", file, tmp_path / "ours.safetensors", words=(words,))
+    with pytest.raises(InputError, match=f"^{words}"):
+        cj.load(file)
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+@pytest.mark.parametrize("verb", ["extract", "evaluate", "info"])
+def test_public_files_are_told_from_ours_where_weights_are_asked_for(
+    capfd: Capture, tmp_path: pathlib.Path, verb: str
+) -> None:
+    more = {
+        "extract": ("--images", tmp_path, "--out", tmp_path / "d.npy"),
+        "evaluate": ("--data", tmp_path),
+        "info": (),
+    }[verb]
+    public, old, matlab = (tmp_path / name for name in ("p.ckpt", "o.pth", "m.mat"))
+    save(public, salad())
+    torch.save(salad(), old, _use_new_zipfile_serialization=False)
+    scipy.io.savemat(matlab, {"x": np.zeros(3)})
+    for file, kind in ((public, "a torch file"), (old, "a torch file"), (matlab, "a MATLAB file")):
+        ours = file.with_suffix(".safetensors")
+        advice = f"crisalad convert {file} {ours}\n"
+        error = fails(
+            capfd, verb, "--weights", file, *more, words=(f"{file}: found {kind}, expected a",)
+        )
+        assert error.endswith(advice)
+    hugging = save(tmp_path / "h.safetensors", salad())
+    words = (f"{hugging}: found metadata ['format'], expected", "`crisalad convert` reads public")
+    fails(capfd, verb, "--weights", hugging, *more, words=words)
+
+
+def test_a_preset_beside_weights(capfd: Capture, tmp_path: pathlib.Path) -> None:
+    ours = tmp_path / "ours.safetensors"
+    succeeds(capfd, "convert", save(tmp_path / "p.ckpt", salad()), ours)
+    words = ("--preset: found beside --weights, expected only one of the two",)
+    given = ("--weights", ours, "--preset", "l14")
+    fails(capfd, "info", *given, words=words)
+    fails(capfd, "evaluate", *given, "--data", tmp_path, words=words)
+
+
+def test_training_from_another_size_or_kind(capfd: Capture, tmp_path: pathlib.Path) -> None:
+    ours, public = tmp_path / "ours.safetensors", save(tmp_path / "p.ckpt", salad())
+    succeeds(capfd, "convert", public, ours)
+    train = ("train", "--preset", "tiny", "--data", tmp_path, "--out", tmp_path / "run")
+    fails(
+        capfd,
+        *(*train, "--weights", ours),
+        words=(
+            f"{ours}: these weights are of another model: ",
+            "backbone.dim: found 64, expected 128",
+        ),
+    )
+    resnet = save(tmp_path / "cosplace.pth", cosplace())
+    words = "this backbone is another than the model's: backbone: found resnet, expected vit"
+    with pytest.raises(InputError, match=f"^{resnet}: {words}$"):
+        read_backbone(resnet, SALAD.backbone, None)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_published_name_is_no_file_to_convert(capfd: Capture, tmp_path: pathlib.Path) -> None:
+    words = ("salad: found the name of a published model, expected a file; --weights salad takes",)
+    fails(capfd, "convert", "salad", tmp_path / "x.safetensors", words=words)
