@@ -48,7 +48,7 @@ def _mask_of(bias: np.ndarray) -> np.ndarray:
 
 
 MASKED_BIAS = Form(
-    lambda bias, mask: (np.where(mask == 0, np.zeros_like(bias), bias * mask),),
+    lambda bias, mask: (bias * mask,),
     lambda bias: (bias, _mask_of(bias)),
 )
 QV_BIAS = Form(
