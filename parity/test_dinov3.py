@@ -16,7 +16,7 @@ import torch
 from safetensors.numpy import load_file
 from transformers import DINOv3ViTConfig, DINOv3ViTModel
 
-from crisalad_jax.checkpoints.layouts import infer, to_state
+from crisalad_jax.checkpoints.layouts import infer, to_params, to_state
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
 from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint, write_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
@@ -41,6 +41,9 @@ from parity.test_independent import (
 LAYOUT, REGISTERS = "huggingface-dinov3", 4
 OBLONG = (3, 5)
 GATED = [False, True]
+PERIODS = [1, 1.3359375, 1.78125, 2.375, 3.15625, 4.21875, 5.625, 7.5]
+PERIODS += [10, 13.3125, 17.75, 23.75, 31.625, 42.25, 56.25, 75]
+"""The periods that the public .pth files hold, rounded to bfloat16."""
 
 
 def hugging_face(gated: bool) -> Any:
@@ -102,6 +105,54 @@ def test_names_are_transformers_own(gated: bool, tmp_path: pathlib.Path) -> None
     parameters = dict(model.named_parameters())
     for name, parameter in loaded.named_parameters():
         assert torch.equal(parameter, parameters[name]), name
+
+
+def as_facebooks(state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A state of transformers' under facebookresearch/dinov3's names.
+
+    The names are those that transformers' script of conversion maps from: w1 is SwiGLU's gate, w2
+    its value, and keys have no bias.
+    """
+    words = {
+        "embeddings.patch_embeddings": "patch_embed.proj",
+        "embeddings.": "",
+        "register_tokens": "storage_tokens",
+        "layer.": "blocks.",
+        "attention.o_proj": "attn.proj",
+        "layer_scale1.lambda1": "ls1.gamma",
+        "layer_scale2.lambda1": "ls2.gamma",
+    }
+    gated = any("gate_proj" in name for name in state)
+    up, down = ("w2", "w3") if gated else ("fc1", "fc2")
+    words |= {"gate_proj": "w1", "up_proj": up, "down_proj": down}
+    renamed = {}
+    for name, array in state.items():
+        for old, new in words.items():
+            name = name.replace(old, new)
+        renamed[name] = array
+    renamed["mask_token"] = renamed["mask_token"][0]
+    for i in range(2):
+        here = f"blocks.{i}.attention."
+        bias, rest = (renamed.pop(f"{here}{each}_proj.bias") for each in "qv")
+        weights = [renamed.pop(f"{here}{each}_proj.weight") for each in "qkv"]
+        there = f"blocks.{i}.attn.qkv"
+        renamed[f"{there}.weight"] = np.concatenate(weights)
+        renamed[f"{there}.bias"] = np.concatenate([bias, np.zeros_like(bias), rest])
+        renamed[f"{there}.bias_mask"] = np.repeat(np.float32([1, 0, 1]), len(bias))
+    return renamed | {"rope_embed.periods": np.float32(PERIODS)}
+
+
+@pytest.mark.parametrize("gated", GATED)
+def test_names_are_facebooks_too(gated: bool, tmp_path: pathlib.Path) -> None:
+    path = saved(hugging_face(gated), tmp_path)
+    expected = read_checkpoint(path)
+    state = as_facebooks(load_file(path))
+    layout, config = infer(state, source="file")
+    assert (layout, config) == ("dinov3", expected.config)
+    params, extras = to_params(state, config, layout, source="file")
+    jax.tree.map(np.testing.assert_array_equal, params, expected.params)
+    for name, array in to_state(params, config, layout, extras).items():
+        np.testing.assert_array_equal(array, state[name])
 
 
 @pytest.mark.parametrize(("gated", "grid"), [(False, OBLONG), (True, (4, 4))])
@@ -201,15 +252,12 @@ def test_all_published_sizes_are_there() -> None:
     assert {name for name in PUBLISHED if name.startswith("dinov3-")} == SIZES.keys()
 
 
-def test_periods_are_the_published_ones(tmp_path: pathlib.Path) -> None:
-    """Those of the public .pth files, which come back as they are; others are refused."""
-    public = [1, 1.3359375, 1.78125, 2.375, 3.15625, 4.21875, 5.625, 7.5]
-    public += [10, 13.3125, 17.75, 23.75, 31.625, 42.25, 56.25, 75]
+def test_a_file_of_facebooks_is_the_same_bytes(tmp_path: pathlib.Path) -> None:
+    """There and back; one that is written of transformers' has the published periods."""
     found = read_checkpoint(saved(hugging_face(gated=False), tmp_path))
     path = tmp_path / "meta.pth"
     write_checkpoint(path, found.params, found.config, "dinov3", found.extras)
-    state = torch.load(path)
-    assert state["rope_embed.periods"].tolist() == public
+    assert torch.load(path)["rope_embed.periods"].tolist() == PERIODS
     convert(path, tmp_path / "ours.safetensors")
     convert(tmp_path / "ours.safetensors", tmp_path / "back.pth")
     assert (tmp_path / "back.pth").read_bytes() == path.read_bytes()
