@@ -422,8 +422,8 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
         The backbone's parameters.
 
     Raises:
-        InputError: what `read_checkpoint` raises, or the backbone is of another size (all fields
-            that differ are listed).
+        InputError: what `read_checkpoint` raises, or the backbone is another, or of another size
+            (all fields that differ are listed).
 
     Example:
         >>> import jax
@@ -438,6 +438,10 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     """
     checkpoint = read_checkpoint(path)
     theirs = checkpoint.config.backbone
+    if type(theirs) is not type(config):
+        raise InputError(
+            f"{path}: found a backbone {theirs.part_name}, expected {config.part_name}"
+        )
     if isinstance(theirs, VisionTransformer) and isinstance(config, VisionTransformer):
         theirs = dataclasses.replace(theirs, adapter=config.adapter)
     params = checkpoint.params.backbone
