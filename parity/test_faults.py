@@ -160,7 +160,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "epsilon of the backbone's norms": (
         "block, no adapter",
         FORWARD,
-        replace(VIT, "NORM_EPSILON", lambda _: 1e-5),
+        replace(VIT.ViTConfig, "norm_epsilon", lambda _: 1e-5),
     ),
     "epsilon of the encoder's norms": (
         "cross-image encoder",

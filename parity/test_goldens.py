@@ -30,7 +30,6 @@ from crisalad_jax.nn.backbones.vit import (
     NORM_EPSILON,
     ViTConfig,
     embed,
-    grid_of,
     run_blocks,
 )
 from crisalad_jax.nn.config import ModelConfig
@@ -154,7 +153,7 @@ def test_vit(name: str, registers: int) -> None:
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         images = inputs["image"].transpose(0, 2, 3, 1)
         tokens = jax.vmap(lambda image: embed(params, image, config))(images)
-        tokens = run_blocks(params, tokens, grid_of(images[0]), config)
+        tokens = run_blocks(params, tokens, config.grid(images.shape[1:3]), config)
         normed = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
         outputs = {
             "x_norm_clstoken": normed[:, 0],

@@ -34,7 +34,7 @@ from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
-from crisalad_jax.nn.backbones.vit import ViT, ViTConfig
+from crisalad_jax.nn.backbones.vit import VisionTransformer, ViT
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.utils.errors import InputError
@@ -472,7 +472,11 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     """
     checkpoint = read_checkpoint(path)
     theirs = checkpoint.config.backbone
-    if isinstance(theirs, ViTConfig) and isinstance(config, ViTConfig):
+    if type(theirs) is not type(config):
+        raise InputError(
+            f"{path}: found a backbone {theirs.part_name}, expected {config.part_name}"
+        )
+    if isinstance(theirs, VisionTransformer) and isinstance(config, VisionTransformer):
         theirs = dataclasses.replace(theirs, adapter=config.adapter)
     params = checkpoint.params.backbone
     if isinstance(theirs, ResNetConfig) and isinstance(config, ResNetConfig):

@@ -33,7 +33,7 @@ class ComparisonFlags:
     epochs: int | None = None
     """By default the recipes'; from nothing 6."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size (14); by default the preset's, or a file's."""
+    """Height and width, multiples of the patch size; by default the preset's, or a file's."""
     resize: tuple[str, ...] = ()
     """Words in place of every model's way: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""

@@ -42,7 +42,7 @@ class Evaluate:
     preset: str | None = None
     """Model to start untrained where there are no weights, by default b14."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size (14); by default the model's."""
+    """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""

@@ -21,7 +21,7 @@ class Extract:
     out: pathlib.Path
     """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size (14); by default the model's."""
+    """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""

@@ -30,7 +30,7 @@ class Index:
     dtype: Literal["float32", "float16"] | None = None
     """What files keep descriptors as, by default the map's, and in a new map float32."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size (14); by default the map's, and of a new map
+    """Height and width, multiples of the patch size; by default the map's, and of a new map
     the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,

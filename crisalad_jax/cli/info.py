@@ -38,7 +38,7 @@ class Info:
     verify: bool = False
     """Read all of the map's descriptors, and compare them with their digests."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size (14); by default the model's."""
+    """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""

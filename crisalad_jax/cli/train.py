@@ -49,7 +49,7 @@ class Train:
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of 14; replaces --model.image-size after all other flags."""
+    """Height and width, multiples of the patch size; replaces --model.image-size."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or skip it (masked out of attention and loss, and counted)."""
     coordinator_address: str | None = None
@@ -90,7 +90,12 @@ def parse(program: str, arguments: Sequence[str]) -> Train:
     made = dataclasses.make_dataclass("Train", fields, frozen=True, bases=(Train,))
     made.__doc__ = Train.__doc__
     parsed: Any = tyro.cli(made, prog=program, args=arguments)
-    return dataclasses.replace(parsed, settings=config_of(flags, parsed.settings))
+    given = parsed.settings
+    if parsed.image_size is not None:
+        # Before the checks: the preset's own size may not fit another backbone.
+        model = dataclasses.replace(given.model, image_size=parsed.image_size)
+        given = dataclasses.replace(given, model=model)
+    return dataclasses.replace(parsed, settings=config_of(flags, given))
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
@@ -123,9 +128,6 @@ def run(arguments: Train) -> None:
         )
     console.quiet = not distributed.is_primary()
     config: TrainConfig = arguments.settings
-    if arguments.image_size is not None:
-        model = dataclasses.replace(config.model, image_size=arguments.image_size)
-        config = dataclasses.replace(config, model=model)
     result = train(
         config,
         arguments.data,

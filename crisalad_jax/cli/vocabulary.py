@@ -51,7 +51,7 @@ class Vocabulary:
     assignment: str | None = None
     """What AnyLoc's nearest word of a patch is nearest by: cosine (as published) or euclidean."""
     image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size (14); by default the model's."""
+    """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""

@@ -3,15 +3,17 @@
 On a GPU it uses cuDNN's fused attention in bfloat16, without mask and dropout.
 """
 
+import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.nn.layers import Linear, dropout, init_linear, linear
+from crisalad_jax.nn.layers import Linear, at_least_float32, dropout, init_linear, linear
 from crisalad_jax.utils.compiler import has_fused_attention
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -22,6 +24,13 @@ class Attention:
 
     qkv: Linear
     proj: Linear
+
+
+class Rotation(NamedTuple):
+    """The angles of a sequence's last tokens, one for each pair of numbers of a head."""
+
+    cosines: Float[np.ndarray, "patch pair"]
+    sines: Float[np.ndarray, "patch pair"]
 
 
 def init_torch_attention(qkv_key: PRNGKeyArray, proj_key: PRNGKeyArray, dim: int) -> Attention:
@@ -38,13 +47,15 @@ def attention(
     heads: int,
     *,
     mask: Bool[Array, "token token"] | None = None,
+    rotation: Rotation | None = None,
     dropout_rate: float = 0.0,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "*batch token dim"]:
     """Apply scaled dot-product self-attention (Vaswani et al. 2017) to a sequence or a batch.
 
     `mask[i, j]` allows token i to attend to token j; a row must allow at least one. Scores and
-    softmax are float32 for every type of `x`. `dropout_rate` applies to the attention weights.
+    softmax are float32 for every type of `x`. `rotation` turns queries and keys by their tokens'
+    angles. `dropout_rate` applies to the attention weights.
     """
     *batch, tokens, dim = x.shape
     dropout_mask = None
@@ -54,6 +65,8 @@ def attention(
     qkv = checkpoint_name(linear(params.qkv, x), "qkv")
     qkv = qkv.reshape(*batch, tokens, 3 * heads, dim // heads)
     queries, keys, values = jnp.split(qkv, 3, axis=-2)
+    if rotation is not None:
+        queries, keys = rotate(queries, rotation), rotate(keys, rotation)
     fits = (
         x.dtype == jnp.bfloat16 and dim // heads % 8 == 0 and mask is None and dropout_mask is None
     )
@@ -73,6 +86,34 @@ def attention(
         dropout_mask,
     )
     return linear(params.proj, jnp.moveaxis(mixed, -1, -3).reshape(x.shape))
+
+
+def rotate(
+    x: Float[Array, "*batch token head dim"], rotation: Rotation
+) -> Float[Array, "*batch token head dim"]:
+    """Turn queries or keys by their tokens' angles (RoPE: Su et al. 2021), in float32.
+
+    Numbers i and i + dim / 2 of a head are a pair. Tokens before those with angles stay as they
+    are, to the bit.
+    """
+    wide = at_least_float32(x)
+    front = ((x.shape[-3] - len(rotation.cosines), 0), (0, 0))
+    cosines, sines = (
+        jnp.asarray(np.pad(part, front, constant_values=still)[:, None], wide.dtype)
+        for part, still in zip(rotation, (1, 0), strict=True)
+    )
+    first, second = jnp.split(wide, 2, axis=-1)
+    turned = first * cosines - second * sines, second * cosines + first * sines
+    return jnp.concatenate(turned, axis=-1).astype(x.dtype)
+
+
+def without_key_bias(params: Attention) -> Attention:
+    """Return the parameters with the keys' bias 0, which then has no gradient."""
+    bias = params.qkv.bias
+    assert bias is not None
+    queries, keys, values = jnp.split(bias, 3, axis=-1)
+    bias = jnp.concatenate([queries, jnp.zeros_like(keys), values], axis=-1)
+    return dataclasses.replace(params, qkv=dataclasses.replace(params.qkv, bias=bias))
 
 
 def cross_attention(
@@ -99,22 +140,26 @@ def cross_attention(
 
 
 def first_token_attention(
-    params: Attention, x: Float[Array, "*batch token dim"], heads: int
+    params: Attention,
+    x: Float[Array, "*batch token dim"],
+    heads: int,
+    *,
+    rotation: Rotation | None = None,
 ) -> Float[Array, "*batch head token"]:
     """Compute how much of each token the first token's `attention` takes, in float32 at least.
 
-    A head's shares sum to 1.
+    A head's shares sum to 1. `rotation` turns keys; the first token has no angle.
     """
     *batch, tokens, dim = x.shape
     weight, bias = params.qkv.weight[:, : 2 * dim], params.qkv.bias
     assert bias is not None
     query = linear(Linear(weight[:, :dim], bias[:dim]), x[..., 0, :]) / math.sqrt(dim // heads)
     keys = linear(Linear(weight[:, dim:], bias[dim : 2 * dim]), x)
-    scores = _product(
-        "...hd,...jhd->...hj",
-        query.reshape(*batch, heads, dim // heads),
-        keys.reshape(*batch, tokens, heads, dim // heads),
-    )
+    keys = keys.reshape(*batch, tokens, heads, dim // heads)
+    if rotation is not None:
+        keys = rotate(keys, rotation)
+    query = query.reshape(*batch, heads, dim // heads)
+    scores = _product("...hd,...jhd->...hj", query, keys)
     return jax.nn.softmax(scores, axis=-1)
 
 

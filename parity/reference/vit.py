@@ -7,12 +7,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.nn.backbones.vit import PATCH_SIZE, ViTConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from parity.reference.adapter import make_adapter
 from parity.reference.attention import Attention
 from parity.reference.layers import Conv2d, LayerNorm, Linear
 
 NORM_EPSILON = 1e-6
+PATCH_SIZE = ViTConfig.patch_size
 
 
 class Features(NamedTuple):

@@ -23,6 +23,7 @@ from crisalad_jax.checkpoints.torch_io import (
 )
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -359,6 +360,12 @@ def test_a_backbone_of_other_heads_is_refused(tmp_path: pathlib.Path) -> None:
     config, start = fresh("depthwise", heads=2)
     with pytest.raises(InputError, match=r"model.s: backbone.heads: found 1, expected 2$"):
         read_backbone(written(tmp_path, "dinov2"), config.backbone, start)
+
+
+def test_another_backbone_is_told_by_its_name(tmp_path: pathlib.Path) -> None:
+    config = DinoV3Config(dim=64, depth=2, heads=1)
+    with pytest.raises(InputError, match=r"public\.pth: found a backbone vit, expected dinov3$"):
+        read_backbone(written(tmp_path, "dinov2"), config, None)
 
 
 def test_a_backbone_of_another_size_is_refused(tmp_path: pathlib.Path) -> None:

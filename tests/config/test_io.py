@@ -161,7 +161,7 @@ def test_a_configuration_without_a_checksum_is_read_with_a_note(tmp_path: pathli
     [
         (
             {"model": {"backbone": "x"}},
-            "backbone: found 'x', expected one of resnet, ",
+            "backbone: found 'x', expected one of dinov3, ",
             "model.backbone",
         ),
         (

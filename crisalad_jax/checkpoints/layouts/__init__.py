@@ -1,8 +1,8 @@
 """Layouts of public torch checkpoints, a module for each family, to name and infer models.
 
-Key names and shapes are those of facebookresearch/dinov2, Hugging Face's Dinov2Model (with and
-without registers), serizba/salad, Lu-Feng/CricaVPR and others, and of the torch reference in
-`parity/`, which can hold any model of this package.
+Key names and shapes are those of facebookresearch/dinov2 and dinov3, Hugging Face's Dinov2Model
+(with and without registers) and DINOv3ViTModel, serizba/salad, Lu-Feng/CricaVPR and others, and of
+the torch reference in `parity/`, which can hold any model of this package over DINOv2 or a CNN.
 """
 
 import importlib

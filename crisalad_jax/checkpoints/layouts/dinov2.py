@@ -1,6 +1,7 @@
 """The layout of facebookresearch/dinov2, whose names most checkpoints of this field keep."""
 
 import dataclasses
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,11 +25,12 @@ from crisalad_jax.checkpoints.layouts.forms import (
 )
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
-from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.backbones.vit import VisionTransformer, ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 
+_V = TypeVar("_V", bound=VisionTransformer)
 HEAD_WIDTH = 64
 """Width of an attention head in every DINOv2; no shape shows the number of heads."""
 
@@ -63,14 +65,17 @@ def parts_in_words(config: ModelConfig) -> str:
     encoder = "an" if config.cross_image.layers else "no"
     projection = ", a projection" if config.projection.dim else ""
     words = f"aggregator {config.aggregator.part_name}"
-    if isinstance(backbone, ViTConfig):
-        return f"{words}, adapter {backbone.adapter.kind}, {encoder} encoder{projection}"
-    return f"{words}, backbone {backbone.part_name}, {encoder} encoder{projection}"
+    if not isinstance(backbone, ViTConfig):
+        words += f", backbone {backbone.part_name}"
+    if isinstance(backbone, VisionTransformer):
+        words += f", adapter {backbone.adapter.kind}"
+    return f"{words}, {encoder} encoder{projection}"
 
 
 def has_vit(state: State, prefix: str) -> bool:
-    """Return whether there is a vision transformer under a prefix."""
-    return f"{prefix}cls_token" in state or f"{prefix}pos_embed" in state
+    """Return whether there is a vision transformer under a prefix, which is not DINOv3's."""
+    found = f"{prefix}cls_token" in state or f"{prefix}pos_embed" in state
+    return found and f"{prefix}storage_tokens" not in state
 
 
 def vit_of(config: ModelConfig) -> ViTConfig:
@@ -197,26 +202,44 @@ def backbone_config(
     grid = side(positions - 1)
     if grid**2 != positions - 1 or not grid:
         raise InputError(f"found {positions} position embeddings, expected 1 and a square number")
-    if dim % HEAD_WIDTH:
+    config = ViTConfig(
+        dim=dim,
+        depth=depth,
+        heads=count_heads(dim),
+        ffn="swiglu" if gated else "mlp",
+        registers=registers,
+        position_grid=grid,
+        adapter=adapter,
+    )
+    return with_hidden(config, hidden)
+
+
+def count_heads(dim: int, width: int = HEAD_WIDTH) -> int:
+    """Return the number of attention heads, by the width of one.
+
+    Raises:
+        InputError: the backbone's width is no multiple of it.
+    """
+    if dim % width:
         raise InputError(
-            f"found a backbone of width {dim}, expected a multiple of {HEAD_WIDTH}: "
+            f"found a backbone of width {dim}, expected a multiple of {width}: "
             "DINOv2's heads have that width, and no shape tells another"
         )
-    # The configuration knows the ratio: of SwiGLU's two thirds, 4 where they are DINOv2's.
-    ratios = (4.0, 1.5 * hidden / dim) if gated else (hidden / dim,)
-    for ratio in ratios:
-        config = ViTConfig(
-            dim=dim,
-            depth=depth,
-            heads=dim // HEAD_WIDTH,
-            mlp_ratio=ratio,
-            ffn="swiglu" if gated else "mlp",
-            registers=registers,
-            position_grid=grid,
-            adapter=adapter,
-        )
-        if config.hidden == hidden:
-            return config
+    return dim // width
+
+
+def with_hidden(config: _V, hidden: int) -> _V:
+    """Return a configuration with the ratio that gives a hidden width of the feed-forward network.
+
+    Raises:
+        InputError: none does.
+    """
+    gated, ratio = config.ffn == "swiglu", hidden / config.dim
+    # Of SwiGLU's two thirds, the ratio is 4 where they are DINOv2's.
+    for each in (4.0, 1.5 * ratio) if gated else (ratio,):
+        found = dataclasses.replace(config, mlp_ratio=each)
+        if found.hidden == hidden:
+            return found
     raise InputError(f"found a feed-forward width of {hidden}, expected a multiple of 8 for SwiGLU")
 
 

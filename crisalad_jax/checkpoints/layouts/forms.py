@@ -5,7 +5,7 @@ round trip gives the same bits.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,9 @@ class Entry(NamedTuple):
     form: Form
 
 
+SAME = Form(lambda x: (x,), lambda x: (x,))
+
+
 class Extra(NamedTuple):
     """An array of theirs that no model of ours uses, stored so that a round trip is exact."""
 
@@ -33,6 +36,14 @@ class Extra(NamedTuple):
     theirs: str
     shape: tuple[int, ...]
     dtype: type
+    value: float | tuple[float, ...] = 0.0
+    """Its initial value, for a model that was not read from such a file."""
+    form: Form = SAME
+
+    def stored(self, extras: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the array as their files have it; an initial value takes no memory."""
+        initial = np.broadcast_to(np.asarray(self.value, self.dtype), self.shape)
+        return self.form.theirs(extras.get(self.name, initial))[0]
 
 
 class Absent(NamedTuple):
@@ -42,7 +53,6 @@ class Absent(NamedTuple):
     value: float
 
 
-SAME = Form(lambda x: (x,), lambda x: (x,))
 LINEAR = Form(lambda w: (w.T,), lambda w: (w.T,))
 FIRST = Form(lambda x: (x[0],), lambda x: (x[None],))
 CLASS_TOKEN = Form(lambda x: (x[0, 0],), lambda x: (x[None, None],))
@@ -69,6 +79,8 @@ POSITIONS = Form(
     lambda first, grid: (np.concatenate([first[None], grid.reshape(-1, grid.shape[-1])])[None],),
 )
 QKV = Form(lambda q, k, v: (np.concatenate([q, k, v]).T,), lambda w: tuple(np.split(w.T, 3)))
+PAIR = Form(lambda a, b: (np.concatenate([a, b]).T,), lambda w: tuple(np.split(w.T, 2)))
+PAIR_BIAS = Form(lambda a, b: (np.concatenate([a, b]),), lambda b: tuple(np.split(b, 2)))
 QKV_BIAS = Form(lambda q, k, v: (np.concatenate([q, k, v]),), lambda b: tuple(np.split(b, 3)))
 
 

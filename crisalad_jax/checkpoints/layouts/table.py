@@ -15,7 +15,7 @@ from crisalad_jax.config.checks import choose
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
@@ -111,7 +111,7 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
         return
     shapes = public_shapes(config, layout)
     blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
-    blank |= {line.theirs: array for line, array in given}
+    blank |= {line.theirs: line.stored(extras or {}) for line in lines}
     _, read_back = infer(blank, source=f"layout {layout}")
     wrong = differences(_told(with_free_fields_of(config, read_back)), _told(config))
     if wrong:
@@ -126,7 +126,7 @@ def _told(config: ModelConfig) -> ModelConfig:
     encoder = config.cross_image if config.cross_image.layers else CrossImageConfig(layers=0)
     config = dataclasses.replace(config, cross_image=encoder)
     backbone = config.backbone
-    if not isinstance(backbone, ViTConfig):
+    if not isinstance(backbone, VisionTransformer):
         return config
     adapter = backbone.adapter
     if adapter.kind == "none":
@@ -151,7 +151,7 @@ def public_shapes(config: ModelConfig, layout: str) -> dict[str, tuple[int, ...]
     shapes: dict[str, tuple[int, ...]] = {}
     for line in table(config, layout):
         if isinstance(line, Extra):
-            shapes[line.theirs] = line.shape
+            shapes[line.theirs] = line.stored({}).shape
         elif isinstance(line, Entry):
             # Broadcast arrays have shapes without memory of their own.
             blanks = (np.broadcast_to(np.float32(0), wanted[name].shape) for name in line.ours)
@@ -166,7 +166,7 @@ def to_params(
     """Convert arrays by public name to (parameters, extras), as numpy arrays of the same types.
 
     The extras are arrays of public checkpoints that no descriptor needs: DINOv2's mask token, and
-    the batch norms' counts of batches.
+    the batch norms' counts of batches, DINOv3's periods.
 
     Raises:
         InputError: naming `source` and every name that is missing, unknown or misshaped.
@@ -189,7 +189,7 @@ def to_params(
     extras: dict[str, np.ndarray] = {}
     for line in table(config, layout):
         if isinstance(line, Extra):
-            extras[line.name] = state[line.theirs]
+            (extras[line.name],) = line.form.ours(state[line.theirs])
         elif isinstance(line, Absent):
             shape = template[line.ours].shape
             ours[line.ours] = np.full(shape, line.value, np.float32)
@@ -202,7 +202,7 @@ def to_params(
 def to_state(
     params: Crisalad, config: ModelConfig, layout: str, extras: State
 ) -> dict[str, np.ndarray]:
-    """Undo `to_params`, in the public order; missing extras are 0, their initial value.
+    """Undo `to_params`, in the public order; missing extras have their initial values.
 
     Raises:
         InputError: the layout has no place for a part of this model.
@@ -211,12 +211,11 @@ def to_state(
     state: dict[str, np.ndarray] = {}
     for line in table(config, layout):
         if isinstance(line, Extra):
-            state[line.theirs] = extras.get(line.name, np.zeros(line.shape, line.dtype))
+            state[line.theirs] = line.stored(extras)
         elif isinstance(line, Entry):
             arrays = line.form.theirs(*(np.asarray(ours[name]) for name in line.ours))
-            for name, array in zip(line.theirs, arrays, strict=True):
-                state[name] = np.ascontiguousarray(array).reshape(array.shape)
-    return state
+            state |= zip(line.theirs, arrays, strict=True)
+    return {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in state.items()}
 
 
 _STACK = re.compile(r"backbone\.blocks\.(?!\d)")

@@ -1,8 +1,10 @@
 """DINOv2's vision transformer ViT/14 (Oquab et al. 2023; registers: Darcet et al. 2024).
 
 Written from the papers and the behaviour of facebookresearch/dinov2, whose golden outputs it meets.
+The blocks are DINOv3's too, whose other parts are in `dinov3.py`.
 """
 
+import abc
 import dataclasses
 import functools
 import itertools
@@ -15,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import choose, require, require_positive
 from crisalad_jax.config.fields import free_field
@@ -28,7 +30,12 @@ from crisalad_jax.nn.adapter import (
     init_adapter,
     train_adapter,
 )
-from crisalad_jax.nn.attention import Attention, attention, first_token_attention
+from crisalad_jax.nn.attention import (
+    Attention,
+    Rotation,
+    attention,
+    first_token_attention,
+)
 from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
     LayerNorm,
@@ -44,7 +51,6 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 NORM_EPSILON = 1e-6
-PATCH_SIZE = Backbone.patch_size
 _PRODUCTS = ("qkv", "attended", "hidden", "down", "mixed")
 """Results of a block's large products and the tokens between its halves, by their names."""
 _POLICIES = {
@@ -88,15 +94,16 @@ class ViT:
     """The backbone. In `blocks` every leaf has a leading depth axis.
 
     A tuple of such stacks runs in sequence. Training uses it to exclude frozen blocks from the
-    gradient where only the last ones train.
+    gradient where only the last ones train. Rotary positions have no parameters: `pos_embed_cls`
+    and `pos_embed` are None.
     """
 
     patch_embed: Linear
     """Linear layer whose weight's rows are a patch's pixels in (row, column, channel) order."""
     cls_token: Float[Array, " dim"]
     register_tokens: Float[Array, "register dim"]
-    pos_embed_cls: Float[Array, " dim"]
-    pos_embed: Float[Array, "grid grid dim"]
+    pos_embed_cls: Float[Array, " dim"] | None
+    pos_embed: Float[Array, "grid grid dim"] | None
     blocks: Block | tuple[Block, ...]
     norm: LayerNorm
 
@@ -105,45 +112,38 @@ Carry = Float[Array, "image token dim"] | tuple[Array, Array]
 """Tokens that run through the blocks, with those on the path of side adapters if there is one."""
 
 
-@BACKBONES.register("vit")
 @dataclasses.dataclass(frozen=True)
-class ViTConfig(Backbone):
-    """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
+class VisionTransformer(Backbone):
+    """What DINOv2's and DINOv3's transformers share: all but positions, and how a block attends."""
 
     inserts: ClassVar[bool] = True
     attends: ClassVar[bool] = True
+    norm_epsilon: ClassVar[float] = NORM_EPSILON
+    """Added to the variance in every layer norm."""
+    token_deviation: ClassVar[float] = 1e-6
+    """Standard deviation of an untrained class token and registers."""
     heads: int = 12
     mlp_ratio: float = 4.0
     ffn: Literal["mlp", "swiglu"] = "mlp"
     registers: int = 0
-    position_grid: int = 37
-    """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
-    position_resize: Literal["dinov2", "plain"] = "dinov2"
-    """Resizing of that grid to an image's: as DINOv2's models do, which antialias where there are
-    registers; or plain, never antialiased."""
-    position_init: Literal["random", "sincos"] = free_field("random")
-    """Initialisation of the position embeddings where no weights are loaded."""
     layer_scale_init: float = free_field(1.0)
     adapter: AdapterConfig = AdapterConfig()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "dim", "depth", "heads", "mlp_ratio", "position_grid")
+        name = type(self).__name__
+        require_positive(self, "dim", "depth", "heads", "mlp_ratio")
         require(
             self.registers >= 0,
-            f"ViTConfig.registers: found {self.registers}, expected at least 0",
+            f"{name}.registers: found {self.registers}, expected at least 0",
         )
         require(
             self.dim % self.heads == 0,
-            f"ViTConfig.dim: found {self.dim}, expected a multiple of the {self.heads} heads",
-        )
-        require(
-            self.position_init != "sincos" or self.dim % 4 == 0,
-            f"ViTConfig.dim: found {self.dim}, expected a multiple of 4 for a sin-cos start",
+            f"{name}.dim: found {self.dim}, expected a multiple of the {self.heads} heads",
         )
         require(
             self.hidden >= 1,
-            f"ViTConfig.mlp_ratio: found {self.mlp_ratio}, expected a hidden width of at least 1",
+            f"{name}.mlp_ratio: found {self.mlp_ratio}, expected a hidden width of at least 1",
         )
         self.adapter.width(self.dim)
 
@@ -163,8 +163,28 @@ class ViTConfig(Backbone):
         """Registers and the kind of adapter."""
         return f", {self.registers} registers, adapter {self.adapter.kind}"
 
+    @abc.abstractmethod
+    def init_positions(
+        self, key: PRNGKeyArray
+    ) -> tuple[Float[Array, " dim"] | None, Float[Array, "grid grid dim"] | None]:
+        """Draw `ViT.pos_embed_cls` and `ViT.pos_embed`."""
+
+    @abc.abstractmethod
+    def add_positions(
+        self, params: ViT, patches: Float[Array, "patch dim"], grid: tuple[int, int]
+    ) -> tuple[Float[Array, " dim"], Float[Array, "patch dim"]]:
+        """Return the class token and the embedded patches, with their positions added if any."""
+
+    def rotation(self, grid: tuple[int, int]) -> Rotation | None:
+        """Return the patches' angles, by which every block rotates queries and keys; or None."""
+        return None
+
+    def attention_of(self, layer: Block) -> Attention:
+        """Return the parameters that a block attends by."""
+        return layer.attn
+
     def init(self, key: PRNGKeyArray) -> ViT:
-        """Draw parameters as DINOv2 does before training."""
+        """Draw parameters as published before training: linears of deviation 0.02, biases 0."""
         return init_vit(key, self)
 
     def apply(
@@ -175,7 +195,7 @@ class ViTConfig(Backbone):
         *,
         remat: str,
     ) -> Features:
-        """Return the features of normalised images whose sides are multiples of 14."""
+        """Return the features of normalised images whose sides are multiples of a patch's."""
         return vit(params, images, self, request, remat=remat)
 
     def apply_training(
@@ -205,25 +225,66 @@ class ViTConfig(Backbone):
         return dataclasses.replace(params, blocks=stack)
 
 
+@BACKBONES.register("vit")
+@dataclasses.dataclass(frozen=True)
+class ViTConfig(VisionTransformer):
+    """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
+
+    position_grid: int = 37
+    """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
+    position_resize: Literal["dinov2", "plain"] = "dinov2"
+    """Resizing of that grid to an image's: as DINOv2's models do, which antialias where there are
+    registers; or plain, never antialiased."""
+    position_init: Literal["random", "sincos"] = free_field("random")
+    """Initialisation of the position embeddings where no weights are loaded."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        require_positive(self, "position_grid")
+        require(
+            self.position_init != "sincos" or self.dim % 4 == 0,
+            f"ViTConfig.dim: found {self.dim}, expected a multiple of 4 for a sin-cos start",
+        )
+
+    def init_positions(
+        self, key: PRNGKeyArray
+    ) -> tuple[Float[Array, " dim"], Float[Array, "grid grid dim"]]:
+        """Draw the patches' positions, or make sine-cosine codes; the class token's are 0."""
+        side = self.position_grid
+        if self.position_init == "sincos":
+            positions = jnp.asarray(_sincos_positions(side, self.dim), jnp.float32)
+        else:
+            positions = 0.02 * jax.random.normal(key, (side, side, self.dim))
+        return jnp.zeros(self.dim), positions
+
+    def add_positions(
+        self, params: ViT, patches: Float[Array, "patch dim"], grid: tuple[int, int]
+    ) -> tuple[Float[Array, " dim"], Float[Array, "patch dim"]]:
+        """Add the class token's position to it, and the resized grid of positions to patches."""
+        assert params.pos_embed_cls is not None
+        assert params.pos_embed is not None
+        positions = interpolate_positions(params.pos_embed, grid, self)
+        class_token = params.cls_token + params.pos_embed_cls
+        return class_token, at_least_float32(patches) + positions.reshape(len(patches), -1)
+
+
 def _one_stack(params: ViT) -> Block:
     assert isinstance(params.blocks, Block)  # only training cuts the stack
     return params.blocks
 
 
-def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
-    """Draw parameters as DINOv2 does: linears normal of deviation 0.02, biases 0."""
+def init_vit(key: PRNGKeyArray, config: VisionTransformer) -> ViT:
+    """Draw parameters as published before training: linears normal of deviation 0.02, biases 0."""
     patch_key, class_key, register_key, position_key, block_key = jax.random.split(key, 5)
-    dim, side = config.dim, config.position_grid
-    if config.position_init == "sincos":
-        positions = jnp.asarray(_sincos_positions(side, dim), jnp.float32)
-    else:
-        positions = 0.02 * jax.random.normal(position_key, (side, side, dim))
+    dim, deviation = config.dim, config.token_deviation
+    pos_embed_cls, pos_embed = config.init_positions(position_key)
     return ViT(
-        patch_embed=init_small_linear(patch_key, 3 * PATCH_SIZE**2, dim),
-        cls_token=1e-6 * jax.random.normal(class_key, (dim,)),
-        register_tokens=1e-6 * jax.random.normal(register_key, (config.registers, dim)),
-        pos_embed_cls=jnp.zeros(dim),
-        pos_embed=positions,
+        patch_embed=init_small_linear(patch_key, 3 * config.patch_size**2, dim),
+        cls_token=deviation * jax.random.normal(class_key, (dim,)),
+        register_tokens=deviation * jax.random.normal(register_key, (config.registers, dim)),
+        pos_embed_cls=pos_embed_cls,
+        pos_embed=pos_embed,
         blocks=jax.vmap(functools.partial(_init_block, config=config))(
             jax.random.split(block_key, config.depth)
         ),
@@ -231,7 +292,7 @@ def init_vit(key: PRNGKeyArray, config: ViTConfig) -> ViT:
     )
 
 
-def _init_block(key: PRNGKeyArray, config: ViTConfig) -> Block:
+def _init_block(key: PRNGKeyArray, config: VisionTransformer) -> Block:
     qkv, proj, first, second, adapter_key = jax.random.split(key, 5)
     dim, hidden = config.dim, config.hidden
     if config.ffn == "swiglu":
@@ -264,12 +325,12 @@ def _sincos_positions(side: int, dim: int) -> np.ndarray:
 def vit(
     params: ViT,
     images: Float[Array, "image height width 3"],
-    config: ViTConfig,
+    config: VisionTransformer,
     request: FeatureRequest = FeatureRequest(),
     *,
     remat: str = "dots",
 ) -> Features:
-    """Compute features of a batch of normalised images whose sides are multiples of 14.
+    """Compute features of a batch of normalised images whose sides are multiples of a patch's.
 
     Levels are concatenated, to a width of levels times dim. The class token is the last level's.
     With several levels the stack of blocks is cut at each, which for inference needs the memory of
@@ -287,7 +348,7 @@ def vit(
 def train_vit(
     params: ViT,
     images: Float[Array, "image height width 3"],
-    config: ViTConfig,
+    config: VisionTransformer,
     request: FeatureRequest,
     *,
     remat: str,
@@ -321,7 +382,7 @@ def train_vit(
         f"{config.depth}",
     )
     tokens = jax.vmap(lambda image: embed(params, image, config))(images)
-    grid = grid_of(images[0])
+    grid = config.grid((images.shape[1], images.shape[2]))
     blocks, outputs, attended = params.blocks, [], None
     if request.inserted is not None:
         tokens, measured = _with_inserted(
@@ -350,7 +411,7 @@ def train_vit(
         )
         outputs.append(_facet(params, tokens, grid, config, levels[0], request.facet))
     if request.norm:
-        outputs = [layer_norm(params.norm, level, epsilon=NORM_EPSILON) for level in outputs]
+        outputs = [layer_norm(params.norm, level, epsilon=config.norm_epsilon) for level in outputs]
     front = 0 if request.inserted is None else len(request.inserted)
     patches = [level[:, front + 1 + config.registers :] for level in outputs]
     joined = patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1)
@@ -363,7 +424,7 @@ def _with_inserted(
     params: ViT,
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
-    config: ViTConfig,
+    config: VisionTransformer,
     request: FeatureRequest,
     *,
     remat: str,
@@ -389,7 +450,7 @@ def _with_class_attention(
     params: ViT,
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
-    config: ViTConfig,
+    config: VisionTransformer,
     request: FeatureRequest,
     *,
     remat: str,
@@ -410,8 +471,9 @@ def _with_class_attention(
     tokens, first = run(before, tokens)
     with jax.named_scope("blocks"):
         last = jax.tree.map(operator.itemgetter(-1), after[-1])
-        normed = layer_norm(last.norm1, tokens, epsilon=NORM_EPSILON)
-        shares = first_token_attention(last.attn, normed, config.heads).sum(axis=-2)
+        normed = layer_norm(last.norm1, tokens, epsilon=config.norm_epsilon)
+        attn, rotation = config.attention_of(last), config.rotation(grid)
+        shares = first_token_attention(attn, normed, config.heads, rotation=rotation).sum(axis=-2)
     tokens, final = run(after, tokens)
     return tokens, first + final, shares[:, 1 + config.registers :]
 
@@ -449,14 +511,14 @@ def _facet(
     params: ViT,
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
-    config: ViTConfig,
+    config: VisionTransformer,
     level: int,
     name: str,
 ) -> Float[Array, "image token dim"]:
     """Compute a facet of the last of `level` blocks; the blocks after it are not run.
 
-    The facets are queries, keys and values of the block's attention, with heads side by side, or
-    its output tokens (AnyLoc: Keetha et al. 2023).
+    The facets are queries, keys and values of the block's attention, with heads side by side and
+    not rotated, or its output tokens (AnyLoc: Keetha et al. 2023).
     """
     stack = _one_stack(params)
 
@@ -476,33 +538,29 @@ def _facet(
             return tokens
         last = numbered(level - 1)
         here = ("query", "key", "value").index(name) * config.dim
-        part = jax.tree.map(lambda x: x[..., here : here + config.dim], last.attn.qkv)
-        return linear(part, layer_norm(last.norm1, tokens, epsilon=NORM_EPSILON))
-
-
-def grid_of(image: Shaped[Array, "height width 3"]) -> tuple[int, int]:
-    """Return the rows and columns of patches of an image."""
-    return image.shape[0] // PATCH_SIZE, image.shape[1] // PATCH_SIZE
+        qkv = config.attention_of(last).qkv
+        part = jax.tree.map(lambda x: x[..., here : here + config.dim], qkv)
+        return linear(part, layer_norm(last.norm1, tokens, epsilon=config.norm_epsilon))
 
 
 def embed(
-    params: ViT, image: Float[Array, "height width 3"], config: ViTConfig
+    params: ViT, image: Float[Array, "height width 3"], config: VisionTransformer
 ) -> Float[Array, "token dim"]:
-    """Embed an image: class token, registers and patches, with positions for all but registers."""
-    rows, columns = grid_of(image)
-    pixels = image.reshape(rows, PATCH_SIZE, columns, PATCH_SIZE, 3).transpose(0, 2, 1, 3, 4)
+    """Embed an image: class token, registers and patches, with their positions added if any."""
+    rows, columns = config.grid((image.shape[0], image.shape[1]))
+    size = config.patch_size
+    pixels = image.reshape(rows, size, columns, size, 3).transpose(0, 2, 1, 3, 4)
     patches = linear(params.patch_embed, pixels.reshape(rows * columns, -1))
-    positions = interpolate_positions(params.pos_embed, (rows, columns), config)
-    class_token = (params.cls_token + params.pos_embed_cls)[None]
-    placed = at_least_float32(patches) + positions.reshape(rows * columns, -1)
-    return jnp.concatenate([class_token, params.register_tokens, placed]).astype(image.dtype)
+    class_token, placed = config.add_positions(params, patches, (rows, columns))
+    whole = jnp.concatenate([class_token[None], params.register_tokens, placed])
+    return whole.astype(image.dtype)
 
 
 def run_blocks(
     params: ViT,
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
-    config: ViTConfig,
+    config: VisionTransformer,
     *,
     remat: str = "dots",
 ) -> Float[Array, "image token dim"]:
@@ -515,7 +573,7 @@ def _run_stacks(
     stacks: Sequence[Block],
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
-    config: ViTConfig,
+    config: VisionTransformer,
     *,
     remat: str,
     valid: Bool[Array, " image"] | None,
@@ -546,7 +604,10 @@ def _run_stacks(
 
 
 def _beside(
-    layer: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+    layer: Block,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: VisionTransformer,
 ) -> Float[Array, "image token dim"]:
     """Apply a block's side adapter, with its skip."""
     assert isinstance(layer.adapter, SideAdapter)
@@ -556,7 +617,10 @@ def _beside(
 
 
 def block(
-    params: Block, tokens: Float[Array, "image token dim"], grid: tuple[int, int], config: ViTConfig
+    params: Block,
+    tokens: Float[Array, "image token dim"],
+    grid: tuple[int, int],
+    config: VisionTransformer,
 ) -> Float[Array, "image token dim"]:
     """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR."""
     return train_block(params, tokens, grid, config, None)[0]
@@ -566,7 +630,7 @@ def train_block(
     params: Block,
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
-    config: ViTConfig,
+    config: VisionTransformer,
     valid: Bool[Array, " image"] | None,
 ) -> tuple[Float[Array, "image token dim"], Block]:
     """Run one block on a training batch.
@@ -581,8 +645,9 @@ def train_block(
     Returns:
         (tokens, statistics): the second as `train_vit` returns it.
     """
-    normed = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
-    attended = attention(params.attn, normed, config.heads, key=None)
+    normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
+    attn, rotation = config.attention_of(params), config.rotation(grid)
+    attended = attention(attn, normed, config.heads, rotation=rotation, key=None)
     beside = params.adapter
     if isinstance(beside, SerialParallelAdapter):
         with jax.named_scope("adapter"):
@@ -592,7 +657,7 @@ def train_block(
         tokens.dtype
     )
     tokens = checkpoint_name(tokens, "attended")
-    normed = layer_norm(params.norm2, tokens, epsilon=NORM_EPSILON)
+    normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
     update = feed_forward(params.mlp, normed)
     if beside is not None:
         with jax.named_scope("adapter"):

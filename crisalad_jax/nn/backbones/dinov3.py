@@ -1,0 +1,110 @@
+"""DINOv3's vision transformer ViT/16 (Siméoni et al. 2025), in inference without augmentation.
+
+Written from the paper and the behaviour of Hugging Face's DINOv3ViTModel, whose outputs it meets.
+What differs from DINOv2: patches of 16 x 16, positions by rotation, no bias of the keys, and the
+layer norms' epsilon.
+"""
+
+import dataclasses
+import functools
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.nn.attention import Attention, Rotation, without_key_bias
+from crisalad_jax.nn.backbones.base import BACKBONES
+from crisalad_jax.nn.backbones.vit import Block, VisionTransformer, ViT
+
+PERIOD_BASE = 100.0
+"""Ratio that the longest period approaches; the shortest is 1, half the side of an image."""
+
+
+@BACKBONES.register(
+    "dinov3",
+    tiny={"dim": 128, "depth": 4, "heads": 4},
+    s14={"dim": 384, "heads": 6},
+    l14={"dim": 1024, "depth": 24, "heads": 16},
+    g14={"dim": 1280, "depth": 32, "heads": 20, "ffn": "swiglu", "mlp_ratio": 6.0},
+)
+@dataclasses.dataclass(frozen=True)
+class DinoV3Config(VisionTransformer):
+    """A DINOv3 vision transformer with patches of 16 x 16 (Siméoni et al. 2025).
+
+    Queries and keys are rotated by their patch's row and column. By default it is ViT-B/16. In the
+    preset g14 it is ViT-H+/16, the largest that is distilled.
+    """
+
+    patch_size: ClassVar[int] = 16
+    norm_epsilon: ClassVar[float] = 1e-5
+    token_deviation: ClassVar[float] = 0.02
+    registers: int = 4
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        require(
+            self.dim // self.heads % 4 == 0,
+            f"DinoV3Config.heads: found {self.heads} of width {self.dim // self.heads}, expected a "
+            "width that is a multiple of 4, for the angles of rows and columns",
+        )
+
+    def init_positions(self, key: PRNGKeyArray) -> tuple[None, None]:
+        """Return no parameters."""
+        return None, None
+
+    def add_positions(
+        self, params: ViT, patches: Float[Array, "patch dim"], grid: tuple[int, int]
+    ) -> tuple[Float[Array, " dim"], Float[Array, "patch dim"]]:
+        """Return the class token and the patches as they are."""
+        return params.cls_token, patches
+
+    def rotation(self, grid: tuple[int, int]) -> Rotation:
+        """Return the patches' angles; see `rotary_angles`."""
+        return _rotation(grid, self.dim // self.heads)
+
+    def attention_of(self, layer: Block) -> Attention:
+        """Return a block's attention, in which keys have no bias.
+
+        Among rotated keys a bias would not cancel in the softmax.
+        """
+        return without_key_bias(layer.attn)
+
+
+def rotary_periods(head_dim: int) -> np.ndarray:
+    """Return a head's periods, head_dim / 4 of them: from 1 towards `PERIOD_BASE`."""
+    return PERIOD_BASE ** (np.arange(head_dim // 4) * 4 / head_dim)
+
+
+def rotary_angles(grid: tuple[int, int], head_dim: int) -> np.ndarray:
+    """Compute the angles of each patch: those of its row, and then those of its column.
+
+    An angle is 2 pi x / period. A patch's centre has x from -1 to 1 along either side of the image,
+    whatever their lengths.
+
+    Args:
+        grid: rows and columns of patches.
+        head_dim: width of an attention head.
+
+    Returns:
+        (patch, head_dim / 2) in radians, patches in row order.
+
+    Example:
+        >>> rotary_angles((1, 2), 4).round(3).tolist()
+        [[0.0, -3.142], [0.0, 3.142]]
+    """
+    periods = rotary_periods(head_dim)
+    rows, columns = (
+        2 * np.pi * ((2 * np.arange(side) + 1) / side - 1)[:, None] / periods for side in grid
+    )
+    shape = (*grid, len(periods))
+    both = np.broadcast_to(rows[:, None], shape), np.broadcast_to(columns[None], shape)
+    return np.concatenate(both, axis=-1).reshape(-1, 2 * len(periods))
+
+
+@functools.cache
+def _rotation(grid: tuple[int, int], head_dim: int) -> Rotation:
+    """Compute cosines and sines, in float64 on the host: they are constants of the program."""
+    angles = rotary_angles(grid, head_dim)
+    return Rotation(np.cos(angles), np.sin(angles))

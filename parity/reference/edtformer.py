@@ -1,0 +1,100 @@
+"""EDTformer (Jin et al. 2025): side adapters and a decoder, of torch's own attention."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from parity.reference.layers import l2_normalise
+from parity.reference.vit import ViT
+
+
+class SideAdapter(nn.Module):
+    """Down, GELU, up."""
+
+    def __init__(self, dim: int, width: int) -> None:
+        """From tokens of `dim` to `width` and back."""
+        super().__init__()
+        self.D_fc1 = nn.Linear(dim, width)
+        self.D_fc2 = nn.Linear(width, dim)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(batch, token, dim) to the same."""
+        return self.D_fc2(F.gelu(self.D_fc1(tokens)))
+
+
+class SideViT(ViT):
+    """DINOv2 as it is, and a path beside it: z = x + y, then y = z + alpha A(z) for each block."""
+
+    def __init__(self, config: ViTConfig) -> None:
+        """An adapter for each block, none in it."""
+        super().__init__(config)
+        self.alpha = config.adapter.alpha
+        width = config.adapter_dim
+        self.adapters = nn.ModuleList(SideAdapter(config.dim, width) for _ in self.blocks)
+
+    def run_blocks(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+        """(batch, token, dim) to what the path beside the blocks ends in."""
+        beside = tokens
+        for block, adapter in zip(self.blocks, self.adapters, strict=True):
+            tokens = block(tokens, grid)
+            both = tokens + beside
+            beside = both + self.alpha * adapter(both)
+        return beside
+
+
+class DecoderLayer(nn.Module):
+    """The queries look at each other, then at the tokens; a norm after each."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        """Both attentions are torch's."""
+        super().__init__()
+        self.self_attn = nn.MultiheadAttention(width, heads, batch_first=True)
+        self.multihead_attn = nn.MultiheadAttention(width, heads, batch_first=True)
+        self.norm1 = nn.LayerNorm(width)
+        self.norm2 = nn.LayerNorm(width)
+
+    def forward(self, queries: Tensor, tokens: Tensor) -> Tensor:
+        """(batch, query, width) and (batch, token, width) to (batch, query, width)."""
+        queries = self.norm1(queries + self.self_attn(queries, queries, queries)[0])
+        return self.norm2(queries + self.multihead_attn(queries, tokens, tokens)[0])
+
+
+class Decoder(nn.Module):
+    """The layers in turn."""
+
+    def __init__(self, config: EdtFormerConfig) -> None:
+        """So many of them as `config` says."""
+        super().__init__()
+        made = (DecoderLayer(config.width, config.heads) for _ in range(config.layers))
+        self.layers = nn.ModuleList(made)
+
+    def forward(self, queries: Tensor, tokens: Tensor) -> Tensor:
+        """(batch, query, width) and (batch, token, width) to (batch, query, width)."""
+        for layer in self.layers:
+            queries = layer(queries, tokens)
+        return queries
+
+
+class EdtFormer(nn.Module):
+    """The whole model, under the public names."""
+
+    def __init__(self, backbone: ViTConfig, head: EdtFormerConfig) -> None:
+        """Random parameters."""
+        super().__init__()
+        self.queries = nn.Parameter(torch.randn(1, head.queries, head.width))
+        self.backbone = SideViT(backbone)
+        self.fc = nn.Linear(backbone.dim, head.width)
+        self.decoder = Decoder(head)
+        self.channel_proj = nn.Linear(head.width, head.channels)
+        self.row_proj = nn.Linear(head.queries, head.rows)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(batch, 3, height, width) to unit descriptors, channel by channel."""
+        features = self.backbone(images)
+        tokens = [features.class_token[:, None], features.patches.flatten(2).mT]
+        tokens = self.fc(torch.cat(tokens, dim=1))
+        answers = self.decoder(self.queries.expand(len(images), -1, -1), tokens)
+        rows = self.row_proj(self.channel_proj(answers).mT)
+        return l2_normalise(rows.flatten(1))
