@@ -33,8 +33,6 @@ from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
-from crisalad_jax.nn.backbones.resnet import ResNetConfig
-from crisalad_jax.nn.backbones.vit import VisionTransformer, ViT
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.utils.errors import InputError
@@ -476,23 +474,12 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
         raise InputError(
             f"{path}: found a backbone {theirs.part_name}, expected {config.part_name}"
         )
-    if isinstance(theirs, VisionTransformer) and isinstance(config, VisionTransformer):
-        theirs = dataclasses.replace(theirs, adapter=config.adapter)
-    params = checkpoint.params.backbone
-    if isinstance(theirs, ResNetConfig) and isinstance(config, ResNetConfig):
-        # A head over fewer stages takes the first ones, as torchvision's files have four.
-        stages = min(theirs.stages, config.stages)
-        theirs = dataclasses.replace(theirs, stages=stages)
-        params = dataclasses.replace(params, blocks=params.blocks[:stages])
+    theirs, params = config.adopt(theirs, checkpoint.params.backbone, fresh)
     # Ignore free fields, such as the initialisation: weights do not depend on them.
     wrong = differences(with_free_fields_of(config, theirs), config, "backbone")
     if wrong:
         raise InputError(f"{path}: this backbone is another than the model's: {'; '.join(wrong)}")
-    if checkpoint.config.backbone == theirs or not isinstance(params, ViT):
-        return params
-    stack: Any = params.blocks  # one stack: only training cuts it
-    blocks = dataclasses.replace(stack, adapter=fresh.blocks.adapter)
-    return dataclasses.replace(params, blocks=blocks)
+    return params
 
 
 def with_backbone_of(

@@ -10,6 +10,7 @@ cd "$(dirname "$0")/../.."
 source scripts/environment.sh "[dev]"
 page=(--page docs/performance.md)
 python scripts/bench/bench_describe.py "${page[@]}" "$@"
+python scripts/bench/bench_published.py "${page[@]}"
 python scripts/bench/bench_train.py "${page[@]}" "$@"
 python scripts/bench/bench_extract.py "${page[@]}"
 python scripts/bench/bench_start.py "${page[@]}"

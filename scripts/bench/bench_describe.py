@@ -243,14 +243,19 @@ def at_size(config: ModelConfig, size: tuple[int, int] | None) -> ModelConfig:
     return config if size is None else dataclasses.replace(config, image_size=size)
 
 
-def read_race(description: str, name: str) -> argparse.Namespace:
+def read_race(
+    description: str,
+    name: str,
+    presets: Sequence[str] = ("tiny", "s14", "b14"),
+    batches: Sequence[int] = (8, 16),
+) -> argparse.Namespace:
     """The flags of a race, whose presets can have the sizes."""
     parser = flags(description, "docs/performance")
-    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=MODELS)
+    parser.add_argument("--presets", nargs="+", default=presets, choices=MODELS)
     parser.add_argument(
         "--sizes", type=image_size, nargs="+", default=[None], help="such as 322x322"
     )
-    parser.add_argument("--batches", type=count, nargs="+", default=[8, 16])
+    parser.add_argument("--batches", type=count, nargs="+", default=batches)
     parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
     parser.add_argument("--rounds", type=count, default=5)
     parser.add_argument("--calls", type=count, default=2)

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
@@ -146,6 +146,17 @@ class Backbone(Part, abc.ABC):
     def join_blocks(self, params: Any) -> Any:
         """Undo `split_blocks`."""
         return params
+
+    def adopt(self, config: Self, params: Any, fresh: Any) -> tuple[Self, Any]:
+        """Return another's configuration and parameters, changed as far as this one can do with.
+
+        Args:
+            config: another backbone of this class.
+            params: its parameters.
+            fresh: parameters of this backbone, for what the other's lack.
+        """
+        del fresh
+        return config, params
 
     def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
         """Return the rows and columns of patches in an image of this height and width.

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Literal
+from typing import Any, Literal, Self
 
 import jax
 from jaxtyping import PRNGKeyArray
@@ -94,6 +94,14 @@ class ResNetConfig(StagedBackbone):
             init_conv_norm(stem_key, STEM_SIDE, 3, STEM_DIM),
             tuple(Stage(tuple(self._init_stage(keys[i], i))) for i in range(self.stages)),
         )
+
+    def adopt(self, config: Self, params: Stages, fresh: Stages) -> tuple[Self, Stages]:
+        """Take the first stages of a backbone with more, as torchvision's files have four."""
+        del fresh
+        stages = min(config.stages, self.stages)
+        blocks: Any = params.blocks[:stages]
+        changed = dataclasses.replace(config, stages=stages)
+        return changed, dataclasses.replace(params, blocks=blocks)
 
     def _init_stage(self, key: PRNGKeyArray, stage: int) -> Iterator[Residual]:
         d_in = self.widths(stage - 1)[-1] if stage else STEM_DIM

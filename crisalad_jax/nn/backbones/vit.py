@@ -11,7 +11,7 @@ import itertools
 import math
 import operator
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -216,6 +216,14 @@ class VisionTransformer(Backbone):
         halves = slice(first), slice(first, None)
         parts = tuple(jax.tree.map(operator.itemgetter(half), stack) for half in halves)
         return dataclasses.replace(params, blocks=parts)
+
+    def adopt(self, config: Self, params: ViT, fresh: ViT) -> tuple[Self, ViT]:
+        """Take the fresh adapters where the other's are of another kind or size."""
+        if config.adapter == self.adapter:
+            return config, params
+        blocks = dataclasses.replace(_one_stack(params), adapter=_one_stack(fresh).adapter)
+        changed = dataclasses.replace(config, adapter=self.adapter)
+        return changed, dataclasses.replace(params, blocks=blocks)
 
     def join_blocks(self, params: ViT) -> ViT:
         """Join the stacks of blocks into one."""

@@ -1,0 +1,19 @@
+"""Images that published models describe a second, beside torch, as `bench_describe.py` compares.
+
+    python scripts/bench/bench_published.py [--out docs/performance] [--page docs/performance.md]
+        [--presets cosplace-resnet50 megaloc] [--batches 8] [--dtype bfloat16]
+
+One of each family, at the size of images that it is published for.
+"""
+
+from bench_describe import cases, compare, read_race
+
+
+def main() -> None:
+    presets = ["cosplace-resnet50", "megaloc"]
+    arguments = read_race(__doc__ or "", "bench_published", presets, [8])
+    compare("bench_published", "Descriptors of a batch", cases(arguments), arguments)
+
+
+if __name__ == "__main__":
+    main()
