@@ -1,7 +1,8 @@
 """Published models against the outputs of their public code, at full size on random weights.
 
 The bound on descriptors, 2e-5 of their norm, is forty times what float32 makes here; a wrong mean,
-filter, axis or norm shows at 1e-3 and more.
+axis or norm shows at 1e-3 and more. Images have the model's size already: how photographs are
+resized is held by tests/checkpoints/test_published.py, the filters by tests/data/test_resize.py.
 """
 
 import dataclasses

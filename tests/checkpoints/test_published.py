@@ -15,10 +15,16 @@ import pytest
 
 from crisalad_jax.checkpoints.layouts import LAYOUTS, infer
 from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY, vocabulary_model
+from crisalad_jax.checkpoints.layouts.table import public_shapes
+from crisalad_jax.checkpoints.matlab_io import AVERAGE
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.errors import InputError
 
@@ -121,6 +127,60 @@ SIZED = {
 """Models without stored shapes: the ones that they resemble, and the settings of their heads."""
 
 
+VGG_MEAN = (123.68, 116.779, 103.939)
+"""MatConvNet's mean of red, green and blue for VGG-16, of pixels from 0 to 255."""
+IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+FROM_255 = (tuple(value / 255 for value in VGG_MEAN), (1 / 255,) * 3)
+
+_BYTES = ("bilinear", True, "bytes", False, IMAGENET)
+_PLAIN = ("bilinear", False, "floats", False, IMAGENET)
+_WRAPPER = ("bilinear", True, "floats", True, IMAGENET)
+_BICUBIC = ("bicubic", True, "floats", False, IMAGENET)
+PREPROCESSING: dict[str, tuple[Any, ...]] = {
+    # Backbones alone have no chain of place recognition: the library's default.
+    "dinov2": ((224, 224), "fixed", *_BYTES),
+    "dinov3": ((224, 224), "fixed", *_BYTES),
+    # serizba/salad eval.py and cliquemining: Resize of Pillow's image, ToTensor, Normalize.
+    "dino-salad": ((322, 322), "fixed", *_BYTES),
+    # Ahmedest61/VLAD-BuFF eval.py, input_transform: the same.
+    "vlad-buff": ((322, 322), "fixed", *_BYTES),
+    # amaralibey/MixVPR and gsv-cities, their data loaders; Conv-AP's demo.py of 4,096 is bicubic.
+    "mixvpr": ((320, 320), "fixed", *_BYTES),
+    "conv-ap": ((320, 320), "fixed", *_BYTES),
+    "conv-ap-4096": ((320, 320), "fixed", "bicubic", True, "bytes", False, IMAGENET),
+    # QVPR/Patch-NetVLAD: Resize of Pillow's image.
+    "patch-netvlad": ((480, 640), "fixed", *_BYTES),
+    # gmberton/CosPlace and EigenPlaces, Indoor-VPR, Nanne/pytorch-NetVlad: not resized.
+    "cosplace": ((512, 512), "native", *_BYTES),
+    "eigenplaces-indoor": ((512, 512), "native", *_BYTES),
+    "netvlad": ((480, 640), "native", *_BYTES),
+    # amaralibey/Bag-of-Queries: the tensor is resized, bicubic and antialiased.
+    "boq-dinov2": ((322, 322), "fixed", *_BICUBIC),
+    "boq-resnet50": ((384, 384), "fixed", *_BICUBIC),
+    # gmberton/VPR-methods-evaluation: the tensor is resized antialiased, and again to multiples.
+    "megaloc": ((322, 322), "fixed", *_WRAPPER),
+    "megaloc-v1": ((322, 322), "fixed", *_WRAPPER),
+    "salad-indoor": ((322, 322), "fixed", *_WRAPPER),
+    "supervlad": ((322, 322), "fixed", *_WRAPPER),
+    "edtformer": ((322, 322), "fixed", *_WRAPPER),
+    # Lu-Feng/ImAge: its torchvision, 0.21, antialiases tensors by default.
+    "image": ((322, 322), "fixed", *_WRAPPER),
+    # datasets_ws.py of Lu-Feng/CricaVPR and SelaVPR (torchvision 0.15.0) and of chenshunpeng/FoL
+    # (0.15.1): tensors, which these do not antialias unless asked.
+    "cricavpr": ((224, 224), "fixed", *_PLAIN),
+    "selavpr": ((224, 224), "fixed", *_PLAIN),
+    "fol": ((504, 504), "fixed", *_PLAIN),
+    # GaoShuang98/DINO-Mix, eval_files (torchvision 0.14.1), and TransVPR's code of 2022: the same.
+    "dino-mix": ((224, 224), "fixed", *_PLAIN),
+    "transvpr": ((480, 640), "fixed", *_PLAIN),
+    # cvg/Hierarchical-Localization: OpenCV's INTER_AREA; pixels of 0 to 255 less a mean.
+    "netvlad-matlab": ((768, 1024), "longer-side", "area", True, "floats", False, FROM_255),
+    # Ours: the demo of AnyLoc crops to multiples of 14 where we resize (docs/resizing.md).
+    VOCABULARY: ((224, 224), "native", "bilinear", True, "floats", False, IMAGENET),
+}
+"""By name or else layout: size, rule, filter, antialias, pixels, round, (mean, deviation)."""
+
+
 @functools.cache
 def stored(name: str) -> tuple[str, ModelConfig]:
     """The layout and configuration of a published file."""
@@ -129,8 +189,15 @@ def stored(name: str) -> tuple[str, ModelConfig]:
     plain = MADE.get(name, lambda shapes: shapes)(plain)
     plain |= CHANGED.get(name, {})
     plain = {key: shape for key, shape in plain.items() if shape is not None}
-    blank = {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in plain.items()}
-    return infer(blank, source=name)
+    return infer(blank(plain), source=name)
+
+
+def blank(shapes: dict[str, Any]) -> dict[str, np.ndarray]:
+    """A state of these shapes; its average image, if there is one, is VGG-16's."""
+    state = {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in shapes.items()}
+    if AVERAGE in state:
+        state[AVERAGE] = np.broadcast_to(np.float32(VGG_MEAN), state[AVERAGE].shape)
+    return state
 
 
 def parameters(config: ModelConfig) -> int:
@@ -201,6 +268,83 @@ def test_anylocs_vocabularies_have_their_backbone():
         config = vocabulary_model(words, base, {})
         assert (model.descriptor, model.parameters) == (config.descriptor_dim, parameters(config))
         assert config.aggregator.block(base.backbone.depth) == 31  # as the file's name says
+
+
+def resized(name: str, **settings: Any) -> ModelConfig:
+    """The configuration inferred from a file like a stored one, with other parts."""
+    layout, config = stored(name)
+    config = dataclasses.replace(config, **settings)
+    return infer(blank(public_shapes(config, layout)), source=name)[1]
+
+
+@functools.cache
+def inferred(name: str) -> ModelConfig:
+    """The configuration that the layout of a published model infers from its shapes."""
+    model = published_model(name)
+    if name in STORED:
+        return stored(name)[1]
+    if name in SIZED:
+        like, settings = SIZED[name]
+        head = stored(like)[1].aggregator
+        return resized(like, aggregator=dataclasses.replace(head, **settings))
+    if model.layout == "patch-netvlad":
+        like = "mapillary-4096" if "mapillary" in name else "pittsburgh-512"
+        whitening = stored(f"patch-netvlad-{like}")[1].projection
+        return resized(
+            f"patch-netvlad-{like}",
+            projection=dataclasses.replace(whitening, dim=model.descriptor),
+        )
+    if model.layout == "cosplace":
+        layers = re.search(r"resnet(\d+)", name)
+        backbone = ResNetConfig(layers=int(layers[1])) if layers else VggConfig()
+        head = dataclasses.replace(
+            stored("cosplace-resnet50-2048")[1].aggregator, dim=model.descriptor
+        )
+        return resized("cosplace-resnet50-2048", backbone=backbone, aggregator=head)
+    if model.layout == VOCABULARY:
+        words = np.broadcast_to(np.float32(0), (32, 1536))
+        return vocabulary_model(words, stored(model.backbone)[1], {})
+    assert model.layout == "dinov3"
+    # The chain is the same for all sizes.
+    alone = ModelConfig(
+        backbone=DinoV3Config(adapter=AdapterConfig(kind="none")),
+        aggregator=ClassTokenConfig(),
+        cross_image=CrossImageConfig(layers=0),
+    )
+    return infer(blank(public_shapes(alone, "dinov3")), source=name)[1]
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_images_are_prepared_as_the_authors_do(name):
+    config = inferred(name)
+    chain = config.preprocessing
+    found = (
+        config.image_size,
+        chain.size_rule,
+        chain.filter,
+        chain.antialias,
+        chain.pixels,
+        chain.round_to_patch,
+        (chain.mean, chain.deviation),
+    )
+    assert found == PREPROCESSING.get(name, PREPROCESSING[published_model(name).layout])
+    assert chain.normalisation == "mean-deviation"
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_models_words_are_those_of_its_chain(name):
+    config = inferred(name)
+    chain = config.preprocessing
+    if chain.size_rule == "native":
+        multiple = config.side_multiple
+        words = "any, not resized" if multiple == 1 else f"any, to multiples of {multiple}"
+    else:
+        words = chain.in_words(config.image_size).split(",")[0]
+    if chain.size_rule != "native" or config.side_multiple > 1:
+        words += f", {chain.filter}"
+        words += " (Pillow)" if chain.pixels == "bytes" else ""
+        words += "" if chain.antialias else ", not antialiased"
+    assert published_model(name).images == words
 
 
 def test_every_model_is_checked_above():

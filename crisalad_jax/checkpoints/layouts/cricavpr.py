@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from crisalad_jax.checkpoints.layouts.base import State, register_head
 from crisalad_jax.checkpoints.layouts.forms import FIRST, Entry
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
 
 _EXPONENT = "aggregation.1.p"
@@ -30,6 +31,8 @@ register_over_dinov2(
     mark=_EXPONENT,
     adapter="multi-resolution",
     encoder=True,
+    # Tensors at torchvision 0.15.0, which does not antialias them unasked.
+    preprocessing=PreprocessingConfig(antialias=False, pixels="floats"),
     module="module.",
     under="model_state_dict",
 )

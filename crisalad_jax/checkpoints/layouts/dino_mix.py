@@ -13,6 +13,8 @@ register_over_dinov2(
     functools.partial(infer_mixvpr, last_norm=False),
     prefix="backbone.dino_model.",
     norm=False,
-    preprocessing=PreprocessingConfig(pixels="floats"),
+    # Tensors at torchvision 0.14.1, which does not antialias them unasked: the chain of its
+    # evaluation. Its training validates on Pillow's images.
+    preprocessing=PreprocessingConfig(antialias=False, pixels="floats"),
     under="state_dict",
 )

@@ -57,7 +57,8 @@ for _name, _holds, _lines in (
         mark="upconv.weight",
         head=_lines,
         image_size=(504, 504),
-        preprocessing=PreprocessingConfig(pixels="floats"),
+        # Tensors at torchvision 0.15.1, which does not antialias them unasked.
+        preprocessing=PreprocessingConfig(antialias=False, pixels="floats"),
         module="module.",
         under="model_state_dict",
     )

@@ -33,7 +33,8 @@ register_over_dinov2(
     prefix="backbone.",
     mark=f"{_LOCAL}.upconv1.weight",
     adapter="serial-parallel",
-    preprocessing=PreprocessingConfig(pixels="floats"),
+    # Tensors at torchvision 0.15.0, which does not antialias them unasked.
+    preprocessing=PreprocessingConfig(antialias=False, pixels="floats"),
     module="module.",
     under="model_state_dict",
 )

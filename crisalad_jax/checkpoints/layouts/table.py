@@ -43,7 +43,7 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
     """Infer the layout and the configuration of a state, from its names and shapes.
 
     Settings that no shape shows are the published ones: heads of width 64 in the backbone, 16 heads
-    in the encoder, alpha 0.2, three Sinkhorn iterations, images of 224 x 224 (DINO-SALAD: 322).
+    in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize.
 
     Raises:
         InputError: naming `source`, if the names are of no layout or the widths of no model.

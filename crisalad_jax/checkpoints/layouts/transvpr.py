@@ -69,7 +69,8 @@ def _infer(state: State) -> ModelConfig:
     dim = read.size("transformer.class_emb", 2)
     return ModelConfig(
         image_size=(480, 640),
-        preprocessing=PreprocessingConfig(pixels="floats"),
+        # Tensors at a torchvision of 2022, which does not antialias them unasked.
+        preprocessing=PreprocessingConfig(antialias=False, pixels="floats"),
         backbone=TransVprNetConfig(
             dim=dim,
             depth=read.count("transformer.blocks."),

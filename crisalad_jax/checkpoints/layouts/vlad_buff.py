@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, POINTWISE, SAME, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
-from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
 
 _BURST = "aggregator.ab_params"
@@ -40,7 +39,6 @@ register_over_dinov2(
     prefix="backbone.model.",
     mark=_BURST,
     image_size=(322, 322),
-    preprocessing=PreprocessingConfig(pixels="floats", round_to_patch=True),
     projection="WPCA_{dim}.0",
     projection_form=POINTWISE,
     under="state_dict",

@@ -46,7 +46,7 @@ class Published:
     parameters: int
     """Number of parameters, as `crisalad info` counts them."""
     images: str
-    """How its authors resize images, in words."""
+    """How images are resized, in words: those of the configuration of its layout."""
     licence: Licence
     repository: str
     """Address of the page that publishes the file."""

@@ -16,7 +16,7 @@ register_published(
         layout="cricavpr",
         descriptor=10752,
         parameters=106_771_265,
-        images="224 x 224, bilinear",
+        images="224 x 224, bilinear, not antialiased",
         licence=MIT,
         repository=github(_REPOSITORY),
         file="CricaVPR.pth",

@@ -16,7 +16,7 @@ register_published(
         layout="dino-mix",
         descriptor=4096,
         parameters=87_632_388,
-        images="224 x 224, bilinear",
+        images="224 x 224, bilinear, not antialiased",
         licence=MIT,
         repository=github(_REPOSITORY),
         file="dinov2_vitb14_mix.ckpt",

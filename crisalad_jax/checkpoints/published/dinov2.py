@@ -19,11 +19,12 @@ for _size, _width, _parameters in (
                 layout="dinov2",
                 descriptor=_width,
                 parameters=_parameters + _registers * _width,
-                images="any, in multiples of 14",
+                images="224 x 224, bilinear (Pillow)",
                 licence=APACHE,
                 repository=github("facebookresearch/dinov2"),
                 file=f"{_full}_pretrain.pth",
                 url=f"{_HOST}/{_name}/{_full}_pretrain.pth",
                 paper="Oquab et al., TMLR 2024",
+                note="a backbone, which takes any sides that are multiples of 14",
             )
         )

@@ -18,7 +18,7 @@ for _size, _width, _parameters, _digest in (
             layout="dinov3",
             descriptor=_width,
             parameters=_parameters,
-            images="any, in multiples of 16",
+            images="224 x 224, bilinear (Pillow)",
             licence=DINOV3_LICENCE,
             repository=github("facebookresearch/dinov3"),
             file=f"dinov3_vit{_size}_pretrain_lvd1689m-{_digest}.pth",

@@ -11,7 +11,7 @@ for _size, _parameters in (("large", 308_826_432), ("base", 90_055_488)):
             layout="fol",
             descriptor=8448,
             parameters=_parameters,
-            images="504 x 504, bilinear",
+            images="504 x 504, bilinear, not antialiased",
             licence=APACHE,
             repository=github("chenshunpeng/FoL"),
             file=f"FoL_{_size}.pth",

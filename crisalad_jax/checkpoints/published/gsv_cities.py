@@ -29,10 +29,10 @@ for _descriptor, _channels, _rows, _parameters, _identifier in (
     )
 
 for _descriptor, _channels, _parameters, _filter in (
-    (512, 128, 23_823_424, ""),
-    (2048, 512, 24_610_240, ""),
-    (4096, 1024, 25_659_328, ", bicubic (Pillow)"),
-    (8192, 2048, 27_757_504, ", bilinear (Pillow)"),
+    (512, 128, 23_823_424, "bilinear"),
+    (2048, 512, 24_610_240, "bilinear"),
+    (4096, 1024, 25_659_328, "bicubic"),
+    (8192, 2048, 27_757_504, "bilinear"),
 ):
     register_published(
         Published(
@@ -40,7 +40,7 @@ for _descriptor, _channels, _parameters, _filter in (
             layout="conv-ap",
             descriptor=_descriptor,
             parameters=_parameters,
-            images=f"320 x 320{_filter}",
+            images=f"320 x 320, {_filter} (Pillow)",
             licence=NO_LICENCE,
             repository=github("amaralibey/gsv-cities"),
             file=f"resnet50_ConvAP_{_channels}_2x2.ckpt",

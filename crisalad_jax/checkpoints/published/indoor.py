@@ -19,7 +19,7 @@ for _method, _network, _descriptor, _parameters, _images, _variations, _note in 
         "Dinov2",
         8448,
         87_990_721,
-        "any, to multiples of 14, bilinear",
+        "322 x 322, bilinear",
         ("GB1_10_25", "HB1_GB1_2_5"),
         "trained on from SALAD's weights, whose repository is under the GPL-3.0",
     ),

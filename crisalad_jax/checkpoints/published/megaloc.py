@@ -25,11 +25,13 @@ for _name, _layout, _file, _url in (
             layout=_layout,
             descriptor=8448,
             parameters=228_639_553,
-            images="any, to multiples of 14, bilinear",
+            images="322 x 322, bilinear",
             licence=MIT,
             repository=github(_REPOSITORY),
             file=_file,
             url=_url,
             paper="Berton and Masone, CVPR Workshops 2025",
+            note="its authors evaluate at 322 x 322; their model takes any size, and resizes to "
+            "multiples of 14, as --resize native does",
         )
     )

@@ -36,7 +36,7 @@ for _name, _file in (
             layout="netvlad-matlab",
             descriptor=4096,
             parameters=149_002_048,
-            images="longer side at most 1,024",
+            images="longer side at most 1024, area",
             licence=APACHE,
             repository=github("cvg/Hierarchical-Localization"),
             file=_file,

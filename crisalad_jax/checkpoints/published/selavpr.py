@@ -18,7 +18,7 @@ for _name, _identifier in (
             layout="selavpr",
             descriptor=1024,
             parameters=357_427_585,
-            images="224 x 224, bilinear",
+            images="224 x 224, bilinear, not antialiased",
             licence=MIT,
             repository=github("Lu-Feng/SelaVPR"),
             file=f"SelaVPR_{_name}.pth",

@@ -16,7 +16,7 @@ for _name, _file in (("msls", "TransVPR_MSLS.pth"), ("pitts30k", "TransVPR_Pitts
             layout="transvpr",
             descriptor=256,
             parameters=5_404_544,
-            images="480 x 640, bilinear",
+            images="480 x 640, bilinear, not antialiased",
             licence=NO_LICENCE,
             repository=_REPOSITORY,
             file=_file,

@@ -20,7 +20,7 @@ for _descriptor, _file, _parameters in (
             layout="vlad-buff",
             descriptor=_descriptor,
             parameters=_parameters,
-            images="322 x 322",
+            images="322 x 322, bilinear (Pillow)",
             licence=GPL,
             repository=github(_REPOSITORY),
             file=_file,
