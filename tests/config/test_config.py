@@ -170,7 +170,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     mix = recipe("b14", "dino-mix")
     assert mix.model.aggregator == MixVprConfig(channels=1024, rows=4, depth=2, last_norm=False)
     assert (mix.places_per_batch, mix.epochs, mix.select_by) == (80, 60, "R@1")
-    assert mix.trainable == "last-4-blocks+positions+head"
+    assert mix.trainable == "last-3-blocks+positions+head"
     assert mix.optimiser == OptimiserConfig(
         kind="sgd",
         learning_rate=0.005,
