@@ -143,7 +143,7 @@ class PreprocessingConfig:
         """Return this chain with the fields that some of `WORDS` set.
 
         Raises:
-            InputError: an unknown word, or two for one field.
+            InputError: an unknown word, two for one field, or one without effect.
 
         Example:
             >>> PreprocessingConfig().changed_by(["native", "bicubic"]).filter
@@ -158,7 +158,13 @@ class PreprocessingConfig:
                     f"--resize: found {' '.join(words)}, expected one of "
                     f"{', '.join(each for each, sets in WORDS.items() if field in sets)}",
                 )
-        return dataclasses.replace(self, **changes)
+        changed = dataclasses.replace(self, **changes)
+        require(
+            "antialias" not in changes or changed.filter != "area",
+            f"--resize: found {' '.join(words)}, expected neither antialias nor no-antialias with "
+            "filter area, which has no such choice",
+        )
+        return changed
 
     def in_words(self, image_size: Size) -> str:
         """Describe the resize of a model of this image size in a few words.

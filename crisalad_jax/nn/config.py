@@ -217,16 +217,28 @@ class ModelConfig:
             The configuration, which fits the same parameters.
 
         Raises:
-            InputError: what `check_image_size` and `PreprocessingConfig.changed_by` raise.
+            InputError: what `check_image_size` and `PreprocessingConfig.changed_by` raise; a size
+                for a model that takes images at their own; "round" for one that takes any size.
 
         Example:
             >>> PRESETS["tiny"].resized((70, 98)).grid
             (5, 7)
         """
         changed = self.preprocessing.changed_by(resize)
+        require(
+            "round" not in resize or self.side_multiple > 1,
+            f"--resize: found round for backbone {self.backbone.part_name}, which takes sides of "
+            "any length, expected it for one whose sides are multiples of a patch's",
+        )
         config = dataclasses.replace(self, preprocessing=changed) if resize else self
         if image_size is None:
             return config
+        # Beside the word native a size is on purpose: training and exports are of it.
+        require(
+            changed.size_rule != "native" or "native" in resize,
+            f"--image-size: found {' x '.join(map(str, image_size))} for a model that takes images "
+            "at their own size, expected --resize fixed (or shorter-side, longer-side) beside it",
+        )
         config.check_image_size(config.rounded_size(image_size))
         return dataclasses.replace(config, image_size=image_size)
 

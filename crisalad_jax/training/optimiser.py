@@ -8,9 +8,18 @@ import optax
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.utils.notes import tell
 
-WARMUP_SHARE = 5
-"""Divisor of a run's steps: a warm-up takes a fifth of them at most. The 30 steps of `scratch` are
-a sixth of the demo's 180, and far less of its own 150 epochs."""
+WARMUP_SHARE = 4
+"""Divisor of a run's steps: a warm-up takes a quarter of them at most, as BoQ's 10 of 40 epochs."""
+
+
+def warmup_length(config: OptimiserConfig, steps_per_epoch: int) -> int:
+    """Return the number of steps of a warm-up, which may be given in epochs.
+
+    Example:
+        >>> warmup_length(OptimiserConfig(warmup_epochs=2), 100)
+        200
+    """
+    return config.warmup_steps or config.warmup_epochs * steps_per_epoch
 
 
 def learning_rate_schedule(
@@ -24,7 +33,7 @@ def learning_rate_schedule(
     without effect, as in GSV-Cities' code, in which the warm-up sets the learning rate anew.
     """
     peak, end = config.learning_rate, config.learning_rate * config.end_lr_fraction
-    warmup_steps = config.warmup_steps or config.warmup_epochs * steps_per_epoch
+    warmup_steps = warmup_length(config, steps_per_epoch)
     if config.schedule == "linear":
         length = config.decay_steps or max(steps - warmup_steps, 1)
         decay = optax.linear_schedule(peak, end, length)
@@ -47,33 +56,38 @@ def learning_rate_schedule(
     )
 
 
-def with_short_warmup(config: OptimiserConfig, steps: int) -> OptimiserConfig:
+def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> OptimiserConfig:
     """Shorten a warm-up to its largest share of a run.
 
     Args:
         config: the optimiser.
         steps: number of steps of the run.
+        steps_per_epoch: number of steps of an epoch.
 
     Returns:
-        The optimiser, as it is where its warm-up is short enough.
+        The optimiser, as it is where its warm-up is short enough. A shortened one is in steps.
 
     Example:
-        >>> with_short_warmup(OptimiserConfig(warmup_steps=30), 32).warmup_steps
-        6
+        >>> with_short_warmup(OptimiserConfig(warmup_epochs=5), 32, 4).warmup_steps
+        8
     """
     longest = steps // WARMUP_SHARE
-    return dataclasses.replace(config, warmup_steps=min(config.warmup_steps, longest))
+    if warmup_length(config, steps_per_epoch) <= longest:
+        return config
+    return dataclasses.replace(config, warmup_steps=longest, warmup_epochs=0)
 
 
-def tell_long_warmup(config: OptimiserConfig, steps: int) -> None:
+def tell_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> None:
     """Tell in a note if a warm-up takes more than its largest share of a run's steps."""
-    longest = steps // WARMUP_SHARE
-    if config.warmup_steps > longest:
-        left = max(steps - config.warmup_steps, 0)
+    longest, warmup = steps // WARMUP_SHARE, warmup_length(config, steps_per_epoch)
+    if warmup > longest:
+        field, found = "warmup_steps", str(warmup)
+        if config.warmup_epochs:
+            field, found = "warmup_epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
+        left = max(steps - warmup, 0)
         tell(
-            f"OptimiserConfig.warmup_steps: found {config.warmup_steps} for a run of {steps} steps,"
-            f" which leaves {left} at the learning rate and its decay; at most {longest} would be a"
-            " fifth"
+            f"OptimiserConfig.{field}: found {found} for a run of {steps} steps, which leaves "
+            f"{left} at the learning rate and its decay; at most {longest} steps would be a quarter"
         )
 
 

@@ -129,7 +129,7 @@ def init_train_state(
 ) -> tuple[TrainState, PyTree]:
     """Make the state before the first step, and the frozen parameters, which no step changes.
 
-    A note tells if the warm-up takes more than a fifth of the run.
+    A note tells if the warm-up takes more than a quarter of the run.
 
     Args:
         params: the model to start from.
@@ -160,7 +160,7 @@ def init_train_state(
     )
     check_params(params, config.model)
     if isinstance(config.optimiser, OptimiserConfig) and distributed.is_primary():
-        tell_long_warmup(config.optimiser, config.steps)
+        tell_long_warmup(config.optimiser, config.steps, config.steps_per_epoch)
     chosen, frozen = split_params(params, config.model, trainable)
     statistics = None
     if config.batch_norm == "batch":

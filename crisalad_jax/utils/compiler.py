@@ -86,6 +86,11 @@ def _compiles_fused_attention() -> bool:
     return True
 
 
+def is_for_cpu() -> bool:
+    """Return whether what is traced now runs on a CPU alone."""
+    return not _PORTABLE.get() and jax.default_backend() == "cpu"
+
+
 def product_dtype(dtype: Any) -> Any:
     """Return the fastest output type for a product of matrices of `dtype`, before rounding to it.
 

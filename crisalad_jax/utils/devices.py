@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from crisalad_jax.utils.compiler import is_for_cpu
 from crisalad_jax.utils.errors import InputError
 
 SHARD_FROM = 2**14
@@ -102,3 +103,20 @@ def devices_for(count: int, *, processes: bool = False) -> Devices:
     fewest = min(map(len, groups))
     most = max(n for n in range(1, fewest + 1) if each % n == 0)
     return Devices(Mesh(np.array([group[:most] for group in groups]).ravel(), ("image",)))
+
+
+def parts_for_caches(images: int, at_once: int) -> int:
+    """Return into how many parts a CPU divides a batch, to compute them one after the other.
+
+    Activations of few images stay in its caches. Other platforms take the batch whole.
+
+    Args:
+        images: number of images, which may be spread over devices as `devices_for` chooses them.
+        at_once: number of images that a device computes at once, or the next smaller one that
+            divides its share; at least one.
+    """
+    if not images or not is_for_cpu():
+        return 1
+    together = images % jax.process_count() == 0
+    share = images // devices_for(images, processes=together).mesh.size
+    return share // max(n for n in range(1, max(1, at_once) + 1) if share % n == 0)

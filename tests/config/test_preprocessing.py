@@ -63,6 +63,9 @@ def test_words_set_fields() -> None:
         how.changed_by(["cubic"])
     with pytest.raises(InputError, match="found area bicubic, expected one of bilinear, bicubic"):
         how.changed_by(["area", "bicubic"])
+    for words, of in ((["area", "no-antialias"], how), (["antialias"], how.changed_by(["area"]))):
+        with pytest.raises(InputError, match=f"found {' '.join(words)}, expected neither "):
+            of.changed_by(words)
 
 
 def test_a_model_rounds_where_its_backbone_needs_it() -> None:
@@ -93,6 +96,19 @@ def test_a_backbone_of_any_size_is_not_rounded() -> None:
     )
     assert (config.side_multiple, config.input_size, config.grid) == (1, (512, 512), (32, 32))
     assert config.images_in_words == "shorter side 512, bilinear, antialiased, on bytes"
+    with pytest.raises(InputError, match="--resize: found round for backbone any-size, which"):
+        config.resized(None, ["round"])
+
+
+def test_a_size_beside_a_native_rule_is_told() -> None:
+    """Unless the same call names a rule."""
+    native = MODEL.resized(None, ["native"])
+    for words in ([], ["bicubic"]):
+        with pytest.raises(InputError, match=r"--image-size: found 56 x 84 .*--resize fixed"):
+            native.resized((56, 84), words)
+    fixed = native.resized((56, 84), ["fixed"])
+    assert fixed == MODEL.resized((56, 84))
+    assert native.resized((56, 84), ["native"]).image_size == (56, 84)
 
 
 def test_parameters_for_every_patch_need_a_fixed_size() -> None:

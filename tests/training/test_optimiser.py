@@ -20,31 +20,46 @@ from crisalad_jax.utils.notes import Note
 from tests.conftest import MODEL, RECIPE, STEPS
 
 
-def told(params, warmup: int, steps: int) -> list[str]:
-    optimiser = OptimiserConfig(warmup_steps=warmup)
+def told(params, optimiser: OptimiserConfig, steps: int, steps_per_epoch: int) -> list[str]:
+    config = StepConfig(MODEL, RECIPE.loss, optimiser, steps, steps_per_epoch=steps_per_epoch)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        init_train_state(params, "head", StepConfig(MODEL, RECIPE.loss, optimiser, steps))
+        init_train_state(params, "head", config)
     return [str(each.message) for each in caught if each.category is Note]
 
 
 @pytest.mark.parametrize(
     ("warmup", "steps", "words"),
     [
-        (30, 32, "found 30 for a run of 32 steps, which leaves 2 at .*; at most 6 would"),
-        (30, 10, "found 30 for a run of 10 steps, which leaves 0 at .*; at most 2 would"),
-        (7, 34, "found 7 for a run of 34 steps, which leaves 27 at .*; at most 6 would"),
-        (7, 35, None),
+        (30, 32, "found 30 for a run of 32 steps, which leaves 2 at .*; at most 8 steps would"),
+        (30, 10, "found 30 for a run of 10 steps, which leaves 0 at .*; at most 2 steps would"),
+        (9, 35, "found 9 for a run of 35 steps, which leaves 26 at .*; at most 8 steps would"),
+        (9, 36, None),
         (30, 180, None),  # of the demo
         (0, 1, None),
     ],
 )
-def test_a_warm_up_of_more_than_a_fifth_is_told_in_a_line(params, warmup, steps, words) -> None:
-    notes = told(params, warmup, steps)
+def test_a_warm_up_of_more_than_a_quarter_is_told_in_a_line(params, warmup, steps, words) -> None:
+    notes = told(params, OptimiserConfig(warmup_steps=warmup), steps, 1)
     assert len(notes) == (words is not None)
     for note in notes:
         assert "\n" not in note
         assert re.match(f"OptimiserConfig.warmup_steps: {words}", note)
+
+
+def test_a_warm_up_in_epochs_is_told_and_shortened_too(params) -> None:
+    """Of BoQ, which warms up for 10 of its 40 epochs; here of 7 steps each."""
+    boq = recipe("b14", "boq").optimiser
+    (note,) = told(params, boq, 5 * 7, 7)
+    assert note.startswith(
+        "OptimiserConfig.warmup_epochs: found 10, which are 70 steps, for a run of 35 steps, which "
+        "leaves 0 at"
+    )
+    short = with_short_warmup(boq, 5 * 7, 7)
+    assert short == dataclasses.replace(boq, warmup_steps=8, warmup_epochs=0)
+    assert not told(params, short, 5 * 7, 7)
+    assert not told(params, boq, 40 * 7, 7)
+    assert with_short_warmup(boq, 40 * 7, 7) == boq
 
 
 def test_it_is_told_once_and_before_the_first_step(shared, tmp_path, monkeypatch) -> None:
@@ -57,12 +72,12 @@ def test_it_is_told_once_and_before_the_first_step(shared, tmp_path, monkeypatch
 
 def test_a_shortened_warm_up_reaches_the_learning_rate() -> None:
     given = OptimiserConfig(learning_rate=1.0, warmup_steps=30)
-    short = with_short_warmup(given, 32)
-    assert short == OptimiserConfig(learning_rate=1.0, warmup_steps=6)
+    short = with_short_warmup(given, 32, 1)
+    assert short == OptimiserConfig(learning_rate=1.0, warmup_steps=8)
     with jax.enable_x64(True):
-        rates = [float(learning_rate_schedule(short, 32)(step)) for step in (0, 5, 6, 32)]
-    np.testing.assert_allclose(rates, [1 / 6, 1, 1, 0], atol=1e-7)
-    assert with_short_warmup(given, 150) == given
+        rates = [float(learning_rate_schedule(short, 32)(step)) for step in (0, 7, 8, 32)]
+    np.testing.assert_allclose(rates, [1 / 8, 1, 1, 0], atol=1e-7)
+    assert with_short_warmup(given, 150, 1) == given
 
 
 def test_published_recipes_keep_their_warm_up() -> None:

@@ -179,6 +179,28 @@ def test_images_are_spread_and_parameters_shared(
     assert in_a_program(SPREAD, tmp_path, **told) == f"{devices} {used} {used} 1\n"
 
 
+IN_PARTS = """
+import numpy as np
+from crisalad_jax.nn.backbones import stages
+from crisalad_jax.utils.devices import devices_for, parts_for_caches
+from tests.nn.backbones.test_cnn import SMALL, random_params
+from crisalad_jax.nn.model import describe
+print(*(parts_for_caches(*each) for each in ((6, 1), (6, 2), (8, 3), (7, 9), (5, 0))))
+stages._PIXELS = 1
+images = np.zeros((6, *SMALL.image_size, 3), np.float32)
+devices = devices_for(6)
+params, spread = devices.replicate(random_params(SMALL)), devices.shard_batch(images)
+text = describe.lower(params, spread, SMALL).compile().as_text()
+print(" while(" in text, any(f" {name}" in text for name in ("all-", "collective-")))
+"""
+
+
+def test_devices_compute_parts_of_their_own_images(tmp_path: pathlib.Path) -> None:
+    """Of four devices six images are on three: each computes two, one by one, and sends none."""
+    told = {"JAX_NUM_CPU_DEVICES": "4", "PYTHONPATH": os.getcwd()}
+    assert in_a_program(IN_PARTS, tmp_path, **told) == "2 1 1 1 5\nTrue False\n"
+
+
 SET_UP = """
 import os, jax
 if os.environ.get("FEWER"):

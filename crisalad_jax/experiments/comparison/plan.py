@@ -30,7 +30,7 @@ from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.batches import groups_of, steps_per_epoch
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.optimiser import with_short_warmup
+from crisalad_jax.training.optimiser import warmup_length, with_short_warmup
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
@@ -170,11 +170,14 @@ def prepare(config: ComparisonConfig) -> Prepared:
         training = draft.training
         if places is not None and draft.run not in weights:
             training = _fitted(training, config, len(places.place_id), views)
-            own, steps = _own_training_set(draft, training, config, places)
-            optimiser = with_short_warmup(training.optimiser, steps)
+            own, per_epoch = _own_training_set(draft, training, config, places)
+            steps = per_epoch * training.epochs
+            optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
             if config.backbone is not None:  # from nothing `_fitted` has shortened it
                 training = dataclasses.replace(training, optimiser=optimiser)
-            before, after = draft.training.optimiser.warmup_steps, training.optimiser.warmup_steps
+            before, after = (
+                warmup_length(each.optimiser, per_epoch) for each in (draft.training, training)
+            )
             if draft.learns and after < before:
                 words = f"found {before} steps, shortened to {after} of the run's {steps}"
                 shortened.setdefault(words, []).append(draft.name)
@@ -196,7 +199,7 @@ def prepare(config: ComparisonConfig) -> Prepared:
 def _own_training_set(
     draft: Variant, training: TrainConfig, config: ComparisonConfig, places: Places
 ) -> tuple[Places, int]:
-    """Choose a variant's training set, and count the steps of a run, whose epochs have batches."""
+    """Choose a variant's training set, and count the steps of an epoch, which has some."""
     assert config.train is not None
     if training.min_images_of_place < training.min_images:
         places = read_places(config.train, min_images=training.min_images_of_place)
@@ -204,7 +207,7 @@ def _own_training_set(
         steps = steps_per_epoch(training, groups_of(training, places))
     except InputError as error:
         raise InputError(f"{draft.name}: {error}") from error
-    return places, steps * training.epochs
+    return places, steps
 
 
 def _drafts(config: ComparisonConfig) -> Iterator[Variant]:
@@ -305,7 +308,7 @@ def _fitted(
     return dataclasses.replace(
         training,
         loss=_own_places(training.loss),
-        optimiser=with_short_warmup(training.optimiser, places // size * epochs),
+        optimiser=with_short_warmup(training.optimiser, places // size * epochs, places // size),
         places_per_batch=size,
         images_per_place=views,
         min_images=views,

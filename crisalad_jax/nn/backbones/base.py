@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
@@ -147,7 +147,7 @@ class Backbone(Part, abc.ABC):
         """Undo `split_blocks`."""
         return params
 
-    def adopt(self, config: Self, params: Any, fresh: Any) -> tuple[Self, Any]:
+    def adopt(self, config: Any, params: Any, fresh: Any) -> tuple[Any, Any]:
         """Return another's configuration and parameters, changed as far as this one can do with.
 
         Args:

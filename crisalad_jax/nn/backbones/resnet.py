@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import jax
 from jaxtyping import PRNGKeyArray
@@ -95,7 +95,7 @@ class ResNetConfig(StagedBackbone):
             tuple(Stage(tuple(self._init_stage(keys[i], i))) for i in range(self.stages)),
         )
 
-    def adopt(self, config: Self, params: Stages, fresh: Stages) -> tuple[Self, Stages]:
+    def adopt(self, config: Any, params: Stages, fresh: Any) -> tuple[Any, Stages]:
         """Take the first stages of a backbone with more, as torchvision's files have four."""
         del fresh
         stages = min(config.stages, self.stages)

@@ -11,7 +11,7 @@ import itertools
 import math
 import operator
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -217,7 +217,7 @@ class VisionTransformer(Backbone):
         parts = tuple(jax.tree.map(operator.itemgetter(half), stack) for half in halves)
         return dataclasses.replace(params, blocks=parts)
 
-    def adopt(self, config: Self, params: ViT, fresh: ViT) -> tuple[Self, ViT]:
+    def adopt(self, config: Any, params: ViT, fresh: ViT) -> tuple[Any, ViT]:
         """Take the fresh adapters where the other's are of another kind or size."""
         if config.adapter == self.adapter:
             return config, params

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from crisalad_jax.nn.aggregators.netvlad import NetVlad, shares
-from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.layers import at_least_float32, l2_normalise
 from crisalad_jax.nn.model import Crisalad, Images, unit_features
 from crisalad_jax.nn.projection import project
@@ -78,8 +78,9 @@ def shape(config: ModelConfig) -> tuple[int, int]:
     """Return the number of windows of an image, of all sizes, and the length of a descriptor.
 
     Raises:
-        InputError: what `windows_of` raises.
+        InputError: what `windows_of` raises; windows' descriptors would be no unit vectors.
     """
+    check_unit_length(config, "rerank")
     windows = sum(rows * columns for _, _, (rows, columns) in windows_of(config))
     return windows, config.descriptor_dim
 

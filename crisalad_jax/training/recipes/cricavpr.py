@@ -23,5 +23,6 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
         ),
         places_per_batch=72,
         epochs=10,
+        select_by="R@1+R@5",
         patience=10,
     )

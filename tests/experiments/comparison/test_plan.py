@@ -16,7 +16,7 @@ from tests.conftest import MODEL
 
 
 def test_batches_fit_the_training_set(config):
-    """Eight places of three images: all in one batch, a fifth of three steps to warm up."""
+    """Eight places of three images: all in one batch, a quarter of three steps to warm up."""
     (variant,) = prepare(config).variants
     training = variant.training
     assert (training.places_per_batch, training.images_per_place) == (8, 3)
@@ -56,12 +56,12 @@ def test_a_shortened_warm_up_is_told_and_stands_in_the_configuration(settings):
     with pytest.warns(Note) as caught:
         prepared = prepare(ComparisonConfig(**settings | {"names": names, "epochs": 32}))
     assert [str(each.message) for each in caught] == [
-        "warm-up: found 30 steps, shortened to 6 of the run's 32, for crisalad, salad"
+        "warm-up: found 30 steps, shortened to 8 of the run's 32, for crisalad, salad"
     ]
-    assert {v.training.optimiser.warmup_steps for v in prepared.variants} == {6}
+    assert {v.training.optimiser.warmup_steps for v in prepared.variants} == {8}
 
 
-def test_a_recipe_from_a_backbone_warms_up_for_a_fifth_too(settings, shared, monkeypatch):
+def test_a_recipe_from_a_backbone_warms_up_for_a_quarter_too(settings, shared, monkeypatch):
     def slow(model, preset):
         return TrainConfig(model=model, optimiser=OptimiserConfig(warmup_steps=30))
 

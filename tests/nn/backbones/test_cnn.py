@@ -14,6 +14,7 @@ import torch
 from torch.nn import functional as F
 
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.backbones import stages
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest
 from crisalad_jax.nn.backbones.resnet import Layers, ResNetConfig
 from crisalad_jax.nn.backbones.stages import StagedBackbone
@@ -181,3 +182,21 @@ def test_facets_are_refused() -> None:
 def test_a_number_of_stages() -> None:
     with pytest.raises(InputError, match=r"ResNetConfig.stages: found 5, expected 1 to 4"):
         ResNetConfig(stages=5)
+
+
+def test_a_batch_in_parts_is_the_whole_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU; parts of two images have the features of all at once."""
+    params = random_params(SMALL)
+    images = np.random.default_rng(0).normal(size=(6, *SMALL.image_size, 3)).astype(np.float32)
+    found = {}
+    for parts in (1, 3, 6):
+        monkeypatch.setattr(stages, "parts_for_caches", lambda images, at_once, n=parts: n)
+        apply = jax.jit(lambda p, x: SMALL.backbone.apply(p, x, FeatureRequest(), remat="none"))
+        assert apply.trace(params.backbone, images).jaxpr.pretty_print().count(" scan[") == (
+            parts > 1
+        )
+        found[parts] = apply(params.backbone, images).patches
+    for parts in (3, 6):
+        # Float32, of sums of thousands in another order; 1e-6 of the largest is measured.
+        largest = np.abs(found[1]).max()
+        np.testing.assert_allclose(found[parts] / largest, found[1] / largest, atol=4e-6, rtol=0)

@@ -60,6 +60,15 @@ def reranking(name: str, top: int) -> Reranking:
     return Reranking(name, top, own, config)
 
 
+@pytest.mark.parametrize("name", [name for name in stage._METHODS if "netvlad" in name])
+def test_windows_of_any_length_are_refused(name: str) -> None:
+    """Their inner products would not tell which is the nearest."""
+    kept = dataclasses.replace(NETVLAD, projection=ProjectionConfig(dim=24, renormalise=False))
+    with pytest.raises(InputError, match=r"^rerank: found a model whose projection leaves lengths"):
+        Reranking(name, 2).check(kept)
+    Reranking(name, 2).check(NETVLAD)
+
+
 NAMES = pytest.mark.parametrize("name", list(stage._METHODS))
 
 
