@@ -16,6 +16,7 @@ from crisalad_jax.checkpoints.layouts import (
     to_state,
 )
 from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
@@ -54,7 +55,10 @@ def expected(name: str) -> tuple[str, ModelConfig]:
     if name == "CricaVPR":
         adapter = AdapterConfig(kind="multi-resolution")
         backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=adapter)
-        return "cricavpr", ModelConfig(aggregator="gem-pyramid", backbone=backbone)
+        floats = PreprocessingConfig(antialias=False, pixels="floats")
+        return "cricavpr", ModelConfig(
+            aggregator="gem-pyramid", backbone=backbone, preprocessing=floats
+        )
     preset = "b14" if name == "dino_salad" else f"{name.removeprefix('dinov2_vit')[0]}14"
     backbone = dataclasses.replace(
         PRESETS[preset].backbone, adapter=NO_ADAPTER, registers=4 if "reg4" in name else 0

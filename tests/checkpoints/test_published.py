@@ -20,7 +20,7 @@ from crisalad_jax.checkpoints.matlab_io import AVERAGE
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
-from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
+from crisalad_jax.nn.backbones.dinov3 import DinoV3Config, rotary_periods
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -311,7 +311,9 @@ def inferred(name: str) -> ModelConfig:
         aggregator=ClassTokenConfig(),
         cross_image=CrossImageConfig(layers=0),
     )
-    return infer(blank(public_shapes(alone, "dinov3")), source=name)[1]
+    state = blank(public_shapes(alone, "dinov3"))
+    periods = rotary_periods(alone.backbone.dim // alone.backbone.heads)
+    return infer(state | {"rope_embed.periods": periods.astype(np.float32)}, source=name)[1]
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
