@@ -1,5 +1,6 @@
 """NetVLAD's MATLAB file, against scipy's reader and hloc's torch module."""
 
+import dataclasses
 import pathlib
 
 import jax
@@ -9,10 +10,12 @@ import pytest
 import scipy.io
 
 from crisalad_jax import describe
-from crisalad_jax.checkpoints.layouts import infer, to_params
+from crisalad_jax.checkpoints.layouts import infer, public_shapes, to_params, to_state
 from crisalad_jax.checkpoints.layouts.cnn import vgg_numbers
 from crisalad_jax.checkpoints.matlab_io import AVERAGE, read_matlab, write_matlab
 from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint
+from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 from parity import zoo
 
@@ -32,6 +35,23 @@ def matlab_state(hloc: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     state["net.layers[33].weights[0]"] = hloc["whiten.weight"].T
     state["net.layers[33].weights[1]"] = hloc["whiten.bias"]
     return state
+
+
+def small_network(average: np.ndarray) -> dict[str, np.ndarray]:
+    """A whole NetVLAD of two clusters and three numbers, with an average image."""
+    config = dataclasses.replace(
+        infer(blank(zoo.layout("netvlad_vgg16_hloc_mat")), source="zoo")[1],
+        aggregator=NetVladConfig(clusters=2),
+        projection=ProjectionConfig(dim=3),
+    )
+    rng = np.random.default_rng(1)
+    shapes = public_shapes(config, "netvlad-matlab")
+    state = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    return state | {AVERAGE: average}
+
+
+def blank(shapes: dict[str, list[int]]) -> dict[str, np.ndarray]:
+    return {name: np.broadcast_to(np.float32(1), tuple(shape)) for name, shape in shapes.items()}
 
 
 def tiny() -> dict[str, np.ndarray]:
@@ -86,6 +106,45 @@ def test_every_cut_is_told(tmp_path: pathlib.Path) -> None:
         (tmp_path / "cut.mat").write_bytes(whole[:size])
         with pytest.raises(InputError, match=r"cut\.mat"):
             read_matlab(tmp_path / "cut.mat")
+
+
+@pytest.mark.parametrize(
+    "first", [(123.68, 116.779, 103.939), (122.74493, 114.89767, 101.59195), (0, 0, 0)]
+)
+def test_the_mean_is_the_files_first_pixel_to_the_bit(tmp_path: pathlib.Path, first) -> None:
+    """hloc subtracts the pixel at [0, 0] from all, whatever the image's size."""
+    average = np.random.default_rng(0).uniform(0, 255, (4, 6, 3)).astype(np.float32)
+    average[0, 0] = first
+    state = small_network(average)
+    write_matlab(tmp_path / "net.mat", state)
+    read = read_checkpoint(tmp_path / "net.mat")
+    mean = np.float32(255) * np.array(read.config.preprocessing.mean)
+    np.testing.assert_array_equal(mean.astype(np.float32), average[0, 0])
+    convert(tmp_path / "net.mat", tmp_path / "ours.safetensors")
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.mat")
+    back = read_matlab(tmp_path / "back.mat")
+    assert back.keys() == state.keys()
+    for name, array in state.items():
+        np.testing.assert_array_equal(back[name], array)
+
+
+def test_a_model_from_another_file_is_written_with_its_own_mean() -> None:
+    state = small_network(np.full((1, 1, 3), 100, np.float32))
+    config = infer(state, source="net")[1]
+    params, _ = to_params(state, config, "netvlad-matlab", source="net")
+    written = to_state(params, config, "netvlad-matlab", {})
+    assert written[AVERAGE].shape == (224, 224, 3)
+    np.testing.assert_array_equal(written[AVERAGE], np.float32(100))
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 3, 4)])
+def test_an_average_that_is_no_image_is_refused(shape: tuple[int, ...]) -> None:
+    state = small_network(np.zeros(shape, np.float32))
+    config = infer(state, source="net.mat")[1]
+    with pytest.raises(
+        InputError, match=r"net\.mat: .*averageImage found .*expected \(224, 224, 3\)"
+    ):
+        to_params(state, config, "netvlad-matlab", source="net.mat")
 
 
 @pytest.mark.slow

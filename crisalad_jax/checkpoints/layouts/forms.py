@@ -39,6 +39,13 @@ class Extra(NamedTuple):
     value: float | tuple[float, ...] = 0.0
     """Its initial value, for a model that was not read from such a file."""
     form: Form = SAME
+    free_axes: int = 0
+    """Number of leading axes whose lengths may differ from file to file."""
+
+    def fits(self, shape: tuple[int, ...]) -> bool:
+        """Return whether an array of this shape can be the extra."""
+        free = self.free_axes
+        return len(shape) == len(self.shape) and shape[free:] == self.shape[free:]
 
     def stored(self, extras: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the array as their files have it; an initial value takes no memory."""

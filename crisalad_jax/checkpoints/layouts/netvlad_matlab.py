@@ -89,7 +89,9 @@ register_over_cnn(
 
 
 def _matlab_lines(config: ModelConfig) -> Lines:
-    yield Extra("average_image", AVERAGE, (_AVERAGE_SIDE, _AVERAGE_SIDE, 3), np.float32)
+    mean = tuple(255 * value for value in config.preprocessing.mean)
+    shape = (_AVERAGE_SIDE, _AVERAGE_SIDE, 3)
+    yield Extra("average_image", AVERAGE, shape, np.float32, mean, free_axes=2)
     for (stage, layer), number in vgg_numbers():
         ours, theirs = f"backbone.blocks.{stage}.layers.{layer}", f"net.layers[{number}]"
         yield Entry((f"{ours}.weight",), (f"{theirs}.weights[0]",), SAME)
@@ -101,13 +103,18 @@ def _matlab_lines(config: ModelConfig) -> Lines:
 
 
 def _mean_of(state: State) -> tuple[float, float, float]:
-    """Return the average image's first pixel, which hloc subtracts from all, or else `_MEAN`."""
+    """Return the average image's first pixel, which hloc subtracts from all."""
     image = state[AVERAGE]
-    if image.ndim != 3 or not image.any():
-        return _MEAN
-    # Rounded, because the file has it in float32.
-    red, green, blue = (round(float(value), 3) for value in image[0, 0])
+    if image.ndim != 3 or image.shape[-1] != 3 or not image.size:
+        return _MEAN  # the layout's table refuses the image by its shape
+    red, green, blue = map(_as_written, image[0, 0])
     return red, green, blue
+
+
+def _as_written(value: np.float32) -> float:
+    """Return a number of three decimals, such as 123.68, where float32 has just rounded it."""
+    short = round(float(value), 3)
+    return short if np.float32(short) == value else float(value)
 
 
 def _matlab_infer(state: State) -> ModelConfig:

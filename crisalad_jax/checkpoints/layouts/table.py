@@ -100,7 +100,7 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
     lines = [line for line in table(config, layout) if isinstance(line, Extra)]
     given = [(line, (extras or {})[line.name]) for line in lines if line.name in (extras or {})]
     for line, array in given:
-        if (array.shape, array.dtype) != (line.shape, np.dtype(line.dtype)):
+        if not line.fits(array.shape) or array.dtype != np.dtype(line.dtype):
             raise InputError(
                 f"extra.{line.name}: found {array.dtype} {array.shape}, expected "
                 f"{np.dtype(line.dtype)} {line.shape}"
@@ -172,6 +172,10 @@ def to_params(
         InputError: naming `source` and every name that is missing, unknown or misshaped.
     """
     shapes = public_shapes(config, layout)
+    for line in table(config, layout):
+        if isinstance(line, Extra) and line.free_axes and line.theirs in state:
+            found = state[line.theirs].shape
+            shapes[line.theirs] = found if line.fits(found) else shapes[line.theirs]
     problems = [f"{name} missing" for name in shapes.keys() - state.keys()]
     problems += [f"{name} unknown" for name in state.keys() - shapes.keys()]
     problems += [
