@@ -75,14 +75,6 @@ TOLERANCES: Mapping[str, Mapping[str, Tolerance]] = {
             "steps along other signs remain in the parameters; four times the measured 2.5e-5 "
             "(seed 0: 2e-5)",
         ),
-        "losses, kinks": Tolerance(
-            1.5e-4,
-            "a ReLU whose input rounds to the other side of 0 in step 6, on one of two processors, "
-            "moves a filter elsewhere: three times the 4.8e-5 measured there (on the other 1.6e-6)",
-        ),
-        "trained, kinks": Tolerance(
-            1.2e-3, "the same; three times the 3.9e-4 measured there (on the other 1.6e-5)"
-        ),
         "statistics": Tolerance(
             5e-4,
             "a bias before a batch norm has no gradient but rounding, of which AdamW makes steps, "

@@ -300,7 +300,7 @@ RUNS: tuple[Run, ...] = (
     Run("training CriSALAD's adapters and head", CRISALAD, "adapters+head"),
     Run("training CriSALAD's last block and head", CRISALAD, "last-1-blocks+head"),
     Run("training all of CriSALAD", CRISALAD, "all"),
-    Run("training CricaVPR's adapters and head", CRICAVPR, "adapters+head", kinks=True),
+    Run("training CricaVPR's adapters and head", CRICAVPR, "adapters+head"),
 )
 
 

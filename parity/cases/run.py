@@ -22,7 +22,7 @@ from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import merge_params
 from parity.cases.case import LAYOUT, STEPS, build, cancelling, convert, random, split
 from parity.cases.parts import LOSS, torch_normalise
-from parity.compare import FROZEN, TOLERANCES, Arrays, Row, Tolerance, as_double, compare
+from parity.compare import FROZEN, TOLERANCES, Arrays, Row, as_double, compare
 from parity.reference.training import train
 
 OPTIMISER = OptimiserConfig(learning_rate=1e-3)
@@ -40,8 +40,6 @@ class Run:
     model: ModelConfig
     trainable: str
     size: tuple[int, int] = (42, 56)
-    kinks: bool = False
-    """Whether a ReLU is measured to switch on one side only, after which the sides drift apart."""
 
 
 class Batch(NamedTuple):
@@ -86,20 +84,15 @@ def check_run(run: Run, precision: str, seed: int) -> list[Row]:
         {n: x for n, x in state.items() if n not in (*learnt, *measured)} for state in (ours, start)
     )
     tolerances = TOLERANCES[precision]
-
-    def tolerance(what: str) -> Tolerance:
-        past_kinks = f"{what}, kinks"
-        return tolerances[past_kinks if run.kinks and past_kinks in tolerances else what]
-
     rows = [
-        compare(run.name, "losses", precision, our_losses, their_losses, tolerance("losses")),
+        compare(run.name, "losses", precision, our_losses, their_losses, tolerances["losses"]),
         compare(
             run.name,
             "parameters at the end",
             precision,
             trained,
             reference,
-            tolerance("trained"),
+            tolerances["trained"],
             note=_note(their_losses["losses"], trained, reference, origin),
         ),
     ]
