@@ -10,24 +10,27 @@ class Compare(ComparisonFlags):
     """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""
 
     methods: str | None = None
-    """Comma-separated; by default the methods of Table 1 over one backbone: crisalad+netvlad (or
-    gem, conv-ap, patch-netvlad, transvpr, mixvpr: that head with CriSALAD's backbone and training),
-    cosplace-vit, eigenplaces-vit, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is
-    a method too, and so is RECIPE+PART, with a registered part as NAME or KIND:NAME."""
+    """Comma-separated. By default the models of --weights; if there are none, or if they replace
+    methods, those of Table 1 over one backbone: crisalad+netvlad (or gem, conv-ap, patch-netvlad,
+    transvpr, mixvpr: that head with CriSALAD's backbone and training), cosplace-vit,
+    eigenplaces-vit, anyloc, cricavpr, salad, crisalad, boq. Any recipe of `train` is a method too,
+    and so is RECIPE+PART, with a registered part as NAME or KIND:NAME."""
     weights: tuple[str, ...] = ()
-    """NAME=FILE, for each method that is not to be trained: its weights, or a published model's
-    name (`crisalad models`)."""
+    """NAME=FILE or the NAME of a published model (`crisalad models`). If NAME is a method's, the
+    weights are that method's, which is not trained. Any other name is a line of its own, whatever
+    model the file holds."""
     rerank: int = 20
     """So many first retrievals Patch-NetVLAD and TransVPR rank anew."""
 
 
 def run(arguments: Compare) -> None:
     """Compare the methods, and print the tables."""
-    from crisalad_jax.experiments.comparison import METHODS, ComparisonConfig
+    from crisalad_jax.experiments.comparison import ComparisonConfig, names_to_compare
 
+    methods = None if arguments.methods is None else names_of(arguments.methods)
     config = ComparisonConfig(
         "compare",
-        tuple(METHODS) if arguments.methods is None else names_of(arguments.methods),
+        names_to_compare(methods, arguments.weights),
         **settings_of(arguments),
         weights=arguments.weights,
         rerank=arguments.rerank,

@@ -8,7 +8,12 @@ from crisalad_jax.experiments.comparison.ablation import (
 )
 from crisalad_jax.experiments.comparison.compare import compare
 from crisalad_jax.experiments.comparison.methods import METHODS, ComparedMethod
-from crisalad_jax.experiments.comparison.plan import ComparisonConfig, Prepared, prepare
+from crisalad_jax.experiments.comparison.plan import (
+    ComparisonConfig,
+    Prepared,
+    names_to_compare,
+    prepare,
+)
 from crisalad_jax.experiments.comparison.runner import carry_out, claim
 from crisalad_jax.experiments.comparison.summary import Recall, Row, Summary, summarise
 
@@ -27,6 +32,7 @@ __all__ = [
     "carry_out",
     "claim",
     "compare",
+    "names_to_compare",
     "prepare",
     "summarise",
 ]

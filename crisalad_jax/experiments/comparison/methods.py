@@ -87,6 +87,18 @@ def method_of(name: str, preset: str) -> ComparedMethod:
     return METHODS.get(whole, ComparedMethod(whole, whole))
 
 
+def is_method(name: str) -> bool:
+    """Return whether a name is a method's or a recipe's, or spells out RECIPE+PART or KIND:NAME.
+
+    A part's name alone is none: with weights it may name any model.
+
+    Example:
+        >>> is_method("salad"), is_method("crisalad+gem"), is_method("megaloc")
+        (True, True, False)
+    """
+    return name in METHODS or name in RECIPES or name in OLD_NAMES or "+" in name or ":" in name
+
+
 def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> TrainConfig:
     """Look up how a method is trained in a comparison.
 

@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -23,7 +23,12 @@ from crisalad_jax.experiments.comparison.ablation import (
     row_labels,
     row_training,
 )
-from crisalad_jax.experiments.comparison.methods import method_of, method_training
+from crisalad_jax.experiments.comparison.methods import (
+    METHODS,
+    is_method,
+    method_of,
+    method_training,
+)
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
@@ -48,13 +53,14 @@ class ComparisonConfig:
 
     kind: Literal["compare", "ablate"]
     names: tuple[str, ...]
-    """Names that `method_of` or `row_training` looks up."""
+    """Names that `method_of` or `row_training` looks up, and any others that `weights` has."""
     test: tuple[str, ...]
     """Evaluation sets, of any layout that `open_benchmark` knows."""
     train: str | None = None
     """Folder in the layout of GSV-Cities."""
     weights: tuple[str, ...] = ()
-    """Weights of methods that are not trained here, as NAME=FILE."""
+    """Weights of methods that are not trained here, as NAME=FILE, or the NAME of a published model.
+    A name that is no method's is a line of its own, whatever model the file holds."""
     backbone: str | None = None
     """Backbone that training starts from; None trains from nothing, by the recipe `scratch`."""
     preset: str = "b14"
@@ -80,7 +86,8 @@ class ComparisonConfig:
         what = "--methods" if self.kind == "compare" else "--rows"
         for name in self.names:
             if self.kind == "compare":
-                method_of(name, self.preset)
+                if name not in self.models:
+                    method_of(name, self.preset)
             elif name not in ABLATIONS:
                 find_row(name, self.preset)
         folders = [file_name(name) for name in self.names]
@@ -93,6 +100,43 @@ class ComparisonConfig:
         for flag, value, least in (("--epochs", self.epochs, 1), ("--rerank", self.rerank, 2)):
             if value is not None and value < least:
                 raise InputError(f"{flag}: found {value}, expected at least {least}")
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of the lines that are whatever model a file holds, and no method's."""
+        return models_of(self.weights)
+
+
+def models_of(weights: Iterable[str]) -> tuple[str, ...]:
+    """Return the names in NAME=FILE, or NAME alone, that are no method's.
+
+    Example:
+        >>> models_of(["megaloc", "ours=run/best.safetensors", "salad=salad.safetensors"])
+        ('megaloc', 'ours')
+    """
+    names = (text.partition("=")[0] for text in weights)
+    return tuple(name for name in names if name and not is_method(name))
+
+
+def names_to_compare(methods: Sequence[str] | None, weights: Sequence[str]) -> tuple[str, ...]:
+    """Return the lines of a comparison: the methods, and the models that weights add.
+
+    Args:
+        methods: names of methods. None stands for those of `weights`, if one of them is no
+            method's, and else for all of `METHODS`.
+        weights: NAME=FILE, or the name of a published model.
+
+    Returns:
+        The names, each once.
+
+    Example:
+        >>> names_to_compare(None, ["megaloc", "salad"]), names_to_compare(["boq"], ["megaloc"])
+        (('megaloc', 'salad'), ('boq', 'megaloc'))
+    """
+    models = models_of(weights)
+    if methods is None:
+        methods = [text.partition("=")[0] for text in weights] if models else list(METHODS)
+    return tuple(methods) + tuple(name for name in models if name not in methods)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +199,7 @@ def prepare(config: ComparisonConfig) -> Prepared:
     benchmarks = [open_benchmark(path) for path in config.test]
     for benchmark in benchmarks:
         benchmark.ground_truth()
-    drafts = list(_drafts(config))
+    drafts = list(_drafts(config, weights))
     # A vocabulary needs training images too, although nothing trains.
     need = [draft.run for draft in drafts if draft.run not in weights]
     if need and config.train is None:
@@ -184,7 +228,9 @@ def prepare(config: ComparisonConfig) -> Prepared:
         else:
             own = None
         file = weights.get(draft.run)
-        model = training.model if file is None else _checked(draft, file, config)
+        model = training.model
+        if file is not None and draft.name not in config.models:
+            model = _checked(draft, file, config)
         variants.append(
             dataclasses.replace(draft, training=training, weights=file, model=model, places=own)
         )
@@ -210,10 +256,15 @@ def _own_training_set(
     return places, steps
 
 
-def _drafts(config: ComparisonConfig) -> Iterator[Variant]:
-    """Yield the variants as their recipes define them."""
+def _drafts(config: ComparisonConfig, weights: Mapping[str, pathlib.Path]) -> Iterator[Variant]:
+    """Yield the variants as their recipes define them, or as the files hold them."""
     from_nothing = config.backbone is None
     for name in config.names:
+        if name in config.models:
+            model = load_weights(weights[name])[1].resized(config.image_size, config.resize)
+            training = TrainConfig(model=model, trainable="head")
+            yield Variant(name, (name,), name, training, True, None, weights[name], model)
+            continue
         rerank = None
         if config.kind == "compare":
             method = method_of(name, config.preset)
@@ -238,15 +289,19 @@ def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
     files: dict[str, pathlib.Path] = {}
     for text in config.weights:
         name, separator, file = text.partition("=")
-        if not separator or not file:
-            raise InputError(f"--weights: found {text!r}, expected NAME=FILE")
+        if not name or (separator and not file):
+            raise InputError(
+                f"--weights: found {text!r}, expected NAME=FILE, or the NAME of a published model"
+            )
         if name not in config.names:
             raise InputError(
                 f"--weights: found {name!r}, expected one of those compared, "
                 f"{', '.join(config.names)}"
             )
-        run = method_of(name, config.preset).recipe if config.kind == "compare" else name
-        path = find_weights(file)
+        run = name
+        if config.kind == "compare" and name not in config.models:
+            run = method_of(name, config.preset).recipe
+        path = find_weights(file or name)
         if files.setdefault(run, path) != path:
             raise InputError(
                 f"--weights: found {files[run]} and {path} for {run}, expected one file: methods "

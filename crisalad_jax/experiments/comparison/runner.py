@@ -25,6 +25,7 @@ from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.config.parts import parts_of
 from crisalad_jax.config.source import source_digest
 from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.images import read_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import right_retrievals
 from crisalad_jax.evaluation.results import GroupingResult
@@ -38,6 +39,7 @@ from crisalad_jax.experiments.comparison.records import advised, is_number, read
 from crisalad_jax.experiments.comparison.timing import Race, describing, is_absolute, machine, race
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
@@ -132,7 +134,7 @@ def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = 
 
 def _carry_out(prepared: Prepared, out: pathlib.Path, say: Say, quiet: bool) -> None:
     claim(out, prepared)
-    say(_start_words(prepared.config))
+    say(_start_words(prepared))
     left = [unit for unit in prepared.units if not _is_done(prepared, out, *unit)]
     total, started = len(prepared.units), time.monotonic()
     for number, (variant, seed) in enumerate(left):
@@ -150,7 +152,10 @@ def _carry_out(prepared: Prepared, out: pathlib.Path, say: Say, quiet: bool) -> 
         write_json(out / "speed.json", _race(prepared, out, quiet))
 
 
-def _start_words(config: ComparisonConfig) -> str:
+def _start_words(prepared: Prepared) -> str:
+    config = prepared.config
+    if all(variant.weights is not None for variant in prepared.variants):
+        return f"{len(config.names)} to compare, all from files"
     start = "from nothing" if config.backbone is None else f"from {config.backbone}"
     return f"{len(config.names)} to compare, {config.preset}, what is trained starts {start}"
 
@@ -327,7 +332,9 @@ def _race(prepared: Prepared, out: pathlib.Path, quiet: bool) -> dict[str, Any]:
 
 def _describing(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Callable[[], Any]:
     params = _model(prepared, out, variant, variant.seeds(1)[0], quiet=True)
-    return describing(params, variant.model, prepared.config.batch_size)
+    # Of the first set's size, which models that take images at their own size go by.
+    image = prepare_image(read_image(prepared.benchmarks[0].queries[0]), variant.model)
+    return describing(params, variant.model, image, prepared.config.batch_size)
 
 
 def read_race(out: pathlib.Path, names: set[str]) -> tuple[Race, dict[str, Any]]:

@@ -224,13 +224,18 @@ def _notes(
 ) -> list[str]:
     config = prepared.config
     title = reference.labels[0]
-    notes = [
+    interval = "95 % by bootstrap over the queries, as if they were independent"
+    recalls = (
         "Recalls in percent of all queries: the mean over the seeds ± their standard deviation, "
-        "and 95 % by bootstrap over the queries, as if they were independent. "
-        f"Seeds of all but models from files: {config.seeds}. Weights after the last step, nothing "
-        "selected on a test set.",
-        f"Images/s: describing batches of {measured['batch_size']} alone, all models in turns, on "
-        f"{measured['device']}"
+        f"and {interval}. Seeds of all but models from files: {config.seeds}. Weights after the "
+        "last step, nothing selected on a test set."
+    )
+    if all(variant.weights is not None for variant in prepared.variants):
+        recalls = f"Recalls in percent of all queries, and {interval}. All models are from files."
+    notes = [
+        recalls,
+        f"Images/s: describing batches of {measured['batch_size']} of the first set's images, "
+        f"each alone, all models in turns, on {measured['device']}"
         + ("." if measured["absolute"] else f", over {title}'s.")
         + (" Ranking anew comes on top." if any(v.rerank for v in prepared.variants) else ""),
     ]

@@ -16,6 +16,8 @@ from crisalad_jax.utils.progress import progress_bar
 
 _CALLS = 3
 """Number of calls of each in a round; their median counts."""
+_LONG = 3.0
+"""Seconds of a call that is made once in a round: a few of it vary less than many short ones."""
 
 
 class Race(NamedTuple):
@@ -41,9 +43,10 @@ def race(
 ) -> Race:
     """Time calls in turns; each call does all of its work and waits for it.
 
-    The first call of each, which compiles, does not count, nor does the first of each turn. A
-    contender makes its call for a turn and drops it: one model is in memory at a time. A progress
-    bar counts the turns, unless `quiet`.
+    The first call of each, which compiles, does not count, nor does the first of each turn. A call
+    of `_LONG` and longer is then made once, any other `_CALLS` times. A contender makes its call
+    for a turn and drops it: one model is in memory at a time. A progress bar counts the turns,
+    unless `quiet`.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     with progress_bar("speed", (1 + rounds) * len(contenders), "turns", quiet=quiet) as bar:
@@ -53,23 +56,36 @@ def race(
         for _ in range(rounds):
             for name, ready in contenders.items():
                 call = ready()
-                call()
-                times = []
-                for _ in range(_CALLS):
-                    started = time.perf_counter()
-                    call()
-                    times.append(time.perf_counter() - started)
+                calls = 1 if _seconds(call) >= _LONG else _CALLS
+                times = [_seconds(call) for _ in range(calls)]
                 seconds[name].append(statistics.median(times))
                 bar.advance(1)
     return Race(seconds)
 
 
-def describing(params: Crisalad, config: ModelConfig, batch_size: int) -> Callable[[], Any]:
-    """Make a call that describes a batch, each image alone, with the programs of `evaluate`."""
+def _seconds(call: Callable[[], Any]) -> float:
+    started = time.perf_counter()
+    call()
+    return time.perf_counter() - started
+
+
+def describing(
+    params: Crisalad, config: ModelConfig, image: np.ndarray, batch_size: int
+) -> Callable[[], Any]:
+    """Make a call that describes a batch, each image alone, with the programs of `evaluate`.
+
+    Args:
+        params: the model's parameters.
+        config: the model.
+        image: a prepared image, which is repeated.
+        batch_size: number of images.
+
+    Returns:
+        The call, which takes no argument and waits for its result.
+    """
     devices = devices_for(batch_size)
     shared = devices.replicate(params)
-    pixels = np.random.default_rng(0).integers(0, 256, (batch_size, *config.input_size, 3))
-    images = devices.shard_batch(pixels.astype(np.uint8))
+    images = devices.shard_batch(np.repeat(image[None], batch_size, axis=0))
     mask = self_mask(batch_size)
 
     def call() -> None:

@@ -11,15 +11,20 @@ import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.cli import main
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments import comparison
 from crisalad_jax.experiments.comparison import (
     METHODS,
     ComparedMethod,
     ComparisonConfig,
+    names_to_compare,
     plan,
     runner,
 )
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import init_crisalad
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
@@ -224,6 +229,34 @@ def test_weights_are_not_trained(shared, params, benchmark, settings, tmp_path, 
         # Of one trial the interval is the binomial one, as `evaluate` has it.
         assert recalls[1].interval == result.intervals[1]
     assert (single.trained, single.training) == (None, None)
+
+
+def test_models_of_any_family_are_lines_of_their_own(shared, benchmark, settings, tmp_path):
+    """Two files that no recipe makes, and no training set: one takes images at their own size."""
+    _, model = load_weights(shared / "weights.safetensors")
+    small = ResNetConfig(layers=18, stages=1)
+    native = PreprocessingConfig(size_rule="native")
+    plain = {"aggregator": "gem", "cross_image": CrossImageConfig(layers=0)}
+    models = {
+        "ours": dataclasses.replace(model, **plain),
+        "netvlad": ModelConfig(model.image_size, native, small, **plain),
+    }
+    weights = []
+    for name, config in models.items():
+        weights.append(f"{name}={tmp_path / name}.safetensors")
+        made = init_crisalad(jax.random.key(1), config)
+        save_weights(tmp_path / f"{name}.safetensors", made, config)
+    names = names_to_compare(None, weights)
+    options = {"train": None, "weights": tuple(weights), "names": names}
+    summary = run(ComparisonConfig(**settings | options), tmp_path / "out")
+    assert [row.labels for row in summary.rows] == [("ours",), ("netvlad",)]
+    for row in summary.rows:
+        params, config = load_weights(tmp_path / f"{row.name}.safetensors")
+        (expected,) = evaluate(params, config, benchmark, batch_size=BATCH, quiet=True)
+        (recalls,) = row.recalls.values()
+        assert recalls[1].mean == expected.recalls[1]
+        assert row.dimension == config.descriptor_dim
+    assert "All models are from files." in summary.notes[0]
 
 
 def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeypatch):
