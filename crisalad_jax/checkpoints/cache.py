@@ -82,10 +82,10 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
     with next_writer(_folder(model)):
         if not _is_ready(model):
             _check_torch(model)
-            fresh = not published.is_file()
-            if fresh:
-                _download(model, published, quiet=quiet)
-            _convert(model, published, fresh=fresh, quiet=quiet)
+            address = None
+            if not published.is_file():
+                address = _download(model, published, quiet=quiet)
+            _convert(model, published, address, quiet=quiet)
     return _weights(model)
 
 
@@ -183,13 +183,13 @@ def _addresses(model: Published) -> list[str]:
     return [f"{mirror.rstrip('/')}/{urllib.parse.quote(model.file)}", *addresses]
 
 
-def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> None:
-    """Download the published file, from the mirror if that has it."""
+def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> str:
+    """Download the published file, from the mirror if that has it; return its address."""
     addresses = _addresses(model)
     for address in addresses:
         try:
             download(address, target, label=model.name, quiet=quiet)
-            return
+            return address
         except MissingFileError as error:
             if address == addresses[-1]:
                 raise InputError(
@@ -198,6 +198,7 @@ def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> None:
             tell(f"{address}: found no such file; looking at {model.url}")
         except InputError as error:
             raise InputError(f"{model.name}: {error}") from error
+    raise AssertionError("no address")  # `_check_obtainable` has seen one
 
 
 def _read(model: Published, published: pathlib.Path, *, quiet: bool) -> Checkpoint:
@@ -207,12 +208,20 @@ def _read(model: Published, published: pathlib.Path, *, quiet: bool) -> Checkpoi
     return read_vocabulary(published, cached_weights(PUBLISHED[model.backbone], quiet=quiet))
 
 
-def _convert(model: Published, published: pathlib.Path, *, fresh: bool, quiet: bool) -> None:
+def _convert(
+    model: Published, published: pathlib.Path, address: str | None, *, quiet: bool
+) -> None:
     """Make the weights of the published file, and record both.
+
+    Args:
+        model: the model.
+        published: its file.
+        address: from where it was downloaded just now; None for a file that was there before.
+        quiet: no progress bar.
 
     Raises:
         InputError: the file is not the one of the record, or not the model. Then it is removed, if
-            it is `fresh`: downloaded just now.
+            it was downloaded just now.
     """
     record, digest = _record(model), sha256_of(published)
     try:
@@ -227,9 +236,14 @@ def _convert(model: Published, published: pathlib.Path, *, fresh: bool, quiet: b
                 f"({checkpoint.layout}), expected {model.descriptor} and {model.parameters}"
             )
     except InputError as error:
-        if fresh:
+        if address is not None:
             published.unlink()
         raise InputError(f"{model.name}: {error}") from error
     save_weights(_weights(model), checkpoint.params, checkpoint.config, extras=checkpoint.extras)
-    known = {"url": model.url, "file": model.file, "sha256": digest, "version": VERSION}
+    known = {
+        "url": address or (record or {}).get("url"),
+        "file": model.file,
+        "sha256": digest,
+        "version": VERSION,
+    }
     write_json(_folder(model) / _RECORD, known | _stamp(published))

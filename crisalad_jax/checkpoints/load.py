@@ -85,9 +85,13 @@ def find_weights(weights: str | os.PathLike[str], *, quiet: bool = False) -> pat
         for each in (model, *filter(None, [PUBLISHED.get(model.backbone)])):
             tell(f"{each.name}: {each.licence.words} ({each.repository})")
         return cached_weights(model, quiet=quiet)
-    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name) and not os.path.lexists(path):
+    near = nearest_names(path.stem)
+    is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name) is not None
+    # A file that looks like a published model's: MegaLoc.pth.
+    is_like_one = path.parent == pathlib.Path() and bool(near)
+    if (is_name or is_like_one) and not os.path.lexists(path):
         raise InputError(
             f"{name}: found no such file, and no published model of this name, expected one of the "
-            f"two (`crisalad models` lists them{nearest_names(name)})"
+            f"two (`crisalad models` lists them{near})"
         )
     return path

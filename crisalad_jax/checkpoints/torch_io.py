@@ -36,7 +36,7 @@ from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_source, check_target
+from crisalad_jax.utils.files import atomic_path, check_source, check_target, is_html
 
 SUFFIXES = {
     "torch": (".pth", ".pt", ".ckpt"),
@@ -93,6 +93,9 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     """
     path = pathlib.Path(path)
     check_source(path, "a checkpoint")
+    with path.open("rb") as file:
+        if is_html(file.read(512)):
+            raise InputError(f"{path}: found a page of HTML, expected a checkpoint")
     if is_ours(path):
         params, config = load_weights(path, verify=verify)
         return Checkpoint(params, config, load_extras(path), None)

@@ -21,7 +21,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.files import check_source, is_html
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
@@ -198,15 +198,29 @@ def _check_not_public(path: pathlib.Path, expected: str) -> None:
     check_source(path, expected)
     try:
         with path.open("rb") as file:
-            start = file.read(8)
+            start = file.read(512)
     except OSError:
         return  # the reader tells
-    for beginning, kind in _BEGINNINGS.items():
-        if start.startswith(beginning):
-            ours = path.with_suffix(".safetensors")
-            raise InputError(
-                f"{path}: found {kind}, expected {expected}: crisalad convert {path} {ours}"
-            )
+    if is_html(start):
+        raise InputError(f"{path}: found a page of HTML, expected {expected}")
+    kind = next((what for mark, what in _BEGINNINGS.items() if start.startswith(mark)), None)
+    ours = path.with_suffix(".safetensors")
+    if kind is None and _is_of_another_program(path):
+        kind, ours = "a .safetensors file of another program", path.with_stem(f"{path.stem}-ours")
+    if kind is not None:
+        raise InputError(
+            f"{path}: found {kind}, expected {expected}: crisalad convert {path} {ours}"
+        )
+
+
+def _is_of_another_program(path: pathlib.Path) -> bool:
+    """Return whether a file is a whole one of safetensors without metadata of this package."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            return not any(form in metadata for form in (FORMAT, FORMAT_2, FORMAT_1))
+    except (safetensors.SafetensorError, OSError):
+        return False
 
 
 def _is_pair(value: Any) -> bool:

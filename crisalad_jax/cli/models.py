@@ -10,7 +10,7 @@ import tyro
 from crisalad_jax.checkpoints.cache import cache_folder, is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
 from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
-from crisalad_jax.cli.tables import models_table
+from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,9 +30,13 @@ def run(arguments: Models) -> None:
     if arguments.name is None:
         models = tuple(PUBLISHED.values())
         width = console.width if sys.stdout.isatty() else None
-        console.print(models_table(models, width), crop=False)
+        table = models_table(models, width)
+        console.print(table, crop=False)
+        hidden = MODEL_COLUMNS[len(table.columns) :]
+        if hidden:
+            say(f"left out in {width} columns: {', '.join(hidden)} (crisalad models | less -S)")
         say(f"{len(models)} models; * in the cache, {cache_folder()}")
-        say("crisalad models NAME tells the rest of one: its paper, file and address")
+        say("crisalad models NAME tells all of one: its images, paper, file and address")
         values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
     else:
         values = _facts(published_model(arguments.name))

@@ -82,13 +82,13 @@ def models_table(models: Sequence[Published], width: int | None) -> Table:
         A table that is printed without wrapping.
     """
     rows = [_model_cells(model) for model in models]
-    lengths = (max(map(len, cells)) for cells in zip(_MODEL_COLUMNS, *rows, strict=True))
+    lengths = (max(map(len, cells)) for cells in zip(MODEL_COLUMNS, *rows, strict=True))
     # One space before the first column, and two after each.
     ends = list(itertools.accumulate((length + 2 for length in lengths), initial=1))
     shown = max(1, sum(width is None or end <= width for end in ends[1:]))
     # Without lines between the columns, longer names fit.
     table = Table(box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), width=ends[shown])
-    for name in _MODEL_COLUMNS[:shown]:
+    for name in MODEL_COLUMNS[:shown]:
         right = name in ("descriptor", "parameters")
         table.add_column(name, no_wrap=True, justify="right" if right else "left")
     for cells in rows:
@@ -96,11 +96,11 @@ def models_table(models: Sequence[Published], width: int | None) -> Table:
     return table
 
 
-_MODEL_COLUMNS = ("name", "descriptor", "parameters", "licence", "images", "on GitHub")
+MODEL_COLUMNS = ("name", "descriptor", "parameters", "licence", "images", "on GitHub")
 
 
 def _model_cells(model: Published) -> tuple[str, ...]:
-    """Return what is told of a model, a text for each of `_MODEL_COLUMNS`."""
+    """Return what is told of a model, a text for each of `MODEL_COLUMNS`."""
     return (
         f"{model.name} *" if is_cached(model) else model.name,
         f"{model.descriptor:,}",

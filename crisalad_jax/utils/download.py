@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, told_of, write_json
+from crisalad_jax.utils.files import is_html, read_json, told_of, write_json
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.version import VERSION
 
@@ -238,8 +238,7 @@ class _Transfer:
     def _check_no_page(self, response: Any, first: bytes) -> None:
         """Raise InputError where a page of HTML comes in place of the file."""
         kind = response.headers.get_content_type()
-        begins = first[:512].lstrip().lower().startswith((b"<!doctype html", b"<html"))
-        if kind == "text/html" or begins:
+        if kind == "text/html" or is_html(first):
             raise InputError(
                 f"{self._url}: found a page of HTML, expected the file {self._target.name} (some "
                 "hosts send one after too many downloads, or where a file was removed)"

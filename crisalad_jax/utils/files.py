@@ -29,6 +29,16 @@ LARGEST = 2**30
 the disk may claim any number."""
 
 
+def is_html(start: bytes) -> bool:
+    """Return whether a file that starts so is a page of HTML, sent in place of what was asked for.
+
+    Example:
+        >>> is_html(b"<!DOCTYPE html><title>Quota exceeded</title>")
+        True
+    """
+    return start[:512].lstrip().lower().startswith((b"<!doctype html", b"<html"))
+
+
 def check_source(
     path: str | os.PathLike[str], expected: str, *, largest: int | None = None
 ) -> None:

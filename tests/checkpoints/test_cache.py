@@ -185,6 +185,29 @@ def test_an_unknown_name_is_told_with_the_nearest(server):
     assert server.asked == []
 
 
+@pytest.mark.parametrize(
+    ("asked", "nearest"),
+    [
+        ("MegaLoc.pth", "megaloc"),  # a file that is not here
+        ("boq dinov2", "boq-dinov2"),
+        ("cliquemining", "salad-cm"),  # the name of its file
+        ("hloc", "netvlad-hloc"),  # a part of a name
+        ("Indoor-VPR", "salad-indoor-gb1-10-25"),  # a repository
+        ("cosplace", "cosplace-resnet50-2048"),  # a family: its longest descriptors
+    ],
+)
+def test_names_of_files_repositories_and_families_are_near(asked: str, nearest: str) -> None:
+    with pytest.raises(InputError, match=rf"^{asked}: found no such file, .*\b{nearest}\b"):
+        find_weights(asked)
+
+
+def test_what_is_told_is_of_the_callers_line(model, monkeypatch):
+    """Python shows a warning once for each line of a program: not one of this package."""
+    with pytest.warns(Note) as caught:
+        cj.load("tiny-model")
+    assert {pathlib.Path(each.filename).name for each in caught} == {"test_cache.py"}
+
+
 def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
     monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path / "own"))
     assert cache_folder() == tmp_path / "own"
@@ -330,6 +353,9 @@ def test_a_mirror_is_asked_first(model, server, monkeypatch, tmp_path, kind):
     with pytest.warns(Note, match="licence MIT"):
         cj.load("tiny-model")
     assert [path for path, _ in server.asked] == ([f"/mirror/{FILE}"] if kind == "http" else [])
+    record = json.loads(published.with_name("record.json").read_text())
+    start = server.url("/mirror") if kind == "http" else (tmp_path / "files").as_uri()
+    assert record["url"] == f"{start}/{FILE}"
 
 
 def test_a_mirror_that_is_no_address(model, server, monkeypatch):

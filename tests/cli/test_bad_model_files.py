@@ -156,8 +156,14 @@ def test_public_files_are_told_from_ours_where_weights_are_asked_for(
         )
         assert error.endswith(advice)
     hugging = save(tmp_path / "h.safetensors", salad())
-    words = (f"{hugging}: found metadata ['format'], expected", "`crisalad convert` reads public")
-    fails(capfd, verb, "--weights", hugging, *more, words=words)
+    words = (f"{hugging}: found a .safetensors file of another program, expected",)
+    error = fails(capfd, verb, "--weights", hugging, *more, words=words)
+    assert error.endswith(f"crisalad convert {hugging} {tmp_path / 'h-ours.safetensors'}\n")
+    page = tmp_path / "page.pth"
+    page.write_text("\n<!DOCTYPE html><title>Too many downloads</title>")
+    words = (f"{page}: found a page of HTML, expected",)
+    fails(capfd, verb, "--weights", page, *more, words=words)
+    fails(capfd, "convert", page, tmp_path / "x.safetensors", words=words)
 
 
 def test_a_preset_beside_weights(capfd: Capture, tmp_path: pathlib.Path) -> None:

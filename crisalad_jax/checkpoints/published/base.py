@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import re
 
 from crisalad_jax.utils.errors import InputError
 
@@ -111,9 +112,20 @@ def published_model(name: str) -> Published:
 
 def nearest_names(name: str) -> str:
     """Return the published names most like this one, as the end of a message."""
-    plain = name.lower().replace("_", "-")
+    plain = re.sub(r"[^a-z0-9]+", "-", name.lower())
+    near = [plain] if plain in PUBLISHED else []
+    # Of a family that is named alone the longest descriptors, which recall the most.
+    near += sorted(
+        (each for each in PUBLISHED if each.startswith(f"{plain}-")),
+        key=lambda each: -PUBLISHED[each].descriptor,
+    )
+    near += difflib.get_close_matches(plain, PUBLISHED, n=3, cutoff=0.6)
     # The first part of a name is its family, which is what a user is most likely to know.
-    near = difflib.get_close_matches(plain, PUBLISHED, n=3, cutoff=0.6)
-    near += [each for each in PUBLISHED if each.startswith(plain.partition("-")[0])]
+    family = plain.partition("-")[0]
+    near += [each for each in PUBLISHED if each.startswith(family)]
+    for model in PUBLISHED.values():
+        known = re.sub(r"[^a-z0-9]+", "-", f"{model.name} {model.file} {model.repository}".lower())
+        if plain in known or plain.replace("-", "") in known:
+            near.append(model.name)
     near = list(dict.fromkeys(near))[:3]
     return f"; nearest: {', '.join(near)}" if near else ""

@@ -2,7 +2,11 @@
 
 from crisalad_jax.checkpoints.published.base import Licence, Published, github, register_published
 
-DINOV3_LICENCE = Licence("DINOv3 License", commercial=True)
+DINOV3_LICENCE = Licence(
+    "DINOv3 License",
+    commercial=True,
+    terms="Meta's own terms, which forbid some uses and go with what is made of the model",
+)
 
 for _size, _width, _parameters, _digest in (
     ("s16", 384, 21_600_768, "08c60483"),
