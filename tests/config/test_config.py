@@ -107,7 +107,7 @@ def test_the_recipes_are_their_papers():
     optimiser = cricavpr.optimiser
     assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
     assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
-    assert (cricavpr.epochs, cricavpr.patience, cricavpr.select_by) == (10, 10, "R@1+R@5")
+    assert (cricavpr.epochs, cricavpr.patience, cricavpr.select_by) == (10, 10, "R@5")
     paper = recipe("b14")
     netvlad = recipe("b14", "crisalad+netvlad")
     assert (netvlad.places_per_batch, netvlad.images_per_place) == (48, 4)
