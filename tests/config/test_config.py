@@ -262,6 +262,12 @@ def test_the_recipes_over_resnet_are_as_published():
     assert cosplace.augmentation == ColourCropConfig(0.7, 0.7, 0.7, 0.5, 0.5)
     classes = cosplace.loss.kind.classes
     assert (classes.kind, classes.groups, cosplace.min_images) == ("cells", 8, 10)
+    eigenplaces = recipe("b14", "eigenplaces-turns")
+    # Its code trains in mixed precision, CosPlace's only where --use_amp16 asks for it.
+    assert (cosplace.model.compute_dtype, eigenplaces.model.compute_dtype) == (
+        "float32",
+        "bfloat16",
+    )
     edtformer = recipe("b14", "edtformer")
     assert edtformer.model.descriptor_dim == 4096
     assert edtformer.model.backbone.adapter_dim == 4
