@@ -112,7 +112,8 @@ def test_image_starts_from_directions_of_netvlads_first_scores() -> None:
     features = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
     config = AggregationTokensConfig(tokens=4)
     assert config.count_centroids(6) == 4
-    assert (config.centroid_images, NetVladConfig.centroid_images) == (5000, 500)
+    assert (config.centroid_images, SuperVladConfig.centroid_images) == (5000, 5000)
+    assert (VladBuffConfig.centroid_images, NetVladConfig.centroid_images) == (500, 500)
     params = config.from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
     directions = np.stack([unit(row) for row in CENTROIDS.astype(np.float64)])
     largest = np.sort(features.astype(np.float64) @ directions.T, axis=1)
