@@ -38,10 +38,11 @@ class Train:
     """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
     recipe: str | None = None
     """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
-    crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, supervlad; over ResNet
-    boq-resnet50, conv-ap, cosplace, mixvpr. In part as published: eigenplaces-turns, netvlad-gsv,
-    cosplace-vit, eigenplaces-vit. From random weights: scratch (the default of tiny). RECIPE+PART
-    is a recipe with a registered part in place, such as crisalad+gem."""
+    crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
+    vlad-buff; over ResNet boq-resnet50, conv-ap, cosplace, mixvpr. In part as published:
+    eigenplaces-turns, netvlad-gsv, cosplace-vit, eigenplaces-vit. From random weights: scratch (the
+    default of tiny). RECIPE+PART is a recipe with a registered part in place, such as
+    crisalad+gem."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28

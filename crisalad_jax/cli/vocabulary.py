@@ -40,8 +40,8 @@ class Vocabulary:
     """tiny, s14, b14 (the default), l14 or g14: the size of --backbone; without one the backbone is
     random."""
     aggregator: str | None = None
-    """With --preset: anyloc (the default), netvlad, or a part of yours that starts from
-    centroids."""
+    """With --preset: anyloc (the default), or another that starts from centroids, such as netvlad
+    or a part of yours."""
     clusters: int | None = None
     """Words, where the aggregator has such a setting; by default the preset's."""
     layer: int | None = None

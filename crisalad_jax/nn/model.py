@@ -396,7 +396,12 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
 
 
 def _extract_features(
-    params: Crisalad, images: Images, valid: Bool[Array, " image"] | None, config: ModelConfig
+    params: Crisalad,
+    images: Images,
+    valid: Bool[Array, " image"] | None,
+    config: ModelConfig,
+    *,
+    inserts: bool = True,
 ) -> tuple[Features, Crisalad | None]:
     """Extract features, and the running statistics; None where `valid` is None."""
     check_params(params, config)
@@ -412,7 +417,9 @@ def _extract_features(
     if images.dtype == jnp.uint8:
         images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
     request = config.aggregator.features(config.backbone.depth)
-    if request.insertion is not None:
+    if not inserts:
+        request = dataclasses.replace(request, insertion=None)
+    elif request.insertion is not None:
         inserted = config.aggregator.inserted(params.aggregator)
         request = dataclasses.replace(request, inserted=inserted)
     pixels = images.astype(config.compute_dtype)
@@ -434,12 +441,13 @@ def unit_features(
 ) -> Float[Array, "image patch dim"]:
     """Return the aggregator's patch features as unit vectors, for vocabularies.
 
-    They are in float32 at least.
+    They are in float32 at least. Tokens of the aggregator's own do not run through the backbone.
 
     Raises:
         InputError: as `describe`.
     """
-    return l2_normalise(at_least_float32(extract_features(params, images, config).patches))
+    features, _ = _extract_features(params, images, None, config, inserts=False)
+    return l2_normalise(at_least_float32(features.patches))
 
 
 @_door("tokens", _check_token_class)

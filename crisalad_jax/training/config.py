@@ -55,11 +55,17 @@ class OptimiserConfig:
     """Of SGD."""
     clip_norm: float | None = None
     """Largest norm of the whole gradient."""
+    clip_value: float | None = None
+    """Largest absolute value of each number of the gradient."""
+    accumulate: int = 1
+    """Number of batches whose gradients are averaged for one step of the optimiser. The steps above
+    are these. As in Lightning, the last batch of an epoch steps too; the sum of the gradients that
+    are left is divided by the same number."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
         check_types(self)
-        require_positive(self, "learning_rate", "step_epochs", "step_gamma")
+        require_positive(self, "learning_rate", "step_epochs", "step_gamma", "accumulate")
         if self.decay_steps is not None:
             require(
                 self.decay_steps > 0,
@@ -81,8 +87,14 @@ class OptimiserConfig:
             "rise",
         )
         require_fraction(self, "b1", "b2", "momentum")
-        if self.clip_norm is not None:
-            require_positive(self, "clip_norm")
+        require(
+            self.clip_norm is None or self.clip_value is None,
+            f"OptimiserConfig.clip_value: found {self.clip_value} beside clip_norm "
+            f"{self.clip_norm}, expected only one of the two",
+        )
+        for name in ("clip_norm", "clip_value"):
+            if getattr(self, name) is not None:
+                require_positive(self, name)
 
 
 def _rises(numbers: tuple[int, ...]) -> bool:
@@ -154,6 +166,11 @@ class TrainConfig:
             self.micro_batch is None or (self.micro_batch > 0 and batch % self.micro_batch == 0),
             f"TrainConfig.micro_batch: found {self.micro_batch}, expected a divisor of the batch's "
             f"{batch} images, or None",
+        )
+        require(
+            self.optimiser.accumulate == 1 or self.loss.kind.grouping is None,
+            f"TrainConfig.optimiser.accumulate: found {self.optimiser.accumulate}, expected 1 for "
+            f"loss {self.loss.kind.part_name}, whose classifiers step with every batch",
         )
         require(
             self.min_images >= self.images_per_place,

@@ -1,9 +1,12 @@
 """The optimiser and its learning rate, equal to torch's."""
 
 import dataclasses
+from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Int, PyTree
 
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.utils.notes import tell
@@ -12,14 +15,51 @@ WARMUP_SHARE = 4
 """Divisor of a run's steps: a warm-up takes a quarter of them at most, as BoQ's 10 of 40 epochs."""
 
 
+class Accumulated(NamedTuple):
+    """State of an optimiser that steps once for several batches."""
+
+    batch: Int[Array, ""]
+    """Number of batches before this one, in all epochs."""
+    gradient: PyTree
+    """Sum of the gradients since the last step."""
+    optimiser: PyTree
+
+
+_Count = TypeVar("_Count", int, Array)
+
+
+def count_steps(config: OptimiserConfig, batches: _Count, batches_per_epoch: int) -> _Count:
+    """Count the optimiser's steps in so many batches from the start of a run.
+
+    Args:
+        config: the optimiser.
+        batches: number of batches, which is also that of the one after them, from 0.
+        batches_per_epoch: number of batches of an epoch, the last of which always steps.
+
+    Example:
+        >>> count_steps(OptimiserConfig(accumulate=4), 20, 10)
+        6
+    """
+    if config.accumulate == 1:
+        return batches
+    per_epoch = -(-batches_per_epoch // config.accumulate)
+    epochs, rest = batches // batches_per_epoch, batches % batches_per_epoch
+    return epochs * per_epoch + rest // config.accumulate
+
+
 def warmup_length(config: OptimiserConfig, steps_per_epoch: int) -> int:
-    """Return the number of steps of a warm-up, which may be given in epochs.
+    """Return the number of the optimiser's steps of a warm-up, which may be given in epochs.
+
+    Args:
+        config: the optimiser.
+        steps_per_epoch: number of batches of an epoch.
 
     Example:
         >>> warmup_length(OptimiserConfig(warmup_epochs=2), 100)
         200
     """
-    return config.warmup_steps or config.warmup_epochs * steps_per_epoch
+    per_epoch = count_steps(config, steps_per_epoch, steps_per_epoch)
+    return config.warmup_steps or config.warmup_epochs * per_epoch
 
 
 def learning_rate_schedule(
@@ -31,9 +71,20 @@ def learning_rate_schedule(
     Step decay multiplies by `step_gamma` every `step_epochs`, counted from the end of the warm-up.
     Milestones count from the start of the run. One that comes before the end of the warm-up is
     without effect, as in GSV-Cities' code, in which the warm-up sets the learning rate anew.
+
+    Args:
+        config: the optimiser.
+        steps: number of batches of the run.
+        steps_per_epoch: number of batches of an epoch.
+
+    Returns:
+        A function of the number of steps that the optimiser has taken (`count_steps`).
     """
     peak, end = config.learning_rate, config.learning_rate * config.end_lr_fraction
     warmup_steps = warmup_length(config, steps_per_epoch)
+    steps, steps_per_epoch = (
+        count_steps(config, batches, steps_per_epoch) for batches in (steps, steps_per_epoch)
+    )
     if config.schedule == "linear":
         length = config.decay_steps or max(steps - warmup_steps, 1)
         decay = optax.linear_schedule(peak, end, length)
@@ -61,8 +112,8 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
 
     Args:
         config: the optimiser.
-        steps: number of steps of the run.
-        steps_per_epoch: number of steps of an epoch.
+        steps: number of batches of the run.
+        steps_per_epoch: number of batches of an epoch.
 
     Returns:
         The optimiser, as it is where its warm-up is short enough. A shortened one is in steps.
@@ -71,7 +122,7 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
         >>> with_short_warmup(OptimiserConfig(warmup_epochs=5), 32, 4).warmup_steps
         8
     """
-    longest = steps // WARMUP_SHARE
+    longest = count_steps(config, steps, steps_per_epoch) // WARMUP_SHARE
     if warmup_length(config, steps_per_epoch) <= longest:
         return config
     return dataclasses.replace(config, warmup_steps=longest, warmup_epochs=0)
@@ -79,7 +130,9 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
 
 def tell_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> None:
     """Tell in a note if a warm-up takes more than its largest share of a run's steps."""
-    longest, warmup = steps // WARMUP_SHARE, warmup_length(config, steps_per_epoch)
+    warmup = warmup_length(config, steps_per_epoch)
+    steps = count_steps(config, steps, steps_per_epoch)
+    longest = steps // WARMUP_SHARE
     if warmup > longest:
         field, found = "warmup_steps", str(warmup)
         if config.warmup_epochs:
@@ -102,7 +155,13 @@ def make_optimiser(
     """Make torch's AdamW (Loshchilov and Hutter 2019), Adam (Kingma and Ba 2015) or SGD.
 
     All decay every parameter: AdamW the parameter itself, the others through its gradient. SGD has
-    torch's momentum, without dampening. With `config.clip_norm` the gradient is clipped first.
+    torch's momentum, without dampening. With `config.clip_norm` or `config.clip_value` the gradient
+    is clipped first, where several batches share a step the mean of theirs.
+
+    Args:
+        config: the optimiser.
+        steps: number of batches of the run.
+        steps_per_epoch: number of batches of an epoch.
     """
     schedule = learning_rate_schedule(config, steps, steps_per_epoch)
     b1, b2 = config.b1, config.b2
@@ -116,6 +175,39 @@ def make_optimiser(
             else optax.sgd(schedule, config.momentum)
         )
         optimiser = optax.chain(decay, descent)
-    if config.clip_norm is None:
+    if config.clip_norm is not None:
+        optimiser = optax.chain(optax.clip_by_global_norm(config.clip_norm), optimiser)
+    elif config.clip_value is not None:
+        optimiser = optax.chain(optax.clip(config.clip_value), optimiser)
+    if config.accumulate == 1:
         return optimiser
-    return optax.chain(optax.clip_by_global_norm(config.clip_norm), optimiser)
+    return _accumulated(optimiser, config.accumulate, steps_per_epoch)
+
+
+def _accumulated(
+    optimiser: optax.GradientTransformation, accumulate: int, batches_per_epoch: int
+) -> optax.GradientTransformation:
+    """Step once for several batches, and at an epoch's last; optax.MultiSteps knows no epochs."""
+
+    def init(params: PyTree) -> Accumulated:
+        zeros = jax.tree.map(jnp.zeros_like, params)
+        return Accumulated(jnp.zeros((), jnp.int32), zeros, optimiser.init(params))
+
+    def update(
+        updates: PyTree, state: Any, params: PyTree | None = None
+    ) -> tuple[PyTree, Accumulated]:
+        total = jax.tree.map(jnp.add, state.gradient, updates)
+        mean = jax.tree.map(lambda each: each / accumulate, total)
+        step, after = optimiser.update(mean, state.optimiser, params)
+        number = state.batch % batches_per_epoch + 1
+        is_last = (number % accumulate == 0) | (number == batches_per_epoch)
+
+        def chosen(stepped: PyTree, waiting: PyTree) -> PyTree:
+            return jax.tree.map(lambda *each: jnp.where(is_last, *each), stepped, waiting)
+
+        zeros = jax.tree.map(jnp.zeros_like, total)
+        return chosen(step, zeros), Accumulated(
+            state.batch + 1, chosen(zeros, total), chosen(after, state.optimiser)
+        )
+
+    return optax.GradientTransformation(init, update)

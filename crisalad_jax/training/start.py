@@ -90,6 +90,7 @@ def with_vocabulary_of(
             start,
             config.model,
             paths,
+            images=config.model.aggregator.centroid_images,
             seed=config.seed,
             on_bad_image=on_bad_image,
             quiet=quiet or not distributed.is_primary(),

@@ -32,6 +32,7 @@ from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.optimiser import (
+    count_steps,
     learning_rate_schedule,
     make_optimiser,
     tell_long_warmup,
@@ -88,7 +89,8 @@ class StepConfig:
     steps: int = 1
     """Number of steps of the run, by which a linear schedule falls."""
     steps_per_epoch: int = 1
-    """Number of steps of an epoch, for a learning rate that falls every few epochs."""
+    """Number of steps of an epoch, for a learning rate that falls every few epochs, and for
+    gradients that add up within one."""
     micro_batch: int | None = None
     """See `nn.model.extract_tokens`."""
     shard_over: Mesh | None = None
@@ -106,7 +108,7 @@ class StepConfig:
         if not isinstance(self.optimiser, OptimiserConfig):
             return None
         schedule = learning_rate_schedule(self.optimiser, self.steps, self.steps_per_epoch)
-        return jnp.asarray(schedule(step))
+        return jnp.asarray(schedule(count_steps(self.optimiser, step, self.steps_per_epoch)))
 
     def make_optimiser(self) -> optax.GradientTransformation:
         """Make the optimiser of a run of so many steps."""
@@ -342,7 +344,7 @@ def train_step(
     config: StepConfig,
     proceed: Bool[Array, ""] | bool = True,
 ) -> tuple[TrainState, Metrics]:
-    """Take one step of the optimiser on the loss of a batch.
+    """Take one step of the optimiser on the loss of a batch, or add its gradient up for one.
 
     The gradient is taken of the trainable parameters, and of the loss's own for the epoch's group.
     If the loss classifies, labels are that group's classes. Dropout is drawn from `key` and the

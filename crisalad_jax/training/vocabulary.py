@@ -1,4 +1,4 @@
-"""The vocabularies of NetVLAD and AnyLoc: k-means centroids of the features of images.
+"""Vocabularies, and the starts of heads such as NetVLAD: k-means centroids of images' features.
 
 It is k-means of unit features: Euclidean, as in VLAD (Jegou et al. 2010) and at NetVLAD's start,
 or by the angle, as in AnyLoc's public code. A centroid is the mean of the features nearest to it,
@@ -72,7 +72,7 @@ def with_vocabulary(
 
     Args:
         params: a model, whose backbone is as it will be used, or as training starts from it.
-        config: NetVLAD's or AnyLoc's.
+        config: the model's, whose aggregator starts from centroids.
         paths: images; not those that are evaluated on.
         images: at most so many of them, drawn at random; None for all, whose features are in memory
             together.
@@ -83,8 +83,8 @@ def with_vocabulary(
 
     Raises:
         InputError: a model without a vocabulary; an argument out of range; an image that cannot be
-            read, or none that can; fewer features than clusters, or features that are not finite
-            or all alike.
+            read, or none that can; fewer features than clusters or than VLAD-BuFF's components,
+            or features that are not finite or all alike.
     """
     _check_vocabulary(config, "aggregator: found")
     clusters = config.aggregator.count_centroids(config.backbone.dim)
@@ -102,8 +102,10 @@ def with_vocabulary(
     if not np.isfinite(features).all():
         raise InputError("features: found NaN or infinity, expected a backbone's finite numbers")
     spherical = config.aggregator.spherical_centroids
-    centroids = jnp.asarray(_k_means(features, clusters, seed, spherical=spherical))
-    aggregator = config.aggregator.from_centroids(centroids, jnp.asarray(features))
+    there = jnp.asarray(features)
+    reduced = np.asarray(config.aggregator.centroid_features(there))
+    centroids = jnp.asarray(_k_means(reduced, clusters, seed, spherical=spherical))
+    aggregator = config.aggregator.from_centroids(centroids, there)
     aggregator = config.aggregator.bind(aggregator, params.backbone)
     return dataclasses.replace(params, aggregator=aggregator)
 

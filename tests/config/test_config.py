@@ -27,6 +27,7 @@ from crisalad_jax.losses.supcon import SupConConfig
 from crisalad_jax.losses.triplet import TripletConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
@@ -34,6 +35,7 @@ from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
@@ -105,7 +107,7 @@ def test_the_recipes_are_their_papers():
     optimiser = cricavpr.optimiser
     assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
     assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
-    assert (cricavpr.epochs, cricavpr.patience, cricavpr.select_by) == (10, 10, "R@1+R@5")
+    assert (cricavpr.epochs, cricavpr.patience, cricavpr.select_by) == (10, 10, "R@5")
     paper = recipe("b14")
     netvlad = recipe("b14", "crisalad+netvlad")
     assert (netvlad.places_per_batch, netvlad.images_per_place) == (48, 4)
@@ -152,7 +154,8 @@ def test_classification_is_as_published():
 
 
 def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
-    """amaralibey/Bag-of-Queries, GaoShuang98/DINO-Mix and Lu-Feng/SuperVLAD."""
+    """Of amaralibey/Bag-of-Queries, GaoShuang98/DINO-Mix, Lu-Feng/SuperVLAD, Lu-Feng/ImAge and
+    Ahmedest61/VLAD-BuFF."""
     boq = recipe("b14", "boq")
     assert boq.model.descriptor_dim == 12_288
     assert boq.model.preprocessing.filter == "bicubic"
@@ -170,7 +173,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     mix = recipe("b14", "dino-mix")
     assert mix.model.aggregator == MixVprConfig(channels=1024, rows=4, depth=2, last_norm=False)
     assert (mix.places_per_batch, mix.epochs, mix.select_by) == (80, 60, "R@1")
-    assert mix.trainable == "last-3-blocks+positions+head"
+    assert mix.trainable == "last-4-blocks+positions+head"
     assert mix.optimiser == OptimiserConfig(
         kind="sgd",
         learning_rate=0.005,
@@ -180,6 +183,8 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
         warmup_steps=650,
         weight_decay=1e-3,
         momentum=0.9,
+        clip_value=0.5,
+        accumulate=4,
     )
     vlad = recipe("b14", "supervlad")
     assert vlad.model.descriptor_dim == 4 * 768
@@ -194,7 +199,27 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
         step_gamma=0.5,
         weight_decay=0.0,
     )
-    for config in (boq, mix, vlad):
+    image = recipe("b14", "image")
+    assert image.model.aggregator == AggregationTokensConfig(tokens=8, insertion=-4)
+    assert (image.model.backbone.registers, image.model.backbone.position_resize) == (4, "plain")
+    assert (image.trainable, image.optimiser) == (vlad.trainable, vlad.optimiser)
+    assert (image.places_per_batch, image.epochs, image.patience) == (120, 20, 20)
+    assert (image.model.descriptor_dim, image.select_by) == (6144, "R@1+R@5")
+    buff, salad = recipe("b14", "vlad-buff"), recipe("b14", "salad")
+    assert buff.model.aggregator == VladBuffConfig(clusters=64, reduced=192)
+    assert dataclasses.replace(buff, model=salad.model) == salad
+    assert (buff.places_per_batch, buff.epochs, buff.select_by) == (60, 4, "R@1")
+    assert buff.trainable == "last-4-blocks+head"
+    assert buff.optimiser == OptimiserConfig(
+        kind="adamw",
+        learning_rate=6e-5,
+        end_lr_fraction=0.2,
+        decay_steps=4000,
+        weight_decay=9.5e-9,
+    )
+    for config in (mix, image, buff):
+        assert config.model.compute_dtype == "bfloat16"
+    for config in (boq, mix, vlad, image, buff):
         assert config.model.image_size == (224, 224)
         assert (config.model.backbone.adapter.kind, config.model.cross_image.layers) == ("none", 0)
         assert config.images_per_place == 4
@@ -208,7 +233,7 @@ def test_the_recipes_over_resnet_are_as_published():
     assert (mix.model.image_size, mix.model.descriptor_dim) == ((320, 320), 4096)
     assert (mix.trainable, mix.places_per_batch, mix.epochs) == ("last-1-blocks+head", 120, 80)
     assert mix.optimiser == dataclasses.replace(
-        recipe("b14", "dino-mix").optimiser, learning_rate=0.05
+        recipe("b14", "dino-mix").optimiser, learning_rate=0.05, accumulate=1, clip_value=None
     )
     conv = recipe("b14", "conv-ap")
     assert conv.model.backbone == ResNetConfig(layers=50, stages=4)
@@ -237,6 +262,12 @@ def test_the_recipes_over_resnet_are_as_published():
     assert cosplace.augmentation == ColourCropConfig(0.7, 0.7, 0.7, 0.5, 0.5)
     classes = cosplace.loss.kind.classes
     assert (classes.kind, classes.groups, cosplace.min_images) == ("cells", 8, 10)
+    eigenplaces = recipe("b14", "eigenplaces-turns")
+    # Its code trains in mixed precision, CosPlace's only where --use_amp16 asks for it.
+    assert (cosplace.model.compute_dtype, eigenplaces.model.compute_dtype) == (
+        "float32",
+        "bfloat16",
+    )
     edtformer = recipe("b14", "edtformer")
     assert edtformer.model.descriptor_dim == 4096
     assert edtformer.model.backbone.adapter_dim == 4

@@ -193,6 +193,30 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
     assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
 
 
+def test_a_run_interrupted_between_batches_that_share_a_step_goes_on(
+    tmp_path, places, params, monkeypatch
+):
+    """Killed at the second batch of two: the gradient of the first is in the saved state."""
+    optimiser = dataclasses.replace(RECIPE.optimiser, accumulate=2)
+    config = dataclasses.replace(ENDLESS, optimiser=optimiser, epochs=2)
+
+    def go(name: str) -> FitResult:
+        return fit(config, places, tmp_path / name, initial=params, quiet=True)
+
+    whole = go("whole")
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "SAVE_SECONDS", -1.0)
+        fail_at(patch, "train_step", 4)
+        with pytest.raises(Interrupted):
+            go("cut")
+    assert max(int(p.name) for p in (tmp_path / "cut" / "state").iterdir()) == 3
+    assert_same_params(go("cut").params, whole.params)
+    assert metrics_of(tmp_path / "cut") == metrics_of(tmp_path / "whole")
+    rates = [line["learning_rate"] for line in metrics_of(tmp_path / "cut")]
+    # Linear to 0 in two steps, in float32.
+    np.testing.assert_allclose(rates, [1e-3, 1e-3, 5e-4, 5e-4], rtol=1e-6)
+
+
 def test_a_finished_run_is_not_trained_further(
     tmp_path, places, params, benchmark, run, monkeypatch
 ):

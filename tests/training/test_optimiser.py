@@ -12,7 +12,11 @@ import torch
 from crisalad_jax.data.places import read_places
 from crisalad_jax.training import loop
 from crisalad_jax.training.config import OptimiserConfig
-from crisalad_jax.training.optimiser import learning_rate_schedule, with_short_warmup
+from crisalad_jax.training.optimiser import (
+    count_steps,
+    learning_rate_schedule,
+    with_short_warmup,
+)
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.step import StepConfig, init_train_state
 from crisalad_jax.utils.errors import InputError
@@ -113,11 +117,13 @@ def warmed_up(count: int, lengths: list[int], gamma: float) -> tuple[OptimiserCo
     return ours, rates
 
 
-def stepped(ours: OptimiserConfig, make) -> tuple[OptimiserConfig, list[float]]:
+def stepped(
+    ours: OptimiserConfig, make, steps: int = STEPS_OF_RUN
+) -> tuple[OptimiserConfig, list[float]]:
     """A scheduler that takes a step after each of the optimiser's."""
     optimiser = torch.optim.SGD([torch.zeros(1)], lr=ours.learning_rate)
     scheduler, rates = make(optimiser), []
-    for _ in range(STEPS_OF_RUN):
+    for _ in range(steps):
         rates.append(optimiser.param_groups[0]["lr"])
         optimiser.step()
         scheduler.step()
@@ -142,17 +148,71 @@ SCHEDULES = {
         OptimiserConfig(learning_rate=1e-4, schedule="step", step_gamma=0.7),
         lambda each: torch.optim.lr_scheduler.LambdaLR(each, lambda n: 0.7 ** (n // (3 * EPOCH))),
     ),
+    "ImAge": lambda: stepped(
+        recipe("b14", "image").optimiser,
+        lambda each: torch.optim.lr_scheduler.StepLR(each, 3 * EPOCH, 0.5),
+    ),
+    "VLAD-BuFF": lambda: stepped(
+        recipe("b14", "vlad-buff").optimiser,
+        lambda each: torch.optim.lr_scheduler.LinearLR(each, 1.0, 0.2, total_iters=4000),
+        steps=4100,
+    ),
 }
 
 
 @pytest.mark.parametrize("name", SCHEDULES)
 def test_the_learning_rate_of_every_step_is_torchs(name: str) -> None:
     ours, theirs = SCHEDULES[name]()
-    schedule = learning_rate_schedule(ours, STEPS_OF_RUN, EPOCH)
-    rates = [float(schedule(step)) for step in range(STEPS_OF_RUN)]
+    schedule = learning_rate_schedule(ours, len(theirs), EPOCH)
+    rates = jax.vmap(schedule)(np.arange(len(theirs)))
     # Sums and powers in float32.
     np.testing.assert_allclose(rates, theirs, rtol=2e-6)
     assert len(set(theirs)) > 2
+
+
+@pytest.mark.parametrize("epoch", [7, 8, 3, 1])
+def test_several_batches_share_a_step_and_its_learning_rate(epoch: int) -> None:
+    """DINO-Mix's four. An epoch of 7 batches has two steps, the second of three batches.
+
+    As Lightning does it: `global_step` counts steps, by which the code warms up; torch's
+    MultiStepLR counts epochs.
+    """
+    ours = dataclasses.replace(recipe("b14", "dino-mix").optimiser, warmup_steps=23)
+    optimiser = torch.optim.SGD([torch.zeros(1)], lr=0.005)
+    scheduler = torch.optim.lr_scheduler.MultiStepLR(optimiser, [5, 10, 15, 25, 45], 0.3)
+    rates, counts, global_step = [], [], 0
+    (group,) = optimiser.param_groups
+    for batch in range(50 * epoch):
+        number = batch % epoch + 1
+        if global_step < 23:
+            group["lr"] = min(1.0, (global_step + 1) / 23) * 0.005
+        counts.append(global_step)
+        rates.append(group["lr"])
+        if number % 4 == 0 or number == epoch:
+            optimiser.step()
+            global_step += 1
+        if number == epoch:
+            scheduler.step()
+    config = StepConfig(MODEL, RECIPE.loss, ours, len(rates), steps_per_epoch=epoch)
+    assert [count_steps(ours, batch, epoch) for batch in range(len(rates))] == counts
+    assert count_steps(ours, len(rates), epoch) == global_step
+    # Sums and powers in float32.
+    found = jax.vmap(config.learning_rate)(np.arange(len(rates)))
+    np.testing.assert_allclose(found, rates, rtol=2e-6)
+    # The milestones after the warm-up: of one step an epoch that is at epoch 23.
+    assert len(set(rates)) >= 23 + 2
+
+
+def test_a_warm_up_of_shared_steps_is_told_and_shortened_in_steps(params) -> None:
+    """Twenty epochs of 7 batches are 40 of the optimiser's steps, and 10 epochs of them 20."""
+    config = OptimiserConfig(warmup_steps=20, accumulate=4)
+    (note,) = told(params, config, 20 * 7, 7)
+    assert "found 20 for a run of 40 steps, which leaves 20 at" in note
+    assert "at most 10 steps" in note
+    assert with_short_warmup(config, 20 * 7, 7).warmup_steps == 10
+    epochs = OptimiserConfig(warmup_epochs=10, accumulate=4)
+    (note,) = told(params, epochs, 20 * 7, 7)
+    assert "found 10, which are 20 steps, for a run of 40 steps" in note
 
 
 def test_a_warm_up_in_epochs_is_one_in_steps() -> None:
@@ -171,9 +231,12 @@ def test_a_warm_up_in_epochs_is_one_in_steps() -> None:
         ({"schedule": "milestones"}, r"OptimiserConfig\.milestones: found \(\), expected numbers"),
         ({"schedule": "milestones", "milestones": (5, 5)}, r"milestones: found \(5, 5\), expected"),
         ({"warmup_steps": 3, "warmup_epochs": 2}, "warmup_epochs: found 2 beside warmup_steps 3"),
+        ({"accumulate": 0}, r"OptimiserConfig\.accumulate: found 0, expected more than 0"),
+        ({"clip_value": 0.0}, r"OptimiserConfig\.clip_value: found 0\.0, expected more than 0"),
+        ({"clip_value": 0.5, "clip_norm": 1.0}, r"clip_value: found 0\.5 beside clip_norm 1\.0"),
         ({"momentum": 1.0}, r"OptimiserConfig\.momentum: found 1\.0"),
     ],
 )
-def test_schedules_that_do_not_fit_are_refused(fields, words) -> None:
+def test_optimisers_that_do_not_fit_are_refused(fields, words) -> None:
     with pytest.raises(InputError, match=words):
         OptimiserConfig(**fields)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -305,6 +306,72 @@ def test_sgd_with_momentum_equals_torch() -> None:
     ours = optimised(config, start, gradients, steps_per_epoch=2)
     # Sums of nine steps of order 1, each rounded to 1e-16.
     np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", ["sgd", "adamw"])
+def test_gradients_of_several_batches_equal_torchs(kind: Literal["sgd", "adamw"]) -> None:
+    """DINO-Mix's: four batches' mean, each number clipped; epochs of seven batches, so that the
+    second step of each has three, whose sum is still divided by four, as in Lightning."""
+    config = OptimiserConfig(
+        kind=kind,
+        learning_rate=0.1,
+        schedule="milestones",
+        milestones=(2,),
+        step_gamma=0.3,
+        warmup_steps=3,
+        weight_decay=1e-3,
+        clip_value=0.5,
+        accumulate=4,
+    )
+    start, *gradients = np.random.default_rng(0).standard_normal((1 + 3 * 7, 9))
+    tensor = torch.tensor(start, requires_grad=True)
+    theirs = (
+        torch.optim.SGD([tensor], lr=0.1, momentum=0.9, weight_decay=1e-3)
+        if kind == "sgd"
+        else torch.optim.AdamW([tensor], lr=0.1, weight_decay=1e-3)
+    )
+    warm = torch.optim.lr_scheduler.LambdaLR(theirs, lambda n: min(1, (n + 1) / 3) * 0.3 ** (n > 3))
+    clipped = []
+    tensor.grad = torch.zeros_like(tensor)
+    for batch, gradient in enumerate(gradients):
+        tensor.grad += torch.tensor(gradient) / 4
+        if batch % 7 in (3, 6):
+            clipped.append(int((tensor.grad.abs() > 0.5).sum()))
+            torch.nn.utils.clip_grad_value_([tensor], 0.5)
+            theirs.step()
+            warm.step()
+            tensor.grad.zero_()
+    assert min(clipped) > 0  # in every step, and never all
+    assert max(clipped) < 9
+    ours = optimised(config, start, gradients, steps_per_epoch=7)
+    # Sums of six steps of order 1, each rounded to 1e-16.
+    np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
+
+
+def test_a_gradient_that_waits_changes_no_parameter_and_a_step_not_finite_nothing(params) -> None:
+    """Two batches of five share a step; the last of the epoch steps alone."""
+    optimiser = OptimiserConfig(kind="sgd", learning_rate=1e-2, accumulate=2, weight_decay=0.0)
+    config = dataclasses.replace(STEP, optimiser=optimiser, steps=5, steps_per_epoch=5)
+    state, frozen = init_train_state(params, "head", config)
+    step = functools.partial(train_step, valid=VALID, key=jax.random.key(0), config=config)
+    spoilt = dataclasses.replace(frozen.backbone, cls_token=jnp.full(32, jnp.nan))
+    broken = dataclasses.replace(frozen, backbone=spoilt)
+    before, changed = jax.device_get(state), []
+    for batch in range(5):
+        if batch in (1, 2):  # of a pair's second and first
+            state, metrics = step(state, broken, pictures(6), LABELS)
+            assert not jnp.isfinite(metrics.loss)
+            assert not metrics.updated
+            assert_equal(jax.device_get(state), before)
+        state, metrics = step(state, frozen, pictures(6, batch), LABELS)
+        assert metrics.updated
+        after = jax.device_get(state)
+        pairs = zip(*map(jax.tree.leaves, (after.trainable, before.trainable)), strict=True)
+        changed.append(any((new != old).any() for new, old in pairs))
+        # The rate of the steps 0, 0, 1, 1, 2 of three: linear to 0, in float32.
+        np.testing.assert_allclose(metrics.learning_rate, 1e-2 * (1 - batch // 2 / 3), rtol=1e-6)
+        before = after
+    assert changed == [False, True, False, True, True]
 
 
 def optimised(

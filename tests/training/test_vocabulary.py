@@ -17,8 +17,10 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVlad, NetVladConfig
+from crisalad_jax.nn.aggregators.vlad_buff import VladBuff, VladBuffConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, unit_features
 from crisalad_jax.training.loop import fit
@@ -35,6 +37,12 @@ ANYLOC = dataclasses.replace(
     cross_image=CrossImageConfig(layers=0),
 )
 NETVLAD = dataclasses.replace(ANYLOC, aggregator=NetVladConfig(clusters=4))
+IMAGE = dataclasses.replace(
+    ANYLOC,
+    backbone=dataclasses.replace(MODEL.backbone, registers=2, position_resize="plain"),
+    aggregator=AggregationTokensConfig(tokens=4, insertion=-1),
+)
+VLAD_BUFF = dataclasses.replace(ANYLOC, aggregator=VladBuffConfig(clusters=4, reduced=8))
 CONFIGS = pytest.mark.parametrize("config", [ANYLOC, NETVLAD], ids=["anyloc", "netvlad"])
 
 
@@ -81,6 +89,35 @@ def test_a_centroid_is_the_mean_of_the_features_nearest_to_it(config, paths) -> 
     np.testing.assert_allclose(centroids, means, atol=1e-6)
 
 
+@pytest.mark.parametrize("config", [IMAGE, VLAD_BUFF], ids=["image", "vlad-buff"])
+def test_other_starts_are_of_the_same_features(config, paths) -> None:
+    """ImAge's are those of its backbone without tokens, VLAD-BuFF's centroids of components."""
+    fresh = random_params(config)
+    found = with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH).aggregator
+    again = with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH).aggregator
+    assert_equal(found, again)
+
+    alone = dataclasses.replace(config, aggregator=NetVladConfig(clusters=4))
+    params = dataclasses.replace(random_params(alone), backbone=fresh.backbone)
+    images = np.stack([resize_image(read_image(path), config.image_size) for path in paths])
+    batches = images.reshape(-1, BATCH, *images.shape[1:])
+    each = [np.asarray(unit_features(params, jnp.asarray(batch), alone)) for batch in batches]
+    features = np.concatenate(each).reshape(-1, 32)
+    reduced = np.asarray(config.aggregator.centroid_features(jnp.asarray(features)))
+    if isinstance(found, VladBuff):
+        centroids = np.asarray(found.centroids)
+    else:
+        # Directions are all that is left of them.
+        expected = with_vocabulary(params, alone, paths, seed=3, batch_size=BATCH)
+        centroids = centroids_of(expected)
+        weight = expected.aggregator.conv.weight  # pyright: ignore
+        # The same features but for the order of the compiled program's float32 sums.
+        np.testing.assert_allclose(found.tokens, weight.T, rtol=1e-4, atol=1e-3)
+    nearest = np.linalg.norm(reduced[:, None] - centroids, axis=2).argmin(axis=1)
+    means = [reduced[nearest == k].mean(axis=0) for k in range(4)]
+    np.testing.assert_allclose(centroids, means, atol=1e-6)
+
+
 def test_a_seed_draws_images_and_centroids(fresh, paths, built) -> None:
     again = with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH)
     assert_equal(again, built)
@@ -95,6 +132,8 @@ def test_a_seed_draws_images_and_centroids(fresh, paths, built) -> None:
 def test_who_needs_one() -> None:
     assert needs_vocabulary(ANYLOC)
     assert needs_vocabulary(NETVLAD)
+    assert needs_vocabulary(IMAGE)
+    assert needs_vocabulary(VLAD_BUFF)
     assert not needs_vocabulary(MODEL)
 
 

@@ -35,7 +35,7 @@ from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.batches import groups_of, steps_per_epoch
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.optimiser import warmup_length, with_short_warmup
+from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
@@ -223,7 +223,8 @@ def prepare(config: ComparisonConfig) -> Prepared:
                 warmup_length(each.optimiser, per_epoch) for each in (draft.training, training)
             )
             if draft.learns and after < before:
-                words = f"found {before} steps, shortened to {after} of the run's {steps}"
+                count = count_steps(training.optimiser, steps, per_epoch)
+                words = f"found {before} steps, shortened to {after} of the run's {count}"
                 shortened.setdefault(words, []).append(draft.name)
         else:
             own = None

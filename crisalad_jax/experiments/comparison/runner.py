@@ -276,7 +276,8 @@ def _with_vocabulary(
     assert prepared.places is not None
     places = prepared.places
     paths = [places.path(image) for image in range(len(places.files))]
-    return with_vocabulary(params, model, paths, seed=seed, quiet=quiet)
+    images = model.aggregator.centroid_images
+    return with_vocabulary(params, model, paths, images=images, seed=seed, quiet=quiet)
 
 
 def _count_sitting(folder: pathlib.Path) -> None:

@@ -1,12 +1,14 @@
 """ImAge: learnt tokens that the backbone's last blocks aggregate into (Lu et al., 2025)."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.aggregators.netvlad import scores_from_centroids
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import Keys, at_least_float32
 from crisalad_jax.nn.tokens import Tokens
@@ -33,6 +35,7 @@ class AggregationTokensConfig(Aggregator):
         6144
     """
 
+    centroid_images: ClassVar[int] = 5000
     tokens: int = 8
     """Number of learnt tokens."""
     insertion: int = -4
@@ -63,8 +66,14 @@ class AggregationTokensConfig(Aggregator):
     def init(
         self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]
     ) -> AggregationTokens:
-        """Draw tokens of deviation 1e-6, as published."""
+        """Draw tokens of deviation 1e-6, as published; `from_centroids` replaces them."""
         return AggregationTokens(1e-6 * jax.random.normal(key, (self.tokens, backbone.dim)))
+
+    def from_centroids(
+        self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
+    ) -> AggregationTokens:
+        """Make tokens as the authors do: centroids of the length of NetVLAD's first scores."""
+        return AggregationTokens(scores_from_centroids(centroids, features).weight.T)
 
     def inserted(self, params: AggregationTokens) -> Float[Array, "token dim"]:
         """Return the tokens."""

@@ -55,6 +55,8 @@ class Aggregator(Part, abc.ABC):
     """Whether its parameters train; if not, no part of the model does."""
     fixed_grid: ClassVar[bool] = False
     """Whether its parameters fit the patches of one image size only."""
+    centroid_images: ClassVar[int] = 500
+    """Number of training images, at most, whose features' centroids training starts from."""
     width_field: ClassVar[str | None] = None
     """Name of the field that sets the tokens' width; None where the backbone's width does."""
 
@@ -115,8 +117,18 @@ class Aggregator(Part, abc.ABC):
         """Make parameters from k-means centroids of unit features.
 
         `starts_from_centroids` tells whether an aggregator has this.
+
+        Args:
+            centroids: of `centroid_features`.
+            features: unit features.
         """
         raise NotImplementedError
+
+    def centroid_features(
+        self, features: Float[Array, "feature dim"]
+    ) -> Float[Array, "feature reduced"]:
+        """Return what k-means makes its centroids of; by default the unit features themselves."""
+        return features
 
     def count_centroids(self, dim: int) -> int:
         """Return the number of centroids that `from_centroids` takes, for features of width `dim`.

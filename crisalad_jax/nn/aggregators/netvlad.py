@@ -83,7 +83,7 @@ def scores_from_centroids(
 
     Args:
         centroids: of the features, two or more.
-        features: unit vectors.
+        features: unit vectors, or what the centroids are of.
 
     Raises:
         InputError: all features are as near to two centroids, as where all are alike.

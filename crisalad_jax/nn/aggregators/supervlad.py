@@ -1,6 +1,7 @@
 """SuperVLAD: sums of patches in few clusters, without centroids (Lu et al., NeurIPS 2024)."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,7 @@ class SuperVladConfig(Aggregator):
         768
     """
 
+    centroid_images: ClassVar[int] = 5000
     clusters: int = 4
     ghosts: int = 1
     """Number of clusters that take part in the softmax, and are dropped after it."""

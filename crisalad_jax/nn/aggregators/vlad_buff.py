@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.aggregators.netvlad import residual_sums, shares
+from crisalad_jax.nn.aggregators.netvlad import residual_sums, scores_from_centroids, shares
 from crisalad_jax.nn.backbones.base import Backbone, Features
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
@@ -73,7 +73,7 @@ class VladBuffConfig(Aggregator):
         return TokenShape(0, self.clusters, self.reduced or dim)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> VladBuff:
-        """Draw an orthogonal reduction and unit centroids; the public ones come from images."""
+        """Draw an orthogonal reduction and unit centroids; `from_centroids` replaces them."""
         rotation_key, conv_key, centroid_key = jax.random.split(key, 3)
         dim = self.reduced or backbone.dim
         rotation = jax.nn.initializers.orthogonal()(rotation_key, (backbone.dim, dim))
@@ -84,11 +84,60 @@ class VladBuffConfig(Aggregator):
             burst=jnp.asarray(BURST),
         )
 
+    def centroid_features(
+        self, features: Float[Array, "feature dim"]
+    ) -> Float[Array, "feature reduced"]:
+        """Return the features reduced by their principal components, at their own lengths.
+
+        Raises:
+            InputError: there are fewer features than components.
+        """
+        if not self.reduced:
+            return features
+        return reduce_features(fit_reduction(features, self.reduced), features)
+
+    def from_centroids(
+        self, centroids: Float[Array, "cluster reduced"], features: Float[Array, "feature dim"]
+    ) -> VladBuff:
+        """Make the reduction of principal components, and NetVLAD's start of reduced features."""
+        reduction = fit_reduction(features, self.reduced) if self.reduced else None
+        conv = scores_from_centroids(centroids, self.centroid_features(features))
+        return VladBuff(reduction, conv, centroids, jnp.asarray(BURST))
+
     def apply(
         self, params: VladBuff, features: Features, grid: tuple[int, int], *, key: Keys | None
     ) -> Tokens:
         """Return a sum of residuals for each cluster, of length 1; no global token."""
         return Tokens.of_local(vlad_buff(params, features.patches))
+
+
+def fit_reduction(features: Float[Array, "feature dim"], reduced: int) -> Reduction:
+    """Fit the mean and the first principal components of features, without whitening.
+
+    Args:
+        features: at least `reduced` of them, and at least so wide.
+        reduced: number of components.
+
+    Raises:
+        InputError: there are fewer features, or they are narrower.
+    """
+    require(
+        min(features.shape) >= reduced,
+        f"features: found {features.shape[0]} of width {features.shape[1]}, expected at least "
+        f"{reduced} of each, one for each component that VLAD-BuFF keeps",
+    )
+    mean = features.mean(axis=0)
+    centred = features - mean
+    scatter = jnp.matmul(centred.T, centred, precision="highest")
+    # Eigenvalues rise.
+    return Reduction(mean, jnp.linalg.eigh(scatter)[1][:, ::-1][:, :reduced])
+
+
+def reduce_features(
+    reduction: Reduction, features: Float[Array, "*batch feature dim"]
+) -> Float[Array, "*batch feature reduced"]:
+    """Reduce features to fewer dimensions, in which they are no unit vectors."""
+    return jnp.matmul(features - reduction.mean, reduction.rotation, precision="highest")
 
 
 def vlad_buff(
@@ -100,9 +149,7 @@ def vlad_buff(
     """
     patches = l2_normalise(at_least_float32(patches))
     if params.reduction is not None:
-        centred = patches - params.reduction.mean
-        reduced = jnp.matmul(centred, params.reduction.rotation, precision="highest")
-        patches = l2_normalise(reduced)
+        patches = l2_normalise(reduce_features(params.reduction, patches))
     weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]
     return l2_normalise(residual_sums(weighed, patches, params.centroids))
 

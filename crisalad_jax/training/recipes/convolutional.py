@@ -118,7 +118,7 @@ def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
     many images of a spot, as in San Francisco XL. Images are described at their own sizes.
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(kind="cells", steps=10_000))
-    return _classified(model, preset, loss, min_images=10, epochs=50)
+    return _classified(model, preset, loss, min_images=10, epochs=50, compute_dtype="float32")
 
 
 @register_recipe("eigenplaces-turns")
@@ -131,7 +131,7 @@ def eigenplaces_turns(model: ModelConfig, preset: str) -> TrainConfig:
     """
     classes = ClassesConfig(kind="viewpoints", groups=9, steps=5000, cell=15.0, spacing=3)
     loss = LargeMarginCosineConfig(scale=100.0, classes=classes)
-    return _classified(model, preset, loss, min_images=5, epochs=80)
+    return _classified(model, preset, loss, min_images=5, epochs=80, compute_dtype="bfloat16")
 
 
 def _classified(
@@ -141,6 +141,7 @@ def _classified(
     *,
     min_images: int,
     epochs: int,
+    compute_dtype: Any,
 ) -> TrainConfig:
     aggregator: Aggregator = AGGREGATORS.make("cosplace", preset)
     return TrainConfig(
@@ -150,7 +151,7 @@ def _classified(
             ResNetConfig(layers=18),
             aggregator,
             (512, 512),
-            compute_dtype="float32",
+            compute_dtype=compute_dtype,
             size_rule="native",
         ),
         loss=LossConfig(kind=loss),

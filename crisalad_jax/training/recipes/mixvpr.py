@@ -24,13 +24,11 @@ MIXVPR_OPTIMISER = OptimiserConfig(
 
 @register_recipe("dino-mix")
 def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make DINO-Mix's recipe: two mixers over DINOv2, whose last three blocks train.
+    """Make DINO-Mix's recipe: two mixers over DINOv2, whose last four blocks train.
 
     The class token and the positions train as well, for its code freezes all else before them.
-    Four differences: it sums the gradients of four batches for a step, so that its 650 steps of
-    warm-up are 2,600 batches; it clips each number of the gradient at 0.5; it validates, and
-    chooses the best weights, on Pitts30k's test set. Here a batch is a step, nothing is clipped,
-    and the weights are chosen on `--val`.
+    Its code validates on Pitts30k's test set, by which it chooses the best weights; here they are
+    chosen on `--val`.
     """
     backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
     mixers: Any = AGGREGATORS.make("mixvpr", preset)
@@ -41,8 +39,10 @@ def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
             aggregator=dataclasses.replace(mixers, depth=2, last_norm=False),
             compute_dtype="bfloat16",
         ),
-        optimiser=dataclasses.replace(MIXVPR_OPTIMISER, learning_rate=0.005),
-        trainable="last-3-blocks+positions+head",
+        optimiser=dataclasses.replace(
+            MIXVPR_OPTIMISER, learning_rate=0.005, accumulate=4, clip_value=0.5
+        ),
+        trainable="last-4-blocks+positions+head",
         places_per_batch=80,
         epochs=60,
         select_by="R@1",

@@ -14,8 +14,9 @@ from crisalad_jax.training.recipes.crisalad import without_encoder
 def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make SuperVLAD's recipe without its cross-image encoder; the last four blocks train.
 
-    Scores start from k-means centroids, as in its code. (There the encoder of the cross-image model
-    has an optimiser of its own, which after the first step finds no gradient.)
+    Scores start from k-means centroids of 5,000 training images. The code takes images of MSLS for
+    these, at 322 x 322, and validates at that size. (Its encoder of the cross-image model has an
+    optimiser of its own, which after the first step finds no gradient.)
     """
     backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
     aggregator = AGGREGATORS.make("supervlad", preset)

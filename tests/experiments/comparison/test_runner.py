@@ -263,8 +263,8 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
     """Of a method that learns nothing: what the vocabulary gave is what is evaluated."""
     built = []
 
-    def with_vocabulary(params, config, paths, *, seed, quiet):
-        built.append((len(paths), seed))
+    def with_vocabulary(params, config, paths, *, images, seed, quiet):
+        built.append((len(paths), images, seed))
         return dataclasses.replace(
             params, aggregator=jax.tree.map(lambda x: x + 1, params.aggregator)
         )
@@ -274,7 +274,7 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
     config = ComparisonConfig(**settings | {"names": ("anyloc",)})
     out = tmp_path / "out"
     summary = run(config, out)
-    assert built == [(24, 0), (24, 1)]
+    assert built == [(24, 500, 0), (24, 500, 1)]
     assert summary.rows[0].trained == 0
     params, model = load_weights(out / "anyloc" / "seed-1" / "start.safetensors")
     key, _ = jax.random.split(jax.random.key(1))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig, hard_vlad
 from crisalad_jax.nn.aggregators.netvlad import (
     NetVlad,
@@ -17,6 +18,7 @@ from crisalad_jax.nn.aggregators.netvlad import (
     scores_from_centroids,
 )
 from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
+from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
 from crisalad_jax.nn.backbones.base import FeatureRequest, Features
 from crisalad_jax.nn.backbones.vit import ViTConfig, vit
 from crisalad_jax.nn.config import ModelConfig
@@ -103,6 +105,63 @@ def test_the_start_shares_a_patch_out_a_hundred_to_one() -> None:
     np.testing.assert_allclose(
         directions / lengths[:, None], [unit(row) for row in CENTROIDS], atol=1e-6
     )
+
+
+def test_image_starts_from_directions_of_netvlads_first_scores() -> None:
+    """Its code: unit centroids times ln 100 over the mean gap of the two largest cosines."""
+    features = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
+    config = AggregationTokensConfig(tokens=4)
+    assert config.count_centroids(6) == 4
+    assert (config.centroid_images, SuperVladConfig.centroid_images) == (5000, 5000)
+    assert (VladBuffConfig.centroid_images, NetVladConfig.centroid_images) == (500, 500)
+    params = config.from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    directions = np.stack([unit(row) for row in CENTROIDS.astype(np.float64)])
+    largest = np.sort(features.astype(np.float64) @ directions.T, axis=1)
+    alpha = np.log(100) / (largest[:, -1] - largest[:, -2]).mean()
+    # Numbers of some tens in float32, over a mean of differences.
+    np.testing.assert_allclose(params.tokens, alpha * directions, rtol=1e-5, atol=1e-5)
+
+
+def test_vlad_buff_starts_from_principal_components() -> None:
+    """PCA without whitening by numpy's SVD in float64; then NetVLAD's start in the components.
+
+    As in the public code, centroids and gap are of reduced features at their own lengths.
+    """
+    generator = np.random.default_rng(5)
+    spread = generator.normal(size=(50, 6)) * [3, 2, 1, 0.5, 0.2, 0.1]
+    features = np.stack([unit(row) for row in spread + 1]).astype(np.float32)
+    config = VladBuffConfig(clusters=4, reduced=3)
+    reduced = np.asarray(config.centroid_features(jnp.asarray(features)), np.float64)
+    mean = features.astype(np.float64).mean(axis=0)
+    components = np.linalg.svd(features - mean)[2][:3]
+    expected = (features - mean) @ components.T
+    signs = np.sign((reduced * expected).sum(axis=0))  # either end of a component is one
+    # Components of gaps of order 1, of unit vectors in float32.
+    np.testing.assert_allclose(reduced * signs, expected, atol=1e-5)
+    assert abs(np.linalg.norm(reduced, axis=1) - 1).max() > 0.1
+
+    centroids = reduced[[0, 11, 22, 33]].astype(np.float32)
+    params = config.from_centroids(jnp.asarray(centroids), jnp.asarray(features))
+    assert params.reduction is not None
+    np.testing.assert_allclose(params.reduction.mean, mean, atol=1e-6)
+    np.testing.assert_allclose(params.reduction.rotation * signs, components.T, atol=1e-5)
+    np.testing.assert_array_equal(params.centroids, centroids)
+    directions = np.stack([unit(row) for row in centroids])
+    largest = np.sort(reduced @ directions.T, axis=1)
+    alpha = np.log(100) / (largest[:, -1] - largest[:, -2]).mean()
+    np.testing.assert_allclose(params.conv.weight, alpha * directions.T, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(params.burst, [8, 7, 1])
+
+    whole = VladBuffConfig(clusters=4, reduced=0)
+    plain = whole.from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    netvlad = NetVladConfig().from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    assert plain.reduction is None
+    np.testing.assert_array_equal(plain.conv.weight, netvlad.conv.weight)
+    np.testing.assert_array_equal(whole.centroid_features(jnp.asarray(features)), features)
+
+    words = "features: found 2 of width 6, expected at least 3 of each"
+    with pytest.raises(InputError, match=words):
+        config.centroid_features(jnp.asarray(features[:2]))
 
 
 def test_a_start_from_features_that_are_all_alike_is_refused() -> None:

@@ -1,0 +1,73 @@
+"""Published recipes from the first image to the last weights, on synthetic places."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.data.places import read_places
+from crisalad_jax.experiments.train import train
+from crisalad_jax.training.recipes import recipe
+from crisalad_jax.training.start import with_vocabulary_of
+from crisalad_jax.training.vocabulary import needs_vocabulary
+from crisalad_jax.utils.pytree import named_leaves
+from tests.conftest import random_params
+
+BLOCKS = {"image": 2, "vlad-buff": 4, "dino-mix": 4}
+"""Number of blocks that train, of tiny's four."""
+
+
+@pytest.mark.parametrize(
+    "name", ["image", "vlad-buff", pytest.param("dino-mix", marks=pytest.mark.slow)]
+)
+def test_a_recipe_trains_its_own_parts_from_its_own_start(
+    name: str, shared: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """By the command's own function, without a flag for the start; two steps of tiny."""
+    published = recipe("tiny", name)
+    config = dataclasses.replace(
+        published,
+        model=dataclasses.replace(published.model, image_size=(42, 56)),
+        # A rate of the warm-up would be too low to see in a step.
+        optimiser=dataclasses.replace(published.optimiser, warmup_steps=0),
+        places_per_batch=4,
+        images_per_place=2,
+        min_images=2,
+        epochs=1,
+        seed=3,
+    )
+    given = random_params(config.model)
+    save_weights(tmp_path / "given.safetensors", given, config.model)
+    what = "backbone" if needs_vocabulary(config.model) else "weights"
+    options = {what: tmp_path / "given.safetensors", "quiet": True}
+    result = train(config, shared / "city", tmp_path / "run", **options)
+    assert result.steps == 2
+    trained, model = load_weights(tmp_path / "run" / "last.safetensors")
+    assert model == config.model
+    places = read_places(shared / "city", min_images=2)
+    start = with_vocabulary_of(given, config, places, quiet=True)  # if there is one
+    before, after = named_leaves(start), named_leaves(trained)
+    moved = {key for key, leaf in after.items() if not np.array_equal(leaf, before[key])}
+    head = {key for key in after if key.startswith("aggregator.")}
+    assert head
+    assert {key for key in moved if not key.startswith("backbone.")} == head
+    depth, last = config.model.backbone.depth, BLOCKS[name]
+    for key in moved - head:
+        if key.startswith("backbone.blocks."):
+            same = np.asarray(after[key] == before[key]).reshape(depth, -1).all(axis=1)
+            assert list(same) == [True] * (depth - last) + [False] * last, key
+    rest = {key for key in moved - head if not key.startswith("backbone.blocks.")}
+    assert (
+        rest
+        == {
+            "image": set(),
+            "vlad-buff": {"backbone.norm.weight", "backbone.norm.bias"},
+            "dino-mix": {"backbone.cls_token", "backbone.pos_embed", "backbone.pos_embed_cls"},
+        }[name]
+    )
+    if name != "dino-mix":
+        # Two steps of Adam at some 5e-5 move a number by 1e-4 at most: the start was this.
+        for key in head:
+            np.testing.assert_allclose(after[key], before[key], rtol=0, atol=2e-4)
