@@ -136,8 +136,11 @@ class PreprocessingConfig:
         return height, width
 
     def for_training(self) -> "PreprocessingConfig":
-        """Return the chain of training: the same filter on bytes, at a fixed size."""
-        return dataclasses.replace(self, size_rule="fixed", pixels="bytes")
+        """Return the chain of training: the same filter by Pillow's rules, at a fixed size.
+
+        All published training loaders resize Pillow's images: bytes, antialiased.
+        """
+        return dataclasses.replace(self, size_rule="fixed", pixels="bytes", antialias=True)
 
     def changed_by(self, words: Sequence[str]) -> "PreprocessingConfig":
         """Return this chain with the fields that some of `WORDS` set.

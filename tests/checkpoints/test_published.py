@@ -26,6 +26,7 @@ from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
 
 KEY = jax.random.key(0)
@@ -222,6 +223,20 @@ def test_another_size_has_its_own_facts(name):
     )
     found = (model.layout, model.descriptor, model.parameters)
     assert found == (layout, config.descriptor_dim, parameters(config))
+
+
+@pytest.mark.parametrize(
+    ("name", "published"),
+    [
+        *((name, name) for name in ("salad", "cricavpr", "dino-mix", "supervlad", "edtformer")),
+        *(("boq", "boq-dinov2"), ("boq-resnet50", "boq-resnet50"), ("image", "image-gsv")),
+        *(("vlad-buff", "vlad-buff-4096"), ("mixvpr", "mixvpr-4096"), ("conv-ap", "conv-ap-4096")),
+        *(("cosplace", "cosplace-resnet18-512"), ("eigenplaces-turns", "cosplace-resnet18-512")),
+    ],
+)
+def test_a_recipes_model_resizes_as_the_published_weights_do(name: str, published: str) -> None:
+    """The published ones are held to each author's code by the test of their images below."""
+    assert recipe("b14", name).model.preprocessing == stored(published)[1].preprocessing
 
 
 def test_cosplaces_sizes_differ_in_their_linear_layer():

@@ -96,6 +96,31 @@ def recipe(preset: str, name: str | None = None) -> TrainConfig:
     return with_part(RECIPES[base or "crisalad"](model, preset), found)
 
 
+def with_resizing(config: TrainConfig, **fields: Any) -> TrainConfig:
+    """Set how a recipe's model resizes photographs, as the published weights' do.
+
+    Training images are resized as `PreprocessingConfig.for_training` says, whatever is set. A model
+    that normalises by local contrast, as `tiny`, keeps to bytes.
+
+    Args:
+        config: the recipe.
+        **fields: of `PreprocessingConfig`.
+
+    Returns:
+        The recipe, with these fields changed.
+
+    Example:
+        >>> boq = with_resizing(recipe("b14"), filter="bicubic")
+        >>> boq.model.preprocessing.filter
+        'bicubic'
+    """
+    chain = config.model.preprocessing
+    if chain.normalisation == "local-contrast":
+        fields = {name: value for name, value in fields.items() if name != "pixels"}
+    model = dataclasses.replace(config.model, preprocessing=dataclasses.replace(chain, **fields))
+    return dataclasses.replace(config, model=model)
+
+
 def split_name(name: str) -> tuple[str | None, str]:
     """Split RECIPE+PART into the two; of a part alone the recipe is None.
 

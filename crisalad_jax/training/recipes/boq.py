@@ -7,7 +7,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 
@@ -32,9 +32,8 @@ def boq(model: ModelConfig, preset: str) -> TrainConfig:
 
 def trained_as_boq(model: ModelConfig, *, trainable: str) -> TrainConfig:
     """Make the training that BoQ's code has for all its backbones."""
-    bicubic = dataclasses.replace(model.preprocessing, filter="bicubic")
-    return TrainConfig(
-        model=dataclasses.replace(model, preprocessing=bicubic),
+    config = TrainConfig(
+        model=model,
         optimiser=OptimiserConfig(
             learning_rate=1e-4,
             schedule="milestones",
@@ -50,3 +49,4 @@ def trained_as_boq(model: ModelConfig, *, trainable: str) -> TrainConfig:
         select_by="R@1",
         patience=None,
     )
+    return with_resizing(config, filter="bicubic", pixels="floats")

@@ -72,11 +72,17 @@ def mixvpr(model: ModelConfig, preset: str) -> TrainConfig:
 def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
     """Make Conv-AP's recipe, of amaralibey/gsv-cities: ResNet-50, whose last two stages train.
 
-    Its optimiser is called Adam there, and is AdamW.
+    The head and the filter, bicubic, are those of its model of 4,096 numbers. Its optimiser is
+    called Adam there, and is AdamW.
     """
     return TrainConfig(
         model=_model(
-            preset, model, ResNetConfig(), AGGREGATORS.make("conv-ap", preset), (320, 320)
+            preset,
+            model,
+            ResNetConfig(),
+            AGGREGATORS.make("conv-ap", preset),
+            (320, 320),
+            filter="bicubic",
         ),
         optimiser=OptimiserConfig(
             learning_rate=2e-4,

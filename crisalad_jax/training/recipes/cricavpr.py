@@ -5,7 +5,7 @@ import dataclasses
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.config import ModelConfig, with_aggregator
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, with_resizing
 
 
 @register_recipe("cricavpr")
@@ -17,7 +17,7 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
     """
     adapter = AdapterConfig(kind="multi-resolution")
     backbone = dataclasses.replace(model.backbone, adapter=adapter)
-    return TrainConfig(
+    config = TrainConfig(
         model=with_aggregator(model, "gem-pyramid", preset, backbone=backbone),
         optimiser=OptimiserConfig(
             kind="adam", learning_rate=1e-4, schedule="step", weight_decay=0.0
@@ -27,3 +27,4 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
         select_by="R@5",
         patience=10,
     )
+    return with_resizing(config, antialias=False, pixels="floats")

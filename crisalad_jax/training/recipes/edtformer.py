@@ -6,7 +6,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 _ADAPTER_WIDTH = 4
@@ -21,7 +21,7 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
     adapter = AdapterConfig(kind="side", bottleneck=_ADAPTER_WIDTH / model.backbone.dim, alpha=0.5)
     backbone = dataclasses.replace(model.backbone, adapter=adapter)
     aggregator = AGGREGATORS.make("edtformer", preset)
-    return TrainConfig(
+    config = TrainConfig(
         model=without_encoder(model, backbone=backbone, aggregator=aggregator),
         optimiser=OptimiserConfig(
             kind="adam", learning_rate=1e-4, schedule="step", step_gamma=0.7, weight_decay=0.0
@@ -30,3 +30,4 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
         epochs=15,
         patience=15,
     )
+    return with_resizing(config, pixels="floats", round_to_patch=True)

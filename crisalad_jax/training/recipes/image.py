@@ -7,7 +7,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 
@@ -25,7 +25,7 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
         registers=4,
         position_resize="plain",
     )
-    return TrainConfig(
+    config = TrainConfig(
         model=without_encoder(
             model, backbone=backbone, aggregator=tokens, compute_dtype="bfloat16"
         ),
@@ -38,3 +38,4 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
         select_by="R@1+R@5",
         patience=20,
     )
+    return with_resizing(config, pixels="floats", round_to_patch=True)

@@ -7,7 +7,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 MIXVPR_OPTIMISER = OptimiserConfig(
@@ -32,7 +32,7 @@ def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
     """
     backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
     mixers: Any = AGGREGATORS.make("mixvpr", preset)
-    return TrainConfig(
+    config = TrainConfig(
         model=without_encoder(
             model,
             backbone=backbone,
@@ -48,3 +48,4 @@ def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
         select_by="R@1",
         patience=None,
     )
+    return with_resizing(config, antialias=False, pixels="floats")

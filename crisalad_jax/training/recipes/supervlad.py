@@ -6,7 +6,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 
@@ -20,7 +20,7 @@ def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
     """
     backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
     aggregator = AGGREGATORS.make("supervlad", preset)
-    return TrainConfig(
+    config = TrainConfig(
         model=without_encoder(model, backbone=backbone, aggregator=aggregator),
         optimiser=OptimiserConfig(
             kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0
@@ -31,3 +31,4 @@ def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
         select_by="R@1+R@5",
         patience=3,
     )
+    return with_resizing(config, pixels="floats", round_to_patch=True)
