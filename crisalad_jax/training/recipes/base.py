@@ -100,7 +100,7 @@ def with_resizing(config: TrainConfig, **fields: Any) -> TrainConfig:
     """Set how a recipe's model resizes photographs, as the published weights' do.
 
     Training images are resized as `PreprocessingConfig.for_training` says, whatever is set. A model
-    that normalises by local contrast, as `tiny`, keeps to bytes.
+    that normalises by local contrast, as `tiny`, takes the filter alone: it is no published one.
 
     Args:
         config: the recipe.
@@ -116,7 +116,7 @@ def with_resizing(config: TrainConfig, **fields: Any) -> TrainConfig:
     """
     chain = config.model.preprocessing
     if chain.normalisation == "local-contrast":
-        fields = {name: value for name, value in fields.items() if name != "pixels"}
+        fields = {name: value for name, value in fields.items() if name == "filter"}
     model = dataclasses.replace(config.model, preprocessing=dataclasses.replace(chain, **fields))
     return dataclasses.replace(config, model=model)
 
