@@ -14,8 +14,8 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.nn.layers import Linear, at_least_float32, dropout, init_linear, linear
-from crisalad_jax.utils.compiler import has_fused_attention
 from crisalad_jax.utils.pytree import pytree_dataclass
+from crisalad_jax.utils.target import target
 
 
 @pytree_dataclass
@@ -70,7 +70,7 @@ def attention(
     fits = (
         x.dtype == jnp.bfloat16 and dim // heads % 8 == 0 and mask is None and dropout_mask is None
     )
-    if fits and has_fused_attention():
+    if fits and target().cudnn:
         queries, keys, values = (
             part.reshape(-1, tokens, heads, dim // heads) for part in (queries, keys, values)
         )

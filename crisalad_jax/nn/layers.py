@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from crisalad_jax.utils.compiler import product_dtype
 from crisalad_jax.utils.pytree import pytree_dataclass
+from crisalad_jax.utils.target import target
 
 Keys = Key[Array, "*keys"]
 """One random key for all, or one for each entry of a batch."""
@@ -135,7 +135,7 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
     transpose the cotangent by a copy.
     """
     rows, weight = x.reshape(-1, x.shape[-1]), params.weight.astype(x.dtype)
-    y = jnp.matmul(rows, weight, preferred_element_type=product_dtype(x.dtype))
+    y = jnp.matmul(rows, weight, preferred_element_type=target().product_dtype(x.dtype))
     y = (y if params.bias is None else at_least_float32(y) + params.bias).astype(x.dtype)
     return y.reshape(*x.shape[:-1], weight.shape[-1])
 

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from crisalad_jax.utils.compiler import is_for_cpu
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.target import machine, target
 
 SHARD_FROM = 2**14
 """Smallest number of elements of a sharded array: a gather of smaller ones costs too much."""
@@ -38,7 +38,7 @@ class Devices(NamedTuple):
         here = Mesh(np.array(self.mesh.local_devices), ("image",))
 
         def put(leaf: Any) -> jax.Array:
-            host = np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
+            host = np.asarray(leaf) if machine().platform == "cpu" else leaf
             alike = NamedSharding(here, PartitionSpec())
             array = jax.device_put(host, alike, may_alias=True)
             if here == self.mesh:
@@ -115,7 +115,7 @@ def parts_for_caches(images: int, at_once: int) -> int:
         at_once: number of images that a device computes at once, or the next smaller one that
             divides its share; at least one.
     """
-    if not images or not is_for_cpu():
+    if not images or target().platform != "cpu":
         return 1
     together = images % jax.process_count() == 0
     share = images // devices_for(images, processes=together).mesh.size

@@ -13,6 +13,7 @@ from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.target import target
 
 _CALLS = 3
 """Number of calls of each in a round; their median counts."""
@@ -89,4 +90,4 @@ def machine() -> str:
 
 def is_absolute() -> bool:
     """Return whether times are comparable; a CPU's are not, for they depend on other load."""
-    return jax.default_backend() != "cpu"
+    return target().platform != "cpu"
