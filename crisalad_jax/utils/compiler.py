@@ -13,7 +13,7 @@ from jax.extend.core import get_opaque_trace_state
 
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
-from crisalad_jax.utils.target import lowering_platforms, target
+from crisalad_jax.utils.target import lowering_platforms, over_devices_of, target
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
@@ -71,6 +71,7 @@ def jit(
     compile cache does not store. YNN computes those where the `compute_dtype` of a configuration
     among the arguments is bfloat16. Nothing else decides, so results have the same bits with and
     without a compile cache. A function that does not run long is scheduled for the least memory.
+    On accelerators float32 products have the `precision` of a configuration among the arguments.
     The returned function has `lower` too, which lowers for the `target`.
     """
     inner = jax.jit(function, **options)
@@ -90,16 +91,33 @@ def jit(
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        leaves = jax.tree.leaves((args, kwargs))
         if get_opaque_trace_state() != _AT_REST:
-            return inner(*args, **kwargs)
-        return outermost(jax.tree.leaves((args, kwargs)))(*args, **kwargs)
+            with _precision_of(leaves):
+                return inner(*args, **kwargs)
+        with _precision_of(leaves), over_devices_of(leaves):
+            return outermost(leaves)(*args, **kwargs)
 
     def lower(*args: Any, **kwargs: Any) -> Any:
-        traced = outermost(jax.tree.leaves((args, kwargs))).trace(*args, **kwargs)
-        return traced.lower(lowering_platforms=lowering_platforms())
+        leaves = jax.tree.leaves((args, kwargs))
+        with _precision_of(leaves), over_devices_of(leaves):
+            traced = outermost(leaves).trace(*args, **kwargs)
+            return traced.lower(lowering_platforms=lowering_platforms())
 
     call.__dict__["lower"] = lower
     return call
+
+
+def _precision_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[None]:
+    """Compute float32 products at the `precision` of a configuration, if there is one.
+
+    A CPU has one precision, the highest.
+    """
+    words = (getattr(leaf, "precision", None) for leaf in leaves)
+    word = next((word for word in words if isinstance(word, str)), None)
+    if word is None or target().platform == "cpu":
+        return contextlib.nullcontext()
+    return jax.default_matmul_precision(word)
 
 
 def _numbers(leaves: Sequence[Any]) -> int:

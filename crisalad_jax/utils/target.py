@@ -3,11 +3,12 @@
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import AbstractMesh, Mesh, NamedSharding
 
 Platform = Literal["cpu", "gpu", "tpu", "portable"]
 _LOWERED_AS = {"cpu": "cpu", "gpu": "cuda", "tpu": "tpu"}
@@ -45,6 +46,8 @@ PORTABLE = Target("portable")
 TARGETS = {"cpu": CPU, "gpu": GPU, "tpu": TPU, "portable": PORTABLE}
 # JAX keeps traces apart by it: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
+_mesh = jax.make_user_context(None)
+_ONE_DEVICE = AbstractMesh((1,), ("image",))
 
 
 def target() -> Target:
@@ -82,6 +85,29 @@ def _compiles_cudnn() -> bool:
     except Exception:  # a missing or old cuDNN and an old GPU raise different errors
         return False
     return True
+
+
+def traced_mesh() -> Mesh | AbstractMesh | None:
+    """Return the devices of what is traced now; None where they are not known.
+
+    A kernel, unlike an operation of XLA, must be told how it is sharded. The devices are those of
+    `over_devices_of`, of `jax.set_mesh`, or the machine's only one.
+    """
+    if _mesh.value is not None:
+        return _mesh.value
+    ambient = jax.sharding.get_abstract_mesh()
+    if not ambient.empty:
+        return ambient
+    return _ONE_DEVICE if jax.device_count() == 1 else None
+
+
+def over_devices_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[None]:
+    """Trace for the devices that the arguments of a program are on; see `traced_mesh`."""
+    if target().platform != "tpu":
+        return contextlib.nullcontext()
+    shardings = (getattr(leaf, "sharding", None) for leaf in leaves)
+    meshes = (each.mesh for each in shardings if isinstance(each, NamedSharding))
+    return _mesh(next((mesh for mesh in meshes if mesh.size > 1), _ONE_DEVICE))
 
 
 @contextlib.contextmanager

@@ -8,7 +8,9 @@ import sys
 import jax
 import jax.numpy as jnp
 import pytest
+from jax.sharding import AbstractMesh, NamedSharding, PartitionSpec
 
+from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import describe, parameter_shapes
 from crisalad_jax.utils import compiler
@@ -89,12 +91,15 @@ def test_a_function_is_traced_again_for_another_target() -> None:
 
     outer = jax.jit(lambda x: choose(x))
     x = jnp.ones(3)
-    for chosen in (GPU, TPU, GPU, CPU, CPU):
+    for chosen in (GPU, TPU, CPU, GPU, TPU, CPU):
+        before = len(traced)
+        seen = chosen.platform in traced
         with lowering_for(chosen):
             jax.make_jaxpr(lambda x: choose(x))(x)
             outer.trace(x)
             choose.lower(x)  # pyright: ignore[reportFunctionMemberAccess]
-    assert traced == ["gpu", "tpu", "cpu"]
+        # The second time all of its traces are found.
+        assert set(traced[before:]) == (set() if seen else {chosen.platform})
 
 
 def text(chosen: Target, config: ModelConfig, *, gradient: bool) -> str:
@@ -138,3 +143,32 @@ def test_programs_for_several_platforms_in_one_process() -> None:
 def test_a_program_of_a_target_runs_here_if_it_is_this_machine() -> None:
     with lowering_for(CPU):
         assert compiler.jit(lambda x: x + 1)(jnp.ones(2)).tolist() == [2, 2]
+
+
+def test_a_kernel_is_told_the_devices_of_the_arguments() -> None:
+    """It cannot be sharded without; where they are not known, a kernel is not used."""
+    mesh = AbstractMesh((4,), ("image",))
+    rows = NamedSharding(mesh, PartitionSpec("image"))
+    leaves = [
+        jax.ShapeDtypeStruct((2,), "float32"),
+        jax.ShapeDtypeStruct((8,), "int8", sharding=rows),
+    ]
+    with lowering_for(TPU):
+        with targets.over_devices_of(leaves):
+            assert targets.traced_mesh() == mesh
+            assert attention_pallas.shards(8)
+            assert not attention_pallas.shards(6)
+        with targets.over_devices_of(leaves[:1]):
+            alone = targets.traced_mesh()
+            assert alone is not None
+            assert alone.size == 1
+    with lowering_for(GPU), targets.over_devices_of(leaves):
+        found = targets.traced_mesh()
+        assert found is None or found.size == 1
+
+
+def test_without_arguments_the_devices_are_the_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    for count, known in ((1, True), (8, False)):
+        monkeypatch.setattr(jax, "device_count", lambda count=count: count)
+        assert (targets.traced_mesh() is not None) == known
+        assert attention_pallas.shards(8) == known
