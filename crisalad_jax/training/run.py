@@ -22,7 +22,7 @@ from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.model import Crisalad, extract_tokens, init_crisalad
+from crisalad_jax.nn.model import Crisalad, cast_params, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.batches import batches_of, groups_of, steps_per_epoch
@@ -38,7 +38,6 @@ from crisalad_jax.training.step import (
     Metrics,
     StepConfig,
     TrainState,
-    cast_frozen,
     init_train_state,
     train_step,
 )
@@ -136,7 +135,7 @@ class Run:
             params, config.trainable, self._step_config, key=classifiers_key
         )
         self._frozen: PyTree = jax.device_get(frozen)
-        self._frozen_there = self._devices.replicate(cast_frozen(self._frozen, config.model))
+        self._frozen_there = self._devices.replicate(cast_params(self._frozen, config.model))
         self.record = RunRecord(
             weights_checksum=checksum(jax.tree.leaves(params)),
             places_checksum=checksums["places"],

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import re
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -39,10 +38,7 @@ from crisalad_jax.training.optimiser import (
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils import compiler, devices, distributed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import named_leaves
 
-_ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
-"""Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
 LossFunction = Callable[..., Float[Array, ""]]
 """Takes descriptors, labels and, if it has a third argument, which images are valid."""
 
@@ -118,6 +114,11 @@ class StepConfig:
     def compute_dtype(self) -> str:
         """Type of the model's matrix products."""
         return self.model.compute_dtype
+
+    @property
+    def precision(self) -> str:
+        """Precision of the model's float32 products."""
+        return self.model.precision
 
 
 def init_train_state(
@@ -197,20 +198,6 @@ def _init_loss(key: PRNGKeyArray | None, loss: Loss, config: StepConfig) -> Clas
         f"key: found None for loss {name}, which has parameters, expected a jax.random.key",
     )
     return None
-
-
-def cast_frozen(frozen: PyTree, config: ModelConfig) -> PyTree:
-    """Cast frozen weights of the backbone's linear layers to the type of their products.
-
-    A step's results stay the same to the bit; in bfloat16 the weights take half the memory.
-    """
-    dtype = jnp.dtype(config.compute_dtype)
-    names = iter(named_leaves(frozen))
-
-    def cast(leaf: Any) -> Any:
-        return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
-
-    return jax.tree.map(cast, frozen)
 
 
 def step_config(

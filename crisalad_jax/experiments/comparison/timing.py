@@ -9,7 +9,13 @@ import jax
 import numpy as np
 
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens, self_mask
+from crisalad_jax.nn.model import (
+    Crisalad,
+    attend_across_images,
+    cast_params,
+    extract_tokens,
+    self_mask,
+)
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
@@ -68,7 +74,7 @@ def race(
 def describing(params: Crisalad, config: ModelConfig, batch_size: int) -> Callable[[], Any]:
     """Make a call that describes a batch, each image alone, with the programs of `evaluate`."""
     devices = devices_for(batch_size)
-    shared = devices.replicate(params)
+    shared = devices.replicate(cast_params(params, config))
     pixels = np.random.default_rng(0).integers(0, 256, (batch_size, *config.input_size, 3))
     images = devices.shard_batch(pixels.astype(np.uint8))
     mask = self_mask(batch_size)
