@@ -60,12 +60,18 @@ class Train:
     """Number of processes, with --coordinator-address HOST:PORT."""
     process_id: int | None = None
     """Which of them this is, from 0."""
+    local_device_ids: tuple[int, ...] | None = None
+    """This host's GPUs that are this process's, with --coordinator-address. By default one: that of
+    the process's number on its host, if Slurm, Open MPI or a coordinator at localhost tells it."""
     shard_state: bool = False
     """Keep what trains and its moments in shards, one a device, not whole on each: for --trainable
     all of a large model."""
     num_workers: int = 0
     """Processes that read the training images; 0 reads them by threads, which is as fast on few
     cores, and keeps decoded images of small sets in memory."""
+    num_threads: int | None = None
+    """Threads that read the training images; by default one for each core that this process may
+    use."""
     quiet: bool = False
     """No progress bars."""
 
@@ -120,11 +126,18 @@ def run(arguments: Train) -> None:
 
     if arguments.coordinator_address is not None:
         distributed.join_processes(
-            arguments.coordinator_address, arguments.num_processes, arguments.process_id
+            arguments.coordinator_address,
+            arguments.num_processes,
+            arguments.process_id,
+            arguments.local_device_ids,
         )
-    elif (arguments.num_processes, arguments.process_id) != (None, None):
+    elif any(
+        given is not None
+        for given in (arguments.num_processes, arguments.process_id, arguments.local_device_ids)
+    ):
         raise InputError(
-            "--num-processes, --process-id: found no --coordinator-address, expected it beside them"
+            "--num-processes, --process-id, --local-device-ids: found no --coordinator-address, "
+            "expected it beside them"
         )
     console.quiet = not distributed.is_primary()
     config: TrainConfig = arguments.settings
@@ -138,6 +151,7 @@ def run(arguments: Train) -> None:
         backbone=arguments.backbone,
         on_bad_image=arguments.on_bad_image,
         num_workers=arguments.num_workers,
+        num_threads=arguments.num_threads,
         shard_state=arguments.shard_state,
         quiet=arguments.quiet,
         say=lambda line: console.print(line, soft_wrap=True),

@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
@@ -32,6 +33,7 @@ from crisalad_jax.nn.pixels import check_pixels, normalise
 from crisalad_jax.nn.projection import project
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
+from crisalad_jax.utils.devices import IMAGE, image_mesh
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
 
@@ -366,6 +368,45 @@ def _extract_tokens(
     micro_batch: int | None,
 ) -> tuple[Tokens, Any]:
     """Extract tokens, and the running statistics; None in their place where `valid` is None."""
+    count = images.shape[0]  # which may be symbolic, where `len` is not
+    keys = None if key is None else jax.random.split(key, count)
+    if micro_batch is not None and count % micro_batch:
+        raise InputError(
+            f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
+        )
+    mesh = image_mesh()
+    if mesh is None or valid is not None:
+        return _tokens_in_parts(params, images, valid, config, keys, micro_batch)
+    # Without statistics of the batch a device needs nothing of the others. XLA's partitioner would
+    # not see it in loops over images, and would sum gradients layer by layer.
+    own = count // mesh.size
+    if micro_batch is not None:
+        at_once = max(1, micro_batch // mesh.size)
+        micro_batch = max(n for n in range(1, at_once + 1) if own % n == 0)
+
+    def tokens_of_own(params: Crisalad, images: Images, keys: Keys | None) -> Tokens:
+        return _tokens_in_parts(params, images, None, config, keys, micro_batch)[0]
+
+    alike, shared = PartitionSpec(), PartitionSpec(IMAGE)
+    extract = jax.shard_map(
+        tokens_of_own,
+        mesh=mesh,
+        in_specs=(alike, shared, shared),
+        out_specs=shared,
+        check_vma=False,  # whose rules parts of plug-ins need not follow
+    )
+    return extract(params, images, keys), None
+
+
+def _tokens_in_parts(
+    params: Crisalad,
+    images: Images,
+    valid: Bool[Array, " image"] | None,
+    config: ModelConfig,
+    keys: Keys | None,
+    micro_batch: int | None,
+) -> tuple[Tokens, Any]:
+    """Extract tokens `micro_batch` images at a time; see `_extract_tokens`."""
 
     def tokens_of(
         statistics: Crisalad | None, images: Images, keys: Keys | None, valid: Array | None
@@ -379,15 +420,10 @@ def _extract_tokens(
         return statistics, tokens
 
     statistics = None if valid is None else split_statistics(params)[0]
-    count = images.shape[0]  # which may be symbolic, where `len` is not
-    keys = None if key is None else jax.random.split(key, count)
+    count = images.shape[0]
     if micro_batch is None or micro_batch == count:
         statistics, tokens = tokens_of(statistics, images, keys, valid)
         return tokens, statistics
-    if count % micro_batch:
-        raise InputError(
-            f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
-        )
 
     # Parts are interleaved, so that each device of a sharded batch has a share of every part.
     def split(x: Array) -> Array:
