@@ -13,7 +13,14 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
 from crisalad_jax.config.fields import free_field
-from crisalad_jax.nn.attention import Attention, _mix, attention, init_torch_attention
+from crisalad_jax.nn.attention import (
+    _COLUMNS,
+    Attention,
+    _mix,
+    _precision,
+    attention,
+    init_torch_attention,
+)
 from crisalad_jax.nn.layers import (
     LayerNorm,
     Linear,
@@ -177,6 +184,8 @@ def _attention_over_devices(
             jnp.transpose(values, (1, 2, 0, 3)),
             mask,
             dropout_mask,
+            _COLUMNS,
+            _precision(qkv.dtype),
         )
         return jnp.transpose(mixed, (3, 0, 1, 2)).reshape(-1, tokens, dim)
 

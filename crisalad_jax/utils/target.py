@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import AbstractMesh, Mesh, NamedSharding
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 
 Platform = Literal["cpu", "gpu", "tpu", "portable"]
 _LOWERED_AS = {"cpu": "cpu", "gpu": "cuda", "tpu": "tpu"}
@@ -91,13 +91,14 @@ def traced_mesh() -> Mesh | AbstractMesh | None:
     """Return the devices of what is traced now; None where they are not known.
 
     A kernel, unlike an operation of XLA, must be told how it is sharded. The devices are those of
-    `over_devices_of`, of `jax.set_mesh`, or the machine's only one.
+    `jax.set_mesh`, of `over_devices_of`, or the machine's only one. Within `jax.shard_map` a device
+    computes its own images, and it is one device.
     """
-    if _mesh.value is not None:
-        return _mesh.value
     ambient = jax.sharding.get_abstract_mesh()
     if not ambient.empty:
-        return ambient
+        return _ONE_DEVICE if set(ambient.axis_types) == {AxisType.Manual} else ambient
+    if _mesh.value is not None:
+        return _mesh.value
     return _ONE_DEVICE if jax.device_count() == 1 else None
 
 
