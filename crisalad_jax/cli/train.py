@@ -3,12 +3,10 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
-
-import tyro
+from typing import Any, Literal
 
 from crisalad_jax.cli.common import console
-from crisalad_jax.cli.flags import choose_parts, config_of, find_flag, flags_of, type_of
+from crisalad_jax.cli.flags import find_flag, parse_settings
 from crisalad_jax.config.io import read_config
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import recipe
@@ -78,30 +76,7 @@ class Train:
 
 def parse(program: str, arguments: Sequence[str]) -> Train:
     """Parse the flags, with one for every field of the configuration and of its parts."""
-    preset = find_flag(arguments, "--preset") or "b14"
-    flags = choose_parts(flags_of(defaults(arguments)), arguments, preset)
-    settings, default = type_of(flags)
-    fields = [
-        (
-            field.name,
-            Annotated[settings, tyro.conf.arg(name="")],
-            dataclasses.field(default=default),
-        )
-        if field.name == "settings"
-        else (field.name, field.type, field)
-        for field in dataclasses.fields(Train)
-    ]
-    # Dataclasses take fields without a default first.
-    fields.sort(key=lambda field: field[0] not in ("data", "out"))
-    made = dataclasses.make_dataclass("Train", fields, frozen=True, bases=(Train,))
-    made.__doc__ = Train.__doc__
-    parsed: Any = tyro.cli(made, prog=program, args=arguments)
-    given = parsed.settings
-    if parsed.image_size is not None:
-        # Before the checks: the preset's own size may not fit another backbone.
-        model = dataclasses.replace(given.model, image_size=parsed.image_size)
-        given = dataclasses.replace(given, model=model)
-    return dataclasses.replace(parsed, settings=config_of(flags, given))
+    return parse_settings(Train, program, arguments, defaults(arguments), ("data", "out"))
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
