@@ -42,6 +42,7 @@ from crisalad_jax.nn.config import with_aggregator as with_aggregator
 from crisalad_jax.nn.cross_image import CrossImageConfig as CrossImageConfig
 from crisalad_jax.nn.model import Crisalad as Crisalad
 from crisalad_jax.nn.model import attend_across_images as attend_across_images
+from crisalad_jax.nn.model import cast_params as cast_params
 from crisalad_jax.nn.model import describe as describe
 from crisalad_jax.nn.model import extract_features as extract_features
 from crisalad_jax.nn.model import extract_tokens as extract_tokens

@@ -22,11 +22,11 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Images, check_params, describe, self_mask
-from crisalad_jax.utils import compiler
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
 from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.target import PORTABLE, lowering_for
 
 FORMAT = "crisalad-jax export 1"
 PROGRAM, WEIGHTS, MANIFEST = "describe.jax_export", "weights.safetensors", "manifest.json"
@@ -118,7 +118,7 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
         (batch,) = export.symbolic_shape("batch")
     dtype = jnp.uint8 if config.preprocessing.pixels == "bytes" else jnp.float32
     images = jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
-    with compiler.portable(), _without_sources():
+    with lowering_for(PORTABLE), _without_sources():
         if how.weights_inside:
             whole = jax.jit(lambda images: run(weights, images))
             return export.export(whole, platforms=how.platforms)(images)

@@ -37,6 +37,7 @@ _COMMANDS = {
     "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
     "export": "Write a model as a StableHLO program that needs nothing of this package.",
     "pca": "Fit principal components to descriptors, for shorter ones.",
+    "compile-check": "Compile for GPUs and TPUs that need not be here, and table memory and work.",
     "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
 }
 """Summaries of the commands in the order of the help; each command is a module here."""
@@ -66,7 +67,7 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
 
 
 def _class_of(name: str, module: Any) -> type:
-    return getattr(module, name.capitalize())
+    return getattr(module, "".join(map(str.capitalize, name.split("-"))))
 
 
 # Beginnings of the parts of tyro's boxes that repeat the first one.
@@ -89,7 +90,7 @@ def _unboxed(box: str) -> str:
 
 def _usage() -> str:
     lines = ["usage: crisalad COMMAND [--help] ... | --version", "", "commands:"]
-    lines += [f"  {name:<12}{summary}" for name, summary in _COMMANDS.items()]
+    lines += [f"  {name:<15}{summary}" for name, summary in _COMMANDS.items()]
     return "\n".join(lines)
 
 
@@ -134,7 +135,7 @@ def _run(name: str, given: list[str]) -> None:
     _limit_pixels(given)
     _load_plugins(given)
     arguments = renamed.today(given, lambda line: print(f"crisalad: note: {line}", file=sys.stderr))
-    module = importlib.import_module(f"{__name__}.{name}")
+    module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
     chosen = _parse(name, module, arguments)
     _check_numbers(chosen)
     compiler.set_up()

@@ -105,6 +105,51 @@ def type_of(flags: Flags) -> tuple[type, Any]:
     return made, made()
 
 
+def parse_settings(
+    kind: type, program: str, arguments: Sequence[str], defaults: Any, required: Sequence[str]
+) -> Any:
+    """Parse a command's flags, with one for every field of a configuration and of its parts.
+
+    Args:
+        kind: the command's class; its field `settings` takes the configuration. A field
+            `image_size` replaces the model's.
+        program: the command's name, for messages.
+        arguments: the command line's.
+        defaults: the configuration that flags start from.
+        required: fields of `kind` without a default.
+
+    Returns:
+        An instance of `kind`.
+
+    Raises:
+        InputError: no such part, or what the configuration's checks raise.
+    """
+    preset = find_flag(arguments, "--preset") or "b14"
+    flags = choose_parts(flags_of(defaults), arguments, preset)
+    settings, default = type_of(flags)
+    fields = [
+        (
+            field.name,
+            Annotated[settings, tyro.conf.arg(name="")],
+            dataclasses.field(default=default),
+        )
+        if field.name == "settings"
+        else (field.name, field.type, field)
+        for field in dataclasses.fields(kind)
+    ]
+    # Dataclasses take fields without a default first.
+    fields.sort(key=lambda field: field[0] not in required)
+    made = dataclasses.make_dataclass(kind.__name__, fields, frozen=True, bases=(kind,))
+    made.__doc__ = kind.__doc__
+    parsed: Any = tyro.cli(made, prog=program, args=arguments)
+    given = parsed.settings
+    if parsed.image_size is not None:
+        # Before the checks: the preset's own size may not fit another backbone.
+        model = dataclasses.replace(given.model, image_size=parsed.image_size)
+        given = dataclasses.replace(given, model=model)
+    return dataclasses.replace(parsed, settings=config_of(flags, given))
+
+
 def config_of(flags: Flags, parsed: Any) -> Any:
     """Make the configuration from a parsed instance of `type_of`'s class.
 

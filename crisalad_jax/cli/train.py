@@ -3,12 +3,10 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
-
-import tyro
+from typing import Any, Literal
 
 from crisalad_jax.cli.common import console
-from crisalad_jax.cli.flags import choose_parts, config_of, find_flag, flags_of, type_of
+from crisalad_jax.cli.flags import find_flag, parse_settings
 from crisalad_jax.config.io import read_config
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import recipe
@@ -61,42 +59,25 @@ class Train:
     """Number of processes, with --coordinator-address HOST:PORT."""
     process_id: int | None = None
     """Which of them this is, from 0."""
+    local_device_ids: tuple[int, ...] | None = None
+    """This host's GPUs that are this process's, with --coordinator-address. By default one: that of
+    the process's number on its host, if Slurm, Open MPI or a coordinator at localhost tells it."""
     shard_state: bool = False
     """Keep what trains and its moments in shards, one a device, not whole on each: for --trainable
     all of a large model."""
     num_workers: int = 0
     """Processes that read the training images; 0 reads them by threads, which is as fast on few
     cores, and keeps decoded images of small sets in memory."""
+    num_threads: int | None = None
+    """Threads that read the training images; by default one for each core that this process may
+    use."""
     quiet: bool = False
     """No progress bars."""
 
 
 def parse(program: str, arguments: Sequence[str]) -> Train:
     """Parse the flags, with one for every field of the configuration and of its parts."""
-    preset = find_flag(arguments, "--preset") or "b14"
-    flags = choose_parts(flags_of(defaults(arguments)), arguments, preset)
-    settings, default = type_of(flags)
-    fields = [
-        (
-            field.name,
-            Annotated[settings, tyro.conf.arg(name="")],
-            dataclasses.field(default=default),
-        )
-        if field.name == "settings"
-        else (field.name, field.type, field)
-        for field in dataclasses.fields(Train)
-    ]
-    # Dataclasses take fields without a default first.
-    fields.sort(key=lambda field: field[0] not in ("data", "out"))
-    made = dataclasses.make_dataclass("Train", fields, frozen=True, bases=(Train,))
-    made.__doc__ = Train.__doc__
-    parsed: Any = tyro.cli(made, prog=program, args=arguments)
-    given = parsed.settings
-    if parsed.image_size is not None:
-        # Before the checks: the preset's own size may not fit another backbone.
-        model = dataclasses.replace(given.model, image_size=parsed.image_size)
-        given = dataclasses.replace(given, model=model)
-    return dataclasses.replace(parsed, settings=config_of(flags, given))
+    return parse_settings(Train, program, arguments, defaults(arguments), ("data", "out"))
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
@@ -121,11 +102,18 @@ def run(arguments: Train) -> None:
 
     if arguments.coordinator_address is not None:
         distributed.join_processes(
-            arguments.coordinator_address, arguments.num_processes, arguments.process_id
+            arguments.coordinator_address,
+            arguments.num_processes,
+            arguments.process_id,
+            arguments.local_device_ids,
         )
-    elif (arguments.num_processes, arguments.process_id) != (None, None):
+    elif any(
+        given is not None
+        for given in (arguments.num_processes, arguments.process_id, arguments.local_device_ids)
+    ):
         raise InputError(
-            "--num-processes, --process-id: found no --coordinator-address, expected it beside them"
+            "--num-processes, --process-id, --local-device-ids: found no --coordinator-address, "
+            "expected it beside them"
         )
     console.quiet = not distributed.is_primary()
     config: TrainConfig = arguments.settings
@@ -139,6 +127,7 @@ def run(arguments: Train) -> None:
         backbone=arguments.backbone,
         on_bad_image=arguments.on_bad_image,
         num_workers=arguments.num_workers,
+        num_threads=arguments.num_threads,
         shard_state=arguments.shard_state,
         quiet=arguments.quiet,
         say=lambda line: console.print(line, soft_wrap=True),

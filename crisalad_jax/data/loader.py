@@ -27,7 +27,7 @@ OnBadImage = Literal["skip", "stop"]
 BATCHES_AHEAD = 2
 _IMAGES_PER_TASK = 8
 """Largest number of images that a thread reads per task, because every task has an overhead."""
-THREADS = min(usable_cores(), 16)
+THREADS = usable_cores()
 """OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
 
 
@@ -339,7 +339,7 @@ def _batches(
         read = read_ahead(
             functools.partial(_read_all, load),
             tasks,
-            ahead=-(-BATCHES_AHEAD * batch_size // size),
+            ahead=max(-(-BATCHES_AHEAD * batch_size // size), threads, num_workers),
             threads=threads,
             num_workers=num_workers,
         )

@@ -53,7 +53,7 @@ def read_ahead(
         executor = ProcessPoolExecutor(num_workers, context, _begin_work, (work,))
         task: Callable[[Any], Any] = _do_work
     else:
-        executor, task = ThreadPoolExecutor(min(threads, ahead)), work
+        executor, task = ThreadPoolExecutor(threads), work
     waiting: collections.deque[Future[_Result]] = collections.deque()
     rest = iter(items)
     try:

@@ -30,6 +30,7 @@ def train(
     backbone: Path | None = None,
     on_bad_image: OnBadImage = "stop",
     num_workers: int = 0,
+    num_threads: int | None = None,
     shard_state: bool = False,
     quiet: bool = False,
     say: Callable[[str], None] = lambda line: None,
@@ -46,6 +47,7 @@ def train(
         backbone: a checkpoint to start the backbone from, or a published model's name.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
         num_workers: number of processes that read the training images; 0 for threads.
+        num_threads: number of threads that read them; None for one a usable core.
         shard_state: keep what trains and its moments in shards, one a device.
         quiet: no progress bars.
         say: called with each line to print.
@@ -107,6 +109,7 @@ def train(
         initial=initial,
         on_bad_image=on_bad_image,
         num_workers=num_workers,
+        num_threads=num_threads,
         shard_state=shard_state,
         quiet=quiet,
     )

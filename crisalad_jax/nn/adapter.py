@@ -188,16 +188,21 @@ def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
 
 
 def adapter(
-    params: SingleAdapter, tokens: Float[Array, "*batch token dim"], grid: tuple[int, int]
+    params: SingleAdapter,
+    tokens: Float[Array, "*batch token dim"],
+    grid: tuple[int, int],
+    *,
+    length: int | None = None,
 ) -> Float[Array, "*batch token dim"]:
     """Apply an adapter: down, ReLU, convolutions on the patch grid plus skip, up (paper Eq. 2).
 
-    The last `grid[0] * grid[1]` tokens are patches in row order. The convolutions are the identity
+    The last `grid[0] * grid[1]` of the first `length` tokens, by default of all, are patches in row
+    order. The convolutions are the identity
     on the class and register tokens before them. With the skip these tokens therefore count twice,
     as in CricaVPR. The MLP and side adapters have neither convolutions nor skip, and the latter has
     GELU.
     """
-    return train_adapter(params, tokens, grid, None)[0]
+    return train_adapter(params, tokens, grid, None, length=length)[0]
 
 
 def train_adapter(
@@ -205,6 +210,8 @@ def train_adapter(
     tokens: Float[Array, "*batch token dim"],
     grid: tuple[int, int],
     valid: Bool[Array, " image"] | None,
+    *,
+    length: int | None = None,
 ) -> tuple[Float[Array, "*batch token dim"], SingleAdapter]:
     """Apply an adapter to a training batch, whose statistics its batch norms normalise by.
 
@@ -213,6 +220,7 @@ def train_adapter(
         tokens: see `adapter`; of a batch of images where `valid` is given.
         grid: rows and columns of patches.
         valid: which images the statistics are taken of; None takes the stored ones, which stay.
+        length: see `adapter`.
 
     Returns:
         (tokens, updated): the adapter's output, and the adapter with updated running statistics.
@@ -224,14 +232,18 @@ def train_adapter(
     if isinstance(params, MlpAdapter):
         return linear(params.up, hidden), params
     *batch, count, width = hidden.shape
-    special = count - grid[0] * grid[1]
-    patches = hidden[..., special:, :].reshape(-1, *grid, width)
+    last = count if length is None else length
+    special = last - grid[0] * grid[1]
+    patches = hidden[..., special:last, :].reshape(-1, *grid, width)
     if isinstance(params, DepthwiseAdapter):
         mixed = _separable(params, patches)
     else:
         mixed, params = _multi_resolution(params, patches, valid)
     mixed = mixed.reshape(*batch, grid[0] * grid[1], width)
-    branch = jnp.concatenate([hidden[..., :special, :], mixed], axis=-2)
+    parts = [hidden[..., :special, :], mixed]
+    if last < count:
+        parts.append(hidden[..., last:, :])
+    branch = jnp.concatenate(parts, axis=-2)
     return linear(params.up, branch + hidden), params
 
 

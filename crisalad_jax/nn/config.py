@@ -50,6 +50,10 @@ class ModelConfig:
     compute_dtype: Literal["float32", "bfloat16", "float64"] = free_field("float32")
     """Type of the matrix products; normalisations, softmax and transport are float32 at least.
     float64 is for numerical studies, under JAX's 64-bit mode."""
+    precision: Literal["highest", "high", "default"] = free_field("highest")
+    """Precision of float32 products on accelerators, in JAX's words: "highest" is float32, "high"
+    fewer bits, and "default" what the platform computes fastest (docs/performance.md). A CPU
+    computes in float32. Products of another `compute_dtype` are in that type."""
     remat: Literal["dots", "full", "none"] = free_field("dots")
     """Rematerialisation of a block in the backward pass. "dots" stores the results of large matrix
     products, "full" the block's input alone (least memory, one more forward pass), and "none"

@@ -16,6 +16,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import TAPS
 from crisalad_jax.nn.model import attend_across_images, extract_tokens, parameter_shapes, self_mask
 from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.target import CPU, lowering_for
 
 _SCOPES = {
     "projection": "projection",
@@ -41,6 +42,7 @@ class PartCost(NamedTuple):
     """Number of multiply-accumulates per image in matrix products and convolutions."""
 
 
+@lowering_for(CPU)
 def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     """Count the parameters of each part, and its multiply-accumulates per image.
 
@@ -97,6 +99,7 @@ def _part_of(name: str) -> str:
     return "backbone blocks" if name.startswith("backbone.blocks.") else "backbone embedding, norm"
 
 
+@lowering_for(CPU)  # whose products are all seen: a fused attention is one operation
 def count_macs(function: Any, *arguments: Any) -> int:
     """Count the multiply-accumulates of a function's program, in products and convolutions.
 

@@ -3,14 +3,15 @@
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from crisalad_jax.utils.compiler import product_dtype
 from crisalad_jax.utils.pytree import pytree_dataclass
+from crisalad_jax.utils.target import target
 
 Keys = Key[Array, "*keys"]
 """One random key for all, or one for each entry of a batch."""
@@ -134,10 +135,68 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
     The whole batch is rows of one matrix: otherwise, for the gradient of a weight, XLA would
     transpose the cotangent by a copy.
     """
-    rows, weight = x.reshape(-1, x.shape[-1]), params.weight.astype(x.dtype)
-    y = jnp.matmul(rows, weight, preferred_element_type=product_dtype(x.dtype))
+    rows = x.reshape(-1, x.shape[-1])
+    product = _wide_gradient_matmul if _sums_gradients(x, params.weight) else _matmul
+    y = product(rows, params.weight)
     y = (y if params.bias is None else at_least_float32(y) + params.bias).astype(x.dtype)
-    return y.reshape(*x.shape[:-1], weight.shape[-1])
+    return y.reshape(*x.shape[:-1], y.shape[-1])
+
+
+def product_precision(dtype: Any) -> jax.lax.Precision | None:
+    """Return the precision of a product of matrices of `dtype`; None is what JAX is set to.
+
+    A pass takes numbers of 8 bits as they are, so that bfloat16 needs one.
+    """
+    single = dtype == jnp.bfloat16 and target().platform != "cpu"
+    return jax.lax.Precision.DEFAULT if single else None
+
+
+def _sums_gradients(x: Array, weight: Array) -> bool:
+    """Return whether a weight's gradient is to be summed in float32 by a rule of its own.
+
+    JAX's rule rounds it to the product's type before the sum over devices. A CPU's devices, which
+    are virtual, do without: its program stays as it is.
+    """
+    mixed = x.dtype == jnp.bfloat16 and weight.dtype != x.dtype
+    return mixed and target().platform != "cpu"
+
+
+def _matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
+    dtype = rows.dtype
+    return jnp.matmul(
+        rows,
+        weight.astype(dtype),
+        precision=product_precision(dtype),
+        preferred_element_type=target().product_dtype(dtype),
+    )
+
+
+@jax.custom_vjp
+def _wide_gradient_matmul(
+    rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]
+) -> Float[Array, "row d_out"]:
+    """Multiply bfloat16 rows by a wider weight, whose gradient is summed in the weight's type."""
+    return _matmul(rows, weight)
+
+
+def _matmul_forward(rows: Array, weight: Array) -> tuple[Array, tuple[Array, Array]]:
+    return _matmul(rows, weight), (rows, weight)
+
+
+def _matmul_backward(kept: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
+    rows, weight = kept
+    change = change.astype(rows.dtype)
+    to_rows = _matmul(change, weight.T).astype(rows.dtype)
+    to_weight = jnp.matmul(
+        rows.T,
+        change,
+        precision=product_precision(rows.dtype),
+        preferred_element_type=weight.dtype,
+    )
+    return to_rows, to_weight
+
+
+_wide_gradient_matmul.defvjp(_matmul_forward, _matmul_backward)
 
 
 def layer_norm(
@@ -208,17 +267,76 @@ def conv(
     kernels of odd sizes.
     """
     margin = params.weight.shape[0] // 2 if padding is None else padding
-    y = jax.lax.conv_general_dilated(
-        x.reshape(-1, *x.shape[-3:]),
-        params.weight.astype(x.dtype),
+    images = x.reshape(-1, *x.shape[-3:])
+    if _sums_gradients(x, params.weight):
+        y = _wide_gradient_convolve(images, params.weight, stride, margin)
+    else:
+        y = _convolve(images, params.weight, stride, margin)
+    if params.bias is not None:
+        y = at_least_float32(y) + params.bias
+    return y.astype(x.dtype).reshape(*x.shape[:-3], *y.shape[1:])
+
+
+def _convolve(images: Array, weight: Array, stride: int, margin: int) -> Array:
+    return jax.lax.conv_general_dilated(
+        images,
+        weight.astype(images.dtype),
         window_strides=(stride, stride),
         # Not "SAME", which pads less before the image than after it where the stride is 2.
         padding=((margin, margin), (margin, margin)),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=product_precision(images.dtype),
     )
-    if params.bias is not None:
-        y = at_least_float32(y) + params.bias
-    return y.astype(x.dtype).reshape(*x.shape[:-3], *y.shape[1:])
+
+
+def _wide_gradient_convolution(
+    images: Float[Array, "image height width d_in"],
+    weight: Float[Array, "k k d_in d_out"],
+    stride: int,
+    margin: int,
+) -> Float[Array, "image rows columns d_out"]:
+    """Convolve bfloat16 images by a wider weight, whose gradient is summed in the weight's type."""
+    return _convolve(images, weight, stride, margin)
+
+
+_wide_gradient_convolve = jax.custom_vjp(_wide_gradient_convolution, nondiff_argnums=(2, 3))
+
+
+def _convolve_forward(
+    images: Array, weight: Array, stride: int, margin: int
+) -> tuple[Array, tuple[Array, Array]]:
+    return _convolve(images, weight, stride, margin), (images, weight)
+
+
+def _convolve_backward(
+    stride: int, margin: int, kept: tuple[Array, Array], change: Array
+) -> tuple[Array, Array]:
+    images, weight = kept
+    (to_images,) = jax.linear_transpose(
+        lambda images: _convolve(images, weight, stride, margin), images
+    )(change)
+    # The weight's gradient is the convolution of the images by the cotangent, whose pixels are
+    # `stride` apart; images are its channels. What no window reached is cut off at the end.
+    ends = [
+        size + (stride * (side - 1) + 1) - 1 - length - margin
+        for size, side, length in zip(
+            weight.shape[:2], change.shape[1:3], images.shape[1:3], strict=True
+        )
+    ]
+    to_weight = jax.lax.conv_general_dilated(
+        images,
+        change,
+        window_strides=(1, 1),
+        padding=[(margin, end) for end in ends],
+        rhs_dilation=(stride, stride),
+        dimension_numbers=("CHWN", "IHWO", "HWNC"),
+        precision=product_precision(images.dtype),
+        preferred_element_type=weight.dtype,
+    )
+    return to_images, to_weight
+
+
+_wide_gradient_convolve.defvjp(_convolve_forward, _convolve_backward)
 
 
 def batch_norm(

@@ -5,12 +5,14 @@ DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
@@ -31,9 +33,12 @@ from crisalad_jax.nn.pixels import check_pixels, normalise
 from crisalad_jax.nn.projection import project
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
+from crisalad_jax.utils.devices import IMAGE, image_mesh
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import check_drawn, pytree_dataclass
+from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
 
+_ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
+"""Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
 Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
 
 
@@ -158,6 +163,36 @@ def _check_classes(params: Any, config: Any) -> None:
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
 
 
+def cast_params(params: Any, config: ModelConfig) -> Any:
+    """Cast the weights of the backbone's large linear layers to the type of their products.
+
+    Otherwise every call casts them. Descriptors stay the same to the bit. In bfloat16 the weights
+    take half the memory, and no longer train.
+
+    Args:
+        params: the parameters, or a tree of these with some left out.
+        config: the model.
+
+    Returns:
+        The parameters that `describe` takes as well. In float32 they are `params`, not copied.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS
+        >>> config = dataclasses.replace(PRESETS["tiny"], compute_dtype="bfloat16")
+        >>> params = cast_params(init_crisalad(jax.random.key(0), config), config)
+        >>> params.backbone.blocks.mlp.fc1.weight.dtype
+        dtype(bfloat16)
+    """
+    dtype = jnp.dtype(config.compute_dtype)
+    names = iter(named_leaves(params))
+
+    def cast(leaf: Any) -> Any:
+        return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
+
+    return jax.tree.map(cast, params)
+
+
 def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[..., Any]:
     """Make a decorator that checks what a trace cannot, before the call of a compiled function.
 
@@ -215,7 +250,8 @@ def describe(
 
     It works under `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`), once and
     twice. Forward mode (`jax.jvp`, `jax.hessian`) does not work: the gradient of attention is
-    written out, for speed. Take `jax.jacrev` of `jax.grad` for a Hessian.
+    written out, for speed. Take `jax.jacrev` of `jax.grad` for a Hessian. On an accelerator, where
+    attention is fused, the gradient can be taken once.
 
     Args:
         params: from `init_crisalad` or a weight file.
@@ -332,6 +368,45 @@ def _extract_tokens(
     micro_batch: int | None,
 ) -> tuple[Tokens, Any]:
     """Extract tokens, and the running statistics; None in their place where `valid` is None."""
+    count = images.shape[0]  # which may be symbolic, where `len` is not
+    keys = None if key is None else jax.random.split(key, count)
+    if micro_batch is not None and count % micro_batch:
+        raise InputError(
+            f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
+        )
+    mesh = image_mesh()
+    if mesh is None or valid is not None:
+        return _tokens_in_parts(params, images, valid, config, keys, micro_batch)
+    # Without statistics of the batch a device needs nothing of the others. XLA's partitioner would
+    # not see it in loops over images, and would sum gradients layer by layer.
+    own = count // mesh.size
+    if micro_batch is not None:
+        at_once = max(1, micro_batch // mesh.size)
+        micro_batch = max(n for n in range(1, at_once + 1) if own % n == 0)
+
+    def tokens_of_own(params: Crisalad, images: Images, keys: Keys | None) -> Tokens:
+        return _tokens_in_parts(params, images, None, config, keys, micro_batch)[0]
+
+    alike, shared = PartitionSpec(), PartitionSpec(IMAGE)
+    extract = jax.shard_map(
+        tokens_of_own,
+        mesh=mesh,
+        in_specs=(alike, shared, shared),
+        out_specs=shared,
+        check_vma=False,  # whose rules parts of plug-ins need not follow
+    )
+    return extract(params, images, keys), None
+
+
+def _tokens_in_parts(
+    params: Crisalad,
+    images: Images,
+    valid: Bool[Array, " image"] | None,
+    config: ModelConfig,
+    keys: Keys | None,
+    micro_batch: int | None,
+) -> tuple[Tokens, Any]:
+    """Extract tokens `micro_batch` images at a time; see `_extract_tokens`."""
 
     def tokens_of(
         statistics: Crisalad | None, images: Images, keys: Keys | None, valid: Array | None
@@ -345,15 +420,10 @@ def _extract_tokens(
         return statistics, tokens
 
     statistics = None if valid is None else split_statistics(params)[0]
-    count = images.shape[0]  # which may be symbolic, where `len` is not
-    keys = None if key is None else jax.random.split(key, count)
+    count = images.shape[0]
     if micro_batch is None or micro_batch == count:
         statistics, tokens = tokens_of(statistics, images, keys, valid)
         return tokens, statistics
-    if count % micro_batch:
-        raise InputError(
-            f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
-        )
 
     # Parts are interleaved, so that each device of a sharded batch has a share of every part.
     def split(x: Array) -> Array:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens
+from crisalad_jax.nn.model import Crisalad, attend_across_images, cast_params, extract_tokens
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.retrieval.grouping import (
     Batches,
@@ -90,7 +90,7 @@ def tokens_in_batches(
         config, paths, batch_size=batch_size, on_bad_image=on_bad_image, cache=cache
     )
     devices = devices_for(batch_size)
-    params = devices.replicate(params)
+    params = devices.replicate(cast_params(params, config))
 
     def back(tokens: Tokens, batch: ImageBatch) -> tuple[FolderTokens, ImageBatch]:
         global_tokens, local = jax.device_get((tokens.global_token, tokens.local))

@@ -34,6 +34,7 @@ from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.target import target
 
 # Queries compared at a time: with 4,096 database rows their similarities are 16 MiB.
 _QUERY_CHUNK = 1024
@@ -104,7 +105,7 @@ def search(
         if value < 1:
             raise InputError(f"{name}: found {value}, expected at least 1")
     database, queries = as_sides(database, queries)
-    on_host = jax.default_backend() == "cpu"
+    on_host = target().platform == "cpu"
     return _search(database, queries, k, chunk, on_host=on_host, label=label, quiet=quiet)
 
 
@@ -158,6 +159,9 @@ def _program(mesh: Mesh, count: int) -> Any:
         start = jax.lax.axis_index("image") * len(rows)
         padding = start + jnp.arange(len(rows)) >= valid
         products = jnp.where(padding[:, None], -jnp.inf, products)
+        if len(rows) // _GROUP <= count:  # as few rows as eight devices have of a chunk
+            values, places = jax.lax.top_k(products.T, count)
+            return values[None], start + places[None]
         # The `count` largest products lie in the `count` groups with the largest maxima.
         largest = products.reshape(-1, _GROUP, len(queries)).max(axis=1).T
         _, groups = jax.lax.top_k(largest, min(count, largest.shape[1]))

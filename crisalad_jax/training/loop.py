@@ -7,11 +7,11 @@ from collections.abc import Callable, Generator
 from typing import NamedTuple
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.loader import THREADS, OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.run import Batch, Run
+from crisalad_jax.training.run import Batch, Run, Told
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError, Stopped
 from crisalad_jax.utils.progress import Bar, progress_bar
@@ -40,6 +40,7 @@ def fit(
     initial: Crisalad | None = None,
     on_bad_image: OnBadImage = "stop",
     num_workers: int = 0,
+    num_threads: int | None = None,
     shard_state: bool = False,
     quiet: bool = False,
 ) -> FitResult:
@@ -50,7 +51,8 @@ def fit(
     and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best recall by
     `config.select_by` (grouping `single`), and the best `config.keep_best` weights in `best/`.
 
-    A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one.
+    A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one
+    (on a CPU; see docs/reliability.md for a GPU).
 
     Args:
         config: everything but the files.
@@ -60,6 +62,7 @@ def fit(
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
         num_workers: processes that read the training images; 0 reads them by threads of this one.
+        num_threads: number of those threads; None is one for each core that this process may use.
         shard_state: keep what trains and its moments in shards, one a device, not whole on each.
         quiet: no progress bar.
 
@@ -81,14 +84,16 @@ def fit(
         2
     """
     check_learns(config)
-    if num_workers < 0:
-        raise InputError(f"num_workers: found {num_workers}, expected at least 0")
+    threads = THREADS if num_threads is None else num_threads
+    for name, count in (("num_workers", num_workers), ("num_threads", threads)):
+        if count < 0:
+            raise InputError(f"{name}: found {count}, expected at least 0")
     if validation is not None:
         # A missing ground truth raises now, not after the first epoch.
         validation.ground_truth()
     run = Run(config, places, pathlib.Path(out), initial, validation, shard_state=shard_state)
     with contextlib.closing(run):
-        _train(run, lambda: run.rest_of_epoch(on_bad_image, num_workers), quiet)
+        _train(run, lambda: run.rest_of_epoch(on_bad_image, num_workers, threads), quiet)
         distributed.raise_together(run.save)
     record = run.record
     best = record.best[0][0] if record.best else None
@@ -145,7 +150,13 @@ def _stop_together(signals: SignalState) -> None:
 
 
 def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar) -> None:
-    """Take the steps of an epoch; the processes agree once before each step."""
+    """Take the steps of an epoch.
+
+    One process knows its errors, signals and clock before each step. Several tell them with the
+    step, and learn what was told when its metrics are read, while the next one is computed: no
+    process waits for the others before the end of the epoch. A process that has failed goes on
+    with steps that none takes, until all have learnt it.
+    """
     error: Exception | None = None
 
     def finish() -> None:
@@ -153,31 +164,42 @@ def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar
         if note is not None:
             bar.advance(1, note=note)
 
+    def heed(told: Told) -> None:
+        if told.failed:
+            raise error or InputError(distributed.ANOTHER_FAILED)
+        if told.signal:
+            finish()
+            raise Stopped(told.signal)
+        if told.save_is_due:
+            finish()
+            distributed.raise_together(run.save)
+
+    def own() -> Told:
+        return Told(error is not None, signals.number, run.save_is_due())
+
     with contextlib.closing(rest_of_epoch()) as batches:
-        while True:
+        for _ in range(run.steps_left_of_epoch()):
             batch = None
             try:
                 batch = None if error is not None else run.next_batch(batches)
             except Exception as raised:
                 error = raised
-            has_failed, has_ended, number, save_is_due = distributed.all_max(
-                error is not None, batch is None, signals.number, run.save_is_due()
-            )
-            if has_failed:
-                raise error or InputError(distributed.ANOTHER_FAILED)
-            if number or save_is_due or has_ended:
-                finish()
-            if number:
-                raise Stopped(number)
-            if save_is_due:
-                distributed.raise_together(run.save)
-            if batch is None:
-                break
+            told = own()
+            heed(run.told if distributed.are_several() else told)
+            signals.watch()
+            run.start_step(batch, told)
+            signals.has_work = True  # before it, XLA compiles the step
             try:
-                signals.watch()
-                note = run.take_step(batch)
-                signals.has_work = True  # before it, XLA compiles the step
-            except Exception as raised:  # told to the others before the next step
+                note = run.finish_step_before()
+            except Exception as raised:  # told to the others with the next step
                 error, note = raised, None
             if note is not None:
                 bar.advance(1, note=note)
+        note = None
+        try:
+            note = run.finish_step()
+        except Exception as raised:
+            error = raised if error is None else error
+        heed(Told(*distributed.all_max(*own())))
+        if note is not None:
+            bar.advance(1, note=note)

@@ -7,7 +7,7 @@ import math
 import pathlib
 import time
 import zlib
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -22,11 +22,12 @@ from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.model import Crisalad, extract_tokens, init_crisalad
+from crisalad_jax.nn.model import Crisalad, cast_params, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.batches import batches_of, groups_of, steps_per_epoch
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.memory import check_memory, memory_limit, memory_of
 from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
@@ -38,7 +39,6 @@ from crisalad_jax.training.step import (
     Metrics,
     StepConfig,
     TrainState,
-    cast_frozen,
     init_train_state,
     train_step,
 )
@@ -46,6 +46,7 @@ from crisalad_jax.training.trainable import merge_params, shards_batch
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.devices import Devices, devices_for
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.signals import SignalState
 
 WATCHED_QUERIES = 16
@@ -62,6 +63,17 @@ class Batch(NamedTuple):
     images: jax.Array
     labels: jax.Array
     valid: jax.Array
+
+
+class Told(NamedTuple):
+    """What a process tells the others, beside a step or between steps."""
+
+    failed: int = 0
+    """1 after an error, 0 without one."""
+    signal: int = 0
+    """Number of the last signal, 0 for none."""
+    save_is_due: int = 0
+    """1 where the last saved state is old."""
 
 
 class _Pending(NamedTuple):
@@ -128,6 +140,7 @@ class Run:
             self.classes,
             config.batch_norm,
         )
+        self._all_is_well = self._devices.replicate(np.asarray(True))
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.
         classifiers_key = jax.random.fold_in(jax.random.key(config.seed), 2)
@@ -136,7 +149,7 @@ class Run:
             params, config.trainable, self._step_config, key=classifiers_key
         )
         self._frozen: PyTree = jax.device_get(frozen)
-        self._frozen_there = self._devices.replicate(cast_frozen(self._frozen, config.model))
+        self._frozen_there = self._devices.replicate(cast_params(self._frozen, config.model))
         self.record = RunRecord(
             weights_checksum=checksum(jax.tree.leaves(params)),
             places_checksum=checksums["places"],
@@ -144,15 +157,34 @@ class Run:
             sources={name: list(source) for name, source in sources_of(config).items()},
         )
         distributed.check_same("weights", self.record.weights_checksum)
+        # A step that does not fit raises before the first file too.
+        place = self._devices.shard if shard_state else self._devices.replicate
+        self._check_memory(state, place)
         self._files: RunFiles | None = None
         state = self._open_files(state)
         # Copied, because a step donates the buffers of its state.
-        place = self._devices.shard if shard_state else self._devices.replicate
         self.state: TrainState = _copied(place(state))
+        self._before: _Pending | None = None
         self._pending: _Pending | None = None
-        self._all_is_well = self._devices.replicate(np.asarray(True))
         self._saved_at = self._stepped_at = time.monotonic()
         self._waited = 0.0
+        self.told = Told()
+        """What several processes told with the last finished step, the largest of each."""
+
+    def _check_memory(self, state: TrainState, place: Callable[[TrainState], TrainState]) -> None:
+        """Check that the devices have the memory of a step; see `check_memory`."""
+        limit = memory_limit(self._devices.mesh.local_devices)
+        if limit is None:
+            return
+
+        def compiled_size(micro_batch: int | None) -> int:
+            config = dataclasses.replace(self._step_config, micro_batch=micro_batch)
+            lowered = train_step.lower(*arguments, config, self._all_is_well, *told)
+            return memory_of(lowered.compile())
+
+        batch, told = self._no_images(), self._with_step(Told())
+        arguments = place(state), self._frozen_there, *batch, self._step_key
+        check_memory(compiled_size, self.config, limit, self._devices.mesh.size)
 
     def _open_files(self, state: TrainState) -> TrainState:
         """Open the run's files in the primary process; return the saved state, or `state`."""
@@ -205,7 +237,7 @@ class Run:
         return self._validation is not None and new and asked
 
     def rest_of_epoch(
-        self, on_bad_image: OnBadImage, num_workers: int
+        self, on_bad_image: OnBadImage, num_workers: int, threads: int
     ) -> Generator[Batch, None, None]:
         """Yield the batches from the next step to the end of its epoch; none if the run is done.
 
@@ -223,6 +255,7 @@ class Run:
             part=(jax.process_index(), jax.process_count()),
             on_bad_image=on_bad_image,
             num_workers=num_workers,
+            threads=threads,
             cache=self._cache,
         )
         yield from one_ahead(
@@ -244,22 +277,51 @@ class Run:
         self._waited = time.monotonic() - begin
         return batch
 
-    def take_step(self, batch: Batch) -> str | None:
-        """Start a step; then finish the one before while the devices compute.
+    def steps_left_of_epoch(self) -> int:
+        """Return how many steps of the epoch are to be taken; 0 if the run is done."""
+        return 0 if self.is_done() else self.steps_per_epoch - self.step % self.steps_per_epoch
 
-        Returns:
-            What `finish_step` returns of the step before.
+    def start_step(self, batch: Batch | None, told: Told) -> None:
+        """Start a step, while the devices may still compute the one before.
 
-        Raises:
-            InputError: what `finish_step` raises.
+        Args:
+            batch: the images; None where this process has failed to read them. Then no process
+                takes the step, which all start.
+            told: of several processes, what this one tells the others with the step.
         """
-        before = self._pending
+        before = self._before = self._pending
         proceed = self._all_is_well if before is None else before.metrics.updated
+        batch = self._no_images() if batch is None else batch
         self.state, metrics = train_step(
-            self.state, self._frozen_there, *batch, self._step_key, self._step_config, proceed
+            self.state,
+            self._frozen_there,
+            *batch,
+            self._step_key,
+            self._step_config,
+            proceed,
+            *self._with_step(told),
         )
         self._pending = _Pending(metrics, len(batch.images), self._waited)
+
+    def finish_step_before(self) -> str | None:
+        """Finish the step before the one that was started last, as `finish_step`."""
+        before, self._before = self._before, None
         return self._finish(before)
+
+    def _with_step(self, told: Told) -> tuple[jax.Array, ...]:
+        """Return what a step tells the other processes, if there are others."""
+        if not distributed.are_several():
+            return ()
+        rows = np.tile(np.array(told, np.int32), (self._devices.mesh.local_mesh.size, 1))
+        return (self._devices.shard_batch(rows),)
+
+    def _no_images(self) -> Batch:
+        """Return a batch of images that are not valid."""
+        count = self.config.places_per_batch * self.config.images_per_place
+        own = count // jax.process_count()
+        size = (own, *self.config.model.input_size, 3)
+        parts = np.zeros(size, np.uint8), np.full(own, -1, np.int32), np.zeros(own, bool)
+        return Batch(*map(self._devices.shard_batch, parts))
 
     def finish_step(self) -> str | None:
         """Wait for the step that was started last, if any, and log it.
@@ -277,7 +339,12 @@ class Run:
     def _finish(self, pending: _Pending | None) -> str | None:
         if pending is None:
             return None
-        metrics, size = _numbers(pending.metrics), pending.images
+        fetched, size = jax.device_get(pending.metrics), pending.images
+        if fetched.told is not None:
+            self.told = Told(*fetched.told.tolist())
+            if self.told.failed:
+                return None  # which the caller raises, in all processes alike
+        metrics = _numbers(fetched._replace(told=None))
         skipped = size - int(metrics.pop("images"))
         if not metrics.pop("updated"):
             self._pending = None  # the step after it was skipped as well
@@ -378,7 +445,9 @@ class Run:
         batches = photograph_batches(model, paths, batch_size=len(paths), cache=self._cache)
         batch = next(iter(batches))  # of the size of the first, where sizes differ
         transport = extract_tokens(params, batch.images[batch.valid], model).transport
-        return {} if transport is None else _numbers(jax.tree.map(jnp.mean, transport))
+        return (
+            {} if transport is None else _numbers(jax.device_get(jax.tree.map(jnp.mean, transport)))
+        )
 
     def save_is_due(self) -> bool:
         """Return whether the last saved state is old, by the primary process's clock."""
@@ -396,6 +465,7 @@ class Run:
             params = functools.partial(self._merged, state.trainable)
             self._files.save(self.step, self.record, state, params)
         self._saved_at = self._stepped_at = time.monotonic()
+        self.told = Told()  # whose processes did not know that this would save
 
     def close(self) -> None:
         """Wait for files that are being written, and close them."""
@@ -416,13 +486,20 @@ def _devices(config: TrainConfig) -> Devices:
         raise InputError(
             f"processes: found {jax.process_count()}, expected a divisor of {images} images"
         )
-    return devices_for(images if spread else jax.process_count(), processes=True)
+    devices = devices_for(images if spread else jax.process_count(), processes=True)
+    found, used = len(jax.devices()), devices.mesh.size
+    if spread and used < found and distributed.is_primary():
+        tell(
+            f"training: found {found} devices for {images} images a step, of which {used} share "
+            "them, the most that divide them in each process"
+        )
+    return devices
 
 
 def _numbers(metrics: Metrics | TransportStatistics) -> dict[str, float]:
-    """Fetch metrics by name, those of the transport among them."""
+    """List metrics by name, those of the transport among them."""
     numbers: dict[str, float] = {}
-    for name, value in jax.device_get(metrics)._asdict().items():
+    for name, value in metrics._asdict().items():
         if isinstance(value, TransportStatistics):
             numbers |= _numbers(value)
         elif value is not None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import re
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -40,10 +39,7 @@ from crisalad_jax.training.optimiser import (
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils import compiler, devices, distributed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import named_leaves
 
-_ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
-"""Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
 LossFunction = Callable[..., Float[Array, ""]]
 """Takes descriptors, labels and, if it has a third argument, which images are valid."""
 
@@ -77,6 +73,8 @@ class Metrics(NamedTuple):
     """Means over the valid images, with dropout; None if the aggregator has no transport."""
     updated: Bool[Array, ""]
     """Whether the step was taken, and not skipped."""
+    told: Int[Array, " number"] | None = None
+    """Largest of what the devices' processes told; None where nothing was."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +118,11 @@ class StepConfig:
     def compute_dtype(self) -> str:
         """Type of the model's matrix products."""
         return self.model.compute_dtype
+
+    @property
+    def precision(self) -> str:
+        """Precision of the model's float32 products."""
+        return self.model.precision
 
 
 def init_train_state(
@@ -199,20 +202,6 @@ def _init_loss(key: PRNGKeyArray | None, loss: Loss, config: StepConfig) -> Clas
         f"key: found None for loss {name}, which has parameters, expected a jax.random.key",
     )
     return None
-
-
-def cast_frozen(frozen: PyTree, config: ModelConfig) -> PyTree:
-    """Cast frozen weights of the backbone's linear layers to the type of their products.
-
-    A step's results stay the same to the bit; in bfloat16 the weights take half the memory.
-    """
-    dtype = jnp.dtype(config.compute_dtype)
-    names = iter(named_leaves(frozen))
-
-    def cast(leaf: Any) -> Any:
-        return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
-
-    return jax.tree.map(cast, frozen)
 
 
 def step_config(
@@ -333,6 +322,7 @@ def make_train_step(
     return step
 
 
+@devices.over_images("images", 2)
 @functools.partial(compiler.jit, runs_long=True, static_argnames="config", donate_argnames="state")
 def train_step(
     state: TrainState,
@@ -343,6 +333,7 @@ def train_step(
     key: PRNGKeyArray,
     config: StepConfig,
     proceed: Bool[Array, ""] | bool = True,
+    told: Int[Array, "device number"] | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Take one step of the optimiser on the loss of a batch, or add its gradient up for one.
 
@@ -356,6 +347,10 @@ def train_step(
     If the loss or the gradient is not finite, or no image is valid, the state is returned as it was
     and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
     a loop may read metrics one step late, and still have the state before the failed step.
+
+    With `told` the processes of a run tell each other some numbers at the cost of no collective of
+    its own: each device has a row of its process's, and `Metrics.told` is the largest of each. If
+    the first is not 0, a process has failed and the step is skipped.
     """
     tokens_key, cross_key = split_key(jax.random.fold_in(key, state.step), 2)
     group = state.step // config.steps_per_epoch % max(len(config.classes), 1)
@@ -364,6 +359,8 @@ def train_step(
         classifier = jax.tree.map(lambda leaf: leaf[group], state.classifiers.weights)
 
     statistics, learnt = split_statistics(state.trainable)
+    # A few numbers that the loss, the mask and the metrics read for all images.
+    all_labels, all_valid, all_told = _gathered(labels, valid, told)
 
     def loss_of(trained: tuple[PyTree, Any]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
         learnt, classifier = trained
@@ -375,9 +372,11 @@ def train_step(
         else:
             tokens, measured = extract_tokens(params, images, config.model, **options), statistics
         descriptors = attend_across_images(
-            params, tokens, config.model, mask=valid_mask(valid), key=cross_key
+            params, tokens, config.model, mask=valid_mask(all_valid), key=cross_key
         )
-        result = _loss(descriptors, labels, valid, classifier, group, config)
+        # On each device the whole loss: a thousandth of a step's work (docs/training.md).
+        descriptors = devices.gather_images(descriptors)
+        result = _loss(descriptors, all_labels, all_valid, classifier, group, config)
         return result.loss, (result, tokens.transport, measured)
 
     def placed(tree: PyTree, *, whole: bool = False) -> PyTree:
@@ -398,7 +397,9 @@ def train_step(
     (loss, (result, transport, statistics)), (gradient, classifier_gradient) = jax.value_and_grad(
         loss_of, has_aux=True
     )((placed(learnt, whole=True), placed(classifier, whole=True)))
-    transport = jax.tree.map(lambda each: jnp.where(valid, each, 0).sum() / valid.sum(), transport)
+    transport = jax.tree.map(
+        lambda each: jnp.where(valid, each, 0).sum() / all_valid.sum(), transport
+    )
     norm = optax.tree.norm((gradient, classifier_gradient))
     learning_rate = config.learning_rate(state.step)
     optimiser = config.make_optimiser()
@@ -410,7 +411,9 @@ def train_step(
         classifiers = update_classifiers(classifiers, group, classifier_gradient, rate)
     trainable = eqx.combine(optax.apply_updates(learnt, updates), statistics)
     new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
-    updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & valid.any()
+    updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & all_valid.any()
+    if all_told is not None:
+        updated &= all_told[0] == 0
     state = jax.tree.map(lambda after, before: jnp.where(updated, after, before), new, state)
     return placed(state), Metrics(
         loss=loss,
@@ -418,10 +421,30 @@ def train_step(
         accuracy=result.accuracy,
         gradient_norm=norm,
         learning_rate=learning_rate,
-        images=valid.sum(),
+        images=all_valid.sum(),
         transport=transport,
         updated=updated,
+        told=all_told,
     )
+
+
+def _gathered(
+    labels: Int[Array, " image"],
+    valid: Bool[Array, " image"],
+    told: Int[Array, "device number"] | None,
+) -> tuple[Int[Array, " image"], Bool[Array, " image"], Int[Array, " number"] | None]:
+    """Gather the labels, what is valid and what was told on all devices, as one array."""
+    mesh = devices.image_mesh()
+    if mesh is None:
+        return labels, valid, None if told is None else told.max(axis=0)
+    own = [each.reshape(mesh.size, -1) for each in (labels, valid.astype(labels.dtype))]
+    if told is not None:
+        own.append(told.astype(labels.dtype))
+    every = devices.gather_images(jnp.concatenate(own, axis=1))
+    count = len(labels) // mesh.size
+    labels, valid = every[:, :count].ravel(), every[:, count : 2 * count].ravel() != 0
+    told = None if told is None else every[:, 2 * count :].max(axis=0)
+    return devices.gather_images((labels, valid, told))
 
 
 def _loss(

@@ -12,6 +12,7 @@ from crisalad_jax.nn.layers import STATISTICS
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.target import target
 
 HEAD, ADAPTERS_AND_HEAD, ALL = "head", "adapters+head", "all"
 _LAST_BLOCKS = re.compile(r"last-(\d+)-blocks(\+positions)?(\+no-norm)?\+head")
@@ -29,7 +30,7 @@ def shards_batch(trainable: str) -> bool:
     parameters train, these copies take most of the memory, which a CPU's devices share; `tiny`
     saves no time by sharding (docs/performance.md).
     """
-    return trainable != ALL or jax.default_backend() != "cpu"
+    return trainable != ALL or target().platform != "cpu"
 
 
 def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple[PyTree, PyTree]:

@@ -24,7 +24,7 @@ from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, init_crisalad, unit_features
+from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.photographs import photograph_batches
@@ -294,7 +294,7 @@ def _read_features(
     batch_size = useful_batch_size(batch_size, len(paths))
     batches = photograph_batches(config, paths, batch_size=batch_size, on_bad_image=on_bad_image)
     devices = devices_for(batch_size)
-    params = devices.replicate(params)
+    params = devices.replicate(cast_params(params, config))
     generator = np.random.default_rng(seed)
     parts: list[np.ndarray] = []
     with progress_bar("vocabulary", len(paths), "images", quiet=quiet) as bar:

@@ -1,19 +1,19 @@
 """Platform settings: compiler options, virtual devices of a CPU, and the compile cache."""
 
 import contextlib
-import contextvars
 import functools
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
+from jax.extend.core import get_opaque_trace_state
 
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
+from crisalad_jax.utils.target import lowering_platforms, over_devices_of, target
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
@@ -35,18 +35,21 @@ _LIBRARIES: dict[str, dict[str, bool | str]] = {
 _LEAST_MEMORY = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 _SMALL = 2**23
 """Number of parameters of a large model: `tiny` has an eighth of it, `s14` three times as many."""
-_PORTABLE = contextvars.ContextVar("portable", default=False)
+_AT_REST = get_opaque_trace_state()
+"""What JAX traces while it traces nothing."""
 
 
-@functools.cache
 def compiler_options(library: str, *, least_memory: bool = False) -> dict[str, bool | str]:
     """Return the XLA options that give a CPU's matrix products to "Eigen", "oneDNN" or "YNN".
 
     `least_memory` schedules operations for the least memory. A training step gets slower by it,
-    and no smaller. Options that this jaxlib does not know are left out, and all on other platforms.
+    and no smaller. Options that this jaxlib does not know are left out, and all for other targets.
     """
-    if jax.default_backend() != "cpu":
-        return {}
+    return _known_options(library, least_memory) if target().platform == "cpu" else {}
+
+
+@functools.cache
+def _known_options(library: str, least_memory: bool) -> dict[str, bool | str]:
     known = {}
     wanted = _LIBRARIES[library] | (_LEAST_MEMORY if least_memory else {})
     for name, value in wanted.items():
@@ -56,49 +59,6 @@ def compiler_options(library: str, *, least_memory: bool = False) -> dict[str, b
             continue
         known[name] = value
     return known
-
-
-@contextlib.contextmanager
-def portable() -> Iterator[None]:
-    """Trace for any platform while the block runs: make no choice by the platform that traces."""
-    token = _PORTABLE.set(True)
-    try:
-        yield
-    finally:
-        _PORTABLE.reset(token)
-
-
-def has_fused_attention() -> bool:
-    """Return whether cuDNN's attention, which never writes scores to memory, compiles here."""
-    return not _PORTABLE.get() and _compiles_fused_attention()
-
-
-@functools.cache
-def _compiles_fused_attention() -> bool:
-    if jax.default_backend() != "gpu":
-        return False
-    token = jax.ShapeDtypeStruct((1, 64, 1, 64), jnp.bfloat16)
-    attention = functools.partial(jax.nn.dot_product_attention, implementation="cudnn")
-    try:
-        jax.jit(attention).lower(token, token, token).compile()
-    except Exception:  # a missing or old cuDNN and an old GPU raise different errors
-        return False
-    return True
-
-
-def is_for_cpu() -> bool:
-    """Return whether what is traced now runs on a CPU alone."""
-    return not _PORTABLE.get() and jax.default_backend() == "cpu"
-
-
-def product_dtype(dtype: Any) -> Any:
-    """Return the fastest output type for a product of matrices of `dtype`, before rounding to it.
-
-    A CPU uses its bfloat16 units only for products with float32 outputs. A GPU rounds as it writes,
-    at no cost.
-    """
-    widens = _PORTABLE.get() or jax.default_backend() == "cpu"
-    return jnp.promote_types(dtype, jnp.float32) if widens else dtype
 
 
 def jit(
@@ -111,35 +71,53 @@ def jit(
     compile cache does not store. YNN computes those where the `compute_dtype` of a configuration
     among the arguments is bfloat16. Nothing else decides, so results have the same bits with and
     without a compile cache. A function that does not run long is scheduled for the least memory.
-    The returned function has `lower` too.
+    On accelerators float32 products have the `precision` of a configuration among the arguments.
+    The returned function has `lower` too, which lowers for the `target`.
     """
     inner = jax.jit(function, **options)
 
     @functools.cache
-    def with_products_of(library: str) -> Any:
-        chosen = compiler_options(library, least_memory=not runs_long)
-        return jax.jit(function, compiler_options=chosen, **options)
+    def with_options(chosen: tuple[tuple[str, bool | str], ...]) -> Any:
+        return jax.jit(function, compiler_options=dict(chosen), **options) if chosen else inner
 
     def outermost(leaves: Sequence[Any]) -> Any:
         if any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves):
-            return with_products_of("YNN")
-        large = runs_long and _numbers(leaves) >= _SMALL
-        return with_products_of("oneDNN" if large else "Eigen")
+            library = "YNN"
+        else:
+            large = runs_long and _numbers(leaves) >= _SMALL
+            library = "oneDNN" if large else "Eigen"
+        chosen = compiler_options(library, least_memory=not runs_long)
+        return with_options(tuple(chosen.items()))
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         leaves = jax.tree.leaves((args, kwargs))
-        # Arrays made inside a trace are traced, even if no argument is.
-        traced = any(isinstance(leaf, Tracer) for leaf in (*leaves, jax.lax.full((), 0)))
-        if traced and _PORTABLE.get():
-            return function(*args, **kwargs)  # `inner` may have a cached trace that is not portable
-        return (inner if traced else outermost(leaves))(*args, **kwargs)
+        if get_opaque_trace_state() != _AT_REST:
+            with _precision_of(leaves):
+                return inner(*args, **kwargs)
+        with _precision_of(leaves), over_devices_of(leaves):
+            return outermost(leaves)(*args, **kwargs)
 
     def lower(*args: Any, **kwargs: Any) -> Any:
-        return outermost(jax.tree.leaves((args, kwargs))).lower(*args, **kwargs)
+        leaves = jax.tree.leaves((args, kwargs))
+        with _precision_of(leaves), over_devices_of(leaves):
+            traced = outermost(leaves).trace(*args, **kwargs)
+            return traced.lower(lowering_platforms=lowering_platforms())
 
     call.__dict__["lower"] = lower
     return call
+
+
+def _precision_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[None]:
+    """Compute float32 products at the `precision` of a configuration, if there is one.
+
+    A CPU has one precision, the highest.
+    """
+    words = (getattr(leaf, "precision", None) for leaf in leaves)
+    word = next((word for word in words if isinstance(word, str)), None)
+    if word is None or target().platform == "cpu":
+        return contextlib.nullcontext()
+    return jax.default_matmul_precision(word)
 
 
 def _numbers(leaves: Sequence[Any]) -> int:

@@ -1,19 +1,25 @@
 """Devices that share a batch of images."""
 
+import contextlib
+import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.core import Tracer
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
-from crisalad_jax.utils.compiler import is_for_cpu
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.target import machine, target
 
 SHARD_FROM = 2**14
 """Smallest number of elements of a sharded array: a gather of smaller ones costs too much."""
 
 
+IMAGE = "image"
+"""Name of the mesh's one axis, over which images are sharded."""
 _Tree = TypeVar("_Tree")
 
 
@@ -38,7 +44,7 @@ class Devices(NamedTuple):
         here = Mesh(np.array(self.mesh.local_devices), ("image",))
 
         def put(leaf: Any) -> jax.Array:
-            host = np.asarray(leaf) if jax.default_backend() == "cpu" else leaf
+            host = np.asarray(leaf) if machine().platform == "cpu" else leaf
             alike = NamedSharding(here, PartitionSpec())
             array = jax.device_put(host, alike, may_alias=True)
             if here == self.mesh:
@@ -115,8 +121,72 @@ def parts_for_caches(images: int, at_once: int) -> int:
         at_once: number of images that a device computes at once, or the next smaller one that
             divides its share; at least one.
     """
-    if not images or not is_for_cpu():
+    if not images or target().platform != "cpu":
         return 1
     together = images % jax.process_count() == 0
     share = images // devices_for(images, processes=together).mesh.size
     return share // max(n for n in range(1, max(1, at_once) + 1) if share % n == 0)
+
+
+def over_images(argument: str, position: int) -> Callable[[Any], Any]:
+    """Make a decorator that tells a compiled function over which devices its images are sharded.
+
+    The traced function sees the mesh by `image_mesh`. The sharding of an argument is known before
+    the trace, not in it.
+
+    Args:
+        argument: name of an argument with a leading image axis.
+        position: its place among the arguments.
+
+    Returns:
+        The decorator; it keeps `lower`.
+    """
+
+    def decorate(function: Any) -> Any:
+        def told(call: Callable[..., Any]) -> Callable[..., Any]:
+            @functools.wraps(call)
+            def within(*args: Any, **options: Any) -> Any:
+                images = args[position] if len(args) > position else options.get(argument)
+                with _shared(images):
+                    return call(*args, **options)
+
+            return within
+
+        wrapped = told(function)
+        wrapped.__dict__["lower"] = told(function.lower)
+        return wrapped
+
+    return decorate
+
+
+def _shared(images: Any) -> contextlib.AbstractContextManager[Any]:
+    """Return a context in which `image_mesh` is that of an array outside of a trace."""
+    where = None if isinstance(images, Tracer) else getattr(images, "sharding", None)
+    if (
+        not isinstance(where, NamedSharding)
+        or where.mesh.axis_names != (IMAGE,)
+        or where.mesh.size == 1
+        or where.spec[:1] != (IMAGE,)
+    ):
+        return contextlib.nullcontext()
+    return jax.sharding.use_abstract_mesh(where.mesh.abstract_mesh)
+
+
+def image_mesh() -> AbstractMesh | None:
+    """Return the devices over which the traced function's images are sharded; None for one alone.
+
+    Within `jax.shard_map`, where a device sees its own images alone, it is None too.
+    """
+    mesh = jax.sharding.get_abstract_mesh()
+    return mesh if mesh.axis_names == (IMAGE,) and mesh.axis_types == (AxisType.Auto,) else None
+
+
+def gather_images(tree: _Tree) -> _Tree:
+    """Gather arrays whose first axis is of images, so that every device has all of them.
+
+    XLA would otherwise split what follows, and exchange its parts. On one device it does nothing.
+    """
+    mesh = image_mesh()
+    if mesh is None:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))

@@ -5,9 +5,10 @@ folder.
 """
 
 import json
+import os
 import re
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -22,20 +23,29 @@ ANOTHER_FAILED = "processes: another one failed; see what it says"
 _T = TypeVar("_T")
 
 
-def join_processes(coordinator: str, count: int | None, index: int | None) -> None:
+def join_processes(
+    coordinator: str,
+    count: int | None,
+    index: int | None,
+    local_device_ids: Sequence[int] | None = None,
+) -> None:
     """Join a group of processes, before JAX is used for anything else.
 
     On CPUs each process has one device. With several, whose threads wait for other processes, the
-    group could deadlock.
+    group could deadlock. On GPUs each process of a host has one too; see `local_device_ids`.
 
     Args:
         coordinator: HOST:PORT of process 0, where all can reach it; or "auto" under what JAX knows
             to ask (Slurm, Open MPI, Kubernetes, Cloud TPU), for the other two as well.
         count: how many there are.
         index: which this is, from 0.
+        local_device_ids: numbers of this host's GPUs that are this process's. By default the one of
+            the process's number on its host, where a launcher tells it (Slurm, Open MPI), where
+            all processes are on one host (a coordinator at localhost), or with "auto". Otherwise,
+            or where the process sees one GPU alone, all that it sees.
 
     Raises:
-        InputError: the three do not fit each other, or the others cannot be met.
+        InputError: the arguments do not fit each other, or the others cannot be met.
     """
     if coordinator == "auto":
         if (count, index) != (None, None):
@@ -57,8 +67,17 @@ def join_processes(coordinator: str, count: int | None, index: int | None) -> No
         given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
         # Otherwise JAX would ask the scheduler which devices this process has.
         given["cluster_detection_method"] = "deactivate"
+        if local_device_ids is None:
+            local_device_ids = _own_device(coordinator, index)
         if index == 0:
             _check_port(coordinator)
+    if local_device_ids is not None:
+        if not local_device_ids or min(local_device_ids) < 0:
+            raise InputError(
+                f"--local-device-ids: found {tuple(local_device_ids)}, expected numbers of this "
+                "host's GPUs, from 0"
+            )
+        given["local_device_ids"] = list(local_device_ids)
     jax.config.update("jax_num_cpu_devices", 1)
     # JAX's own handler of SIGTERM would hide the signal from this program.
     jax.config.update("jax_enable_preemption_service", False)
@@ -66,6 +85,34 @@ def join_processes(coordinator: str, count: int | None, index: int | None) -> No
         jax.distributed.initialize(**given)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"processes: cannot meet the others: {error}") from error
+
+
+_LAUNCHED = (
+    ("SLURM_PROCID", "SLURM_LOCALID"),
+    ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_LOCAL_RANK"),
+)
+"""Environment variables with a process's number among all and on its host: Slurm, Open MPI."""
+_VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
+"""Environment variables with the GPUs that a process sees."""
+
+
+def _own_device(coordinator: str, index: int) -> list[int] | None:
+    """Return the number of the GPU that is this process's alone; None where nothing tells it.
+
+    Each process would otherwise claim the memory of all GPUs of its host.
+    """
+    if os.environ.get("JAX_LOCAL_DEVICE_IDS"):
+        return None  # which JAX reads
+    if any(len(os.environ[name].split(",")) == 1 for name in _VISIBLE if os.environ.get(name)):
+        return None  # it was given its GPU, which has the number 0 here
+    host = coordinator.rpartition(":")[0].strip("[]")
+    if host in ("localhost", "::1") or host.startswith("127."):
+        return [index]
+    for number, local in _LAUNCHED:
+        # A shell that the launcher began has numbers too, which are not those of its processes.
+        if os.environ.get(number) == str(index) and os.environ.get(local, "").isdecimal():
+            return [int(os.environ[local])]
+    return None
 
 
 def _check_port(address: str) -> None:
@@ -86,6 +133,11 @@ def _check_port(address: str) -> None:
             f"--coordinator-address: found {address}, which cannot be listened at "
             f"({getattr(error, 'strerror', None) or error}), expected this host and a free port"
         ) from error
+
+
+def are_several() -> bool:
+    """Return whether the run has several processes."""
+    return jax.process_count() > 1
 
 
 def is_primary() -> bool:

@@ -10,6 +10,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "export": ("flatbuffers", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
+    "accelerators": ("libtpu", "jax_cuda12_plugin", *_CLI),
 }
 """Modules of each extra, by its name."""
 
@@ -24,7 +25,7 @@ def missing_extra(error: ModuleNotFoundError, what: str) -> str:
     extra = next((extra for extra, modules in EXTRAS.items() if name in modules), None)
     if extra is None:
         raise error
-    others = "" if extra in ("milvus", "convert") else " (or [all])"
+    others = "" if extra in ("milvus", "convert", "accelerators") else " (or [all])"
     return (
         f"{what}: found no module {name}, expected it with the extra {extra}: "
         f"pip install 'crisalad-jax[{extra}]'{others}"

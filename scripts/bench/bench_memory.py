@@ -21,10 +21,10 @@ import numpy as np
 from tables import Study, Table, count, flags, leave, read
 
 from crisalad_jax.nn.config import PRESETS
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import cast_params, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import recipe
-from crisalad_jax.training.step import StepConfig, cast_frozen, init_train_state, train_step
+from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 
@@ -51,7 +51,7 @@ def analysed(config: TrainConfig, step: StepConfig, images: int) -> dict[str, An
         state, frozen = init_train_state(
             init_crisalad(jax.random.key(0), step.model), config.trainable, step
         )
-        return state, cast_frozen(frozen, step.model)
+        return state, cast_params(frozen, step.model)
 
     batch = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in batch_of(config, images)]
     key = jax.eval_shape(lambda: jax.random.key(0))
@@ -70,7 +70,7 @@ def taken(config: TrainConfig, step: StepConfig, images: int) -> dict[str, Any]:
     state, frozen = init_train_state(
         init_crisalad(jax.random.key(0), step.model), config.trainable, step
     )
-    frozen = devices.replicate(cast_frozen(jax.device_get(frozen), step.model))
+    frozen = devices.replicate(cast_params(jax.device_get(frozen), step.model))
     state = jax.jit(lambda tree: jax.tree.map(jax.numpy.copy, tree))(devices.replicate(state))
     batch = map(devices.shard_batch, batch_of(config, images))
     state, metrics = train_step(state, frozen, *batch, jax.random.key(1), step)

@@ -36,9 +36,11 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils import compiler
+from crisalad_jax.utils import target as targets
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.target import GPU, PORTABLE, lowering_for, target
 from tests.conftest import BATCH, MODEL, write_picture
 
 SCRIPT = pathlib.Path(__file__).parents[2] / "scripts" / "run_exported.py"
@@ -236,23 +238,22 @@ def test_other_models_for_all_platforms(config: ModelConfig):
 
 
 def test_nothing_is_chosen_by_the_platform_that_exports(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(compiler, "_compiles_fused_attention", lambda: True)
+    monkeypatch.setattr(targets, "machine", lambda: GPU)
     traced = []
 
     @compiler.jit
     def choices(x: jax.Array) -> jax.Array:
-        traced.append((compiler.has_fused_attention(), compiler.product_dtype(x.dtype)))
+        traced.append((target().cudnn, target().product_dtype(x.dtype)))
         return x
 
     x = jnp.ones(3, jnp.bfloat16)
     jax.make_jaxpr(lambda x: choices(x))(x)
-    with compiler.portable():
+    with lowering_for(PORTABLE):
         jax.make_jaxpr(lambda x: choices(x))(x)
     jax.make_jaxpr(lambda x: choices(x))(x)
     # The second would else find the first's trace, as the third does.
     assert traced == [(True, jnp.bfloat16), (False, jnp.float32)]
-    assert compiler.has_fused_attention()
+    assert target() == GPU
 
 
 @pytest.mark.parametrize(

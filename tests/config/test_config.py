@@ -568,6 +568,7 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
         (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),
         (ModelConfig, {"cross_image": 2}, "2", "CrossImageConfig"),
         (ModelConfig, {"remat": ["dots"]}, "['dots']", "one of dots, full, none"),
+        (ModelConfig, {"precision": "float32"}, "'float32'", "one of default, high, highest"),
         (LossConfig, {"miner_margin": "0.1"}, "'0.1'", "a number"),
         (TripletConfig, {"margin": "0.1"}, "'0.1'", "a number"),
         (ClassesConfig, {"groups": 2.5}, "2.5", "a whole number"),

@@ -384,6 +384,21 @@ def test_cache_decodes_once_within_its_budget(places):
         first[0][0, 0] = 0
 
 
+def test_as_many_threads_decode_as_are_asked_for(places, monkeypatch):
+    """Each waits until all do: fewer, such as the images of two batches, would wait for ever."""
+    barrier = threading.Barrier(7, timeout=30)
+    read = loader._read
+
+    def wait(*args, **options):
+        barrier.wait()
+        return read(*args, **options)
+
+    monkeypatch.setattr(loader, "_read", wait)
+    paths = [places.path(i) for i in range(7)]
+    batches = list(image_batches(paths, image_size=SIZE, batch_size=2, threads=7))
+    assert sum(batch.valid.sum() for batch in batches) == 7
+
+
 def test_an_abandoned_iterator_lets_its_threads_go(places):
     before = set(threading.enumerate())
     batches = image_batches(

@@ -23,6 +23,7 @@ from crisalad_jax.nn.misfits import misfits
 from crisalad_jax.nn.model import (
     Crisalad,
     attend_across_images,
+    cast_params,
     check_params,
     describe,
     extract_features,
@@ -36,7 +37,6 @@ from crisalad_jax.retrieval.extract import extract
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.step import (
-    cast_frozen,
     init_train_state,
     make_train_step,
     step_config,
@@ -214,7 +214,7 @@ def test_numpy_arrays_and_free_fields_make_no_misfit() -> None:
 def test_what_training_has_cast_and_cut_still_fits(trainable: str) -> None:
     config = dataclasses.replace(MODEL, compute_dtype="bfloat16")
     chosen, frozen = split_params(PARAMS, config, trainable)
-    cast = cast_frozen(frozen, config)
+    cast = cast_params(frozen, config)
     assert any(leaf.dtype == jnp.bfloat16 for leaf in jax.tree.leaves(cast))
     whole = jax.tree.map(
         lambda a, b: b if a is None else a, chosen, cast, is_leaf=lambda leaf: leaf is None

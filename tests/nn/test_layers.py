@@ -5,6 +5,7 @@ Bounds of 1e-6 relative to outputs of order 1 are a few units of float32's last 
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -35,6 +36,7 @@ from crisalad_jax.nn.layers import (
     split_statistics,
     train_batch_norm,
 )
+from crisalad_jax.utils.target import GPU, TPU, Target, lowering_for
 
 
 def normal(seed: int, *shape: int) -> np.ndarray:
@@ -48,6 +50,87 @@ def test_linear_equals_torch() -> None:
     np.testing.assert_allclose(ours, expected, atol=2e-6)
     without = linear(Linear(jnp.asarray(weight), None), jnp.asarray(x))
     np.testing.assert_allclose(without, expected.numpy() - bias, atol=2e-6)
+
+
+STRIDED = [(3, 1, 1), (3, 2, 1), (1, 2, 0), (4, 4, 0), (7, 2, 3), (2, 3, 0)]
+"""Kernel size, stride and padding; the windows of the last leave a row and a column out."""
+
+
+def slopes_in_bfloat16(
+    apply: Callable[[jax.Array, jax.Array], jax.Array], weight: np.ndarray, x: np.ndarray
+) -> tuple[jax.Array, jax.Array]:
+    """The gradient by a float32 weight and by bfloat16 inputs."""
+
+    def value(weight: jax.Array, x: jax.Array) -> jax.Array:
+        y = apply(weight, x)
+        towards = normal(3, *y.shape).round(1)
+        return (y.astype(jnp.float32) * towards).sum()
+
+    return jax.grad(value, argnums=(0, 1))(jnp.asarray(weight), jnp.asarray(x, jnp.bfloat16))
+
+
+def exact_slope(apply: Callable[..., torch.Tensor], weight: np.ndarray, x: np.ndarray) -> Any:
+    """Torch's gradient by the weight, in float64, of inputs and cotangents of 8 bits."""
+    rounded = np.asarray(jnp.asarray(x, jnp.bfloat16), np.float64)
+    weight = torch.tensor(weight, dtype=torch.float64, requires_grad=True)
+    y = apply(torch.tensor(rounded), weight)
+    towards = normal(3, *y.shape).round(1)
+    y.backward(torch.tensor(np.asarray(jnp.asarray(towards, jnp.bfloat16), np.float64)))
+    return weight.grad
+
+
+@pytest.mark.parametrize("chosen", [GPU, TPU], ids=lambda chosen: chosen.platform)
+def test_accelerators_sum_the_gradient_of_a_weight_in_float32(chosen: Target) -> None:
+    """A sum of 4,096 products of 8-bit numbers is exact but for float32's own rounding."""
+    x, weight = normal(0, 4096, 7), normal(1, 7, 3)
+
+    def apply(weight: jax.Array, x: jax.Array) -> jax.Array:
+        return linear(Linear(weight, None), x)
+
+    with lowering_for(chosen):
+        found, to_x = slopes_in_bfloat16(apply, weight, x)
+    assert found.dtype == jnp.float32
+    assert to_x.dtype == jnp.bfloat16
+    expected = exact_slope(lambda x, weight: x @ weight, weight, x)
+    # 4,096 terms of order 1; rounded to bfloat16 it would be off by up to 0.25.
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("size", "stride", "padding"), STRIDED)
+def test_accelerators_sum_the_gradient_of_a_kernel_in_float32(
+    size: int, stride: int, padding: int
+) -> None:
+    x, weight = normal(0, 3, 12, 9, 4), normal(1, size, size, 4, 5)
+
+    def apply(weight: jax.Array, x: jax.Array) -> jax.Array:
+        return conv(Conv(weight, None), x, stride=stride, padding=padding)
+
+    def theirs(x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        x, weight = x.permute(0, 3, 1, 2), weight.permute(3, 2, 0, 1)
+        y = torch.nn.functional.conv2d(x, weight, stride=stride, padding=padding)
+        return y.permute(0, 2, 3, 1)
+
+    expected, to_x = slopes_in_bfloat16(apply, weight, x)
+    with lowering_for(GPU):
+        found, ours = slopes_in_bfloat16(apply, weight, x)
+    assert found.dtype == jnp.float32
+    np.testing.assert_array_equal(ours.astype(jnp.float32), to_x.astype(jnp.float32))
+    # Some 300 terms of order 1. The CPU's are rounded to 8 bits, of numbers up to 60.
+    np.testing.assert_allclose(found, exact_slope(theirs, weight, x), atol=1e-4)
+    np.testing.assert_allclose(found, expected, atol=0.25)
+
+
+def test_the_sum_over_devices_is_of_float32() -> None:
+    """The product of the weight's gradient has float32 outputs, over which devices sum."""
+
+    def value(weight: jax.Array, x: jax.Array) -> jax.Array:
+        return linear(Linear(weight, None), x).astype(jnp.float32).sum()
+
+    shapes = jax.ShapeDtypeStruct((7, 3), "float32"), jax.ShapeDtypeStruct((5, 7), "bfloat16")
+    for chosen in (GPU, TPU):
+        with lowering_for(chosen):
+            program = str(jax.make_jaxpr(jax.grad(value))(*shapes))
+        assert ":f32[7,3] = dot_general" in program
 
 
 @pytest.mark.parametrize("kind", ["linear", "conv", "depthwise"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import logging
 import pathlib
 import re
 import shutil
@@ -420,23 +421,46 @@ def test_a_step_is_started_before_the_one_before_is_read(tmp_path, places, param
     assert events[:4] == ["step", "step", "line 1", "line 2"]  # an epoch has two
 
 
-def test_processes_agree_once_before_a_step(tmp_path, places, params, monkeypatch):
-    config = dataclasses.replace(RECIPE, epochs=1)
-    agreements = []
+def test_a_step_costs_one_fetch_from_the_devices(tmp_path, places, params, monkeypatch):
+    """All metrics in one call, which starts every copy before it waits for the first."""
+    config, events = dataclasses.replace(RECIPE, epochs=1), []
+    real = jax.device_get
 
     def step(*args):
-        agreements.append(0)
+        events.append("step")
+        return train_step(*args)
+
+    def device_get(tree):
+        events.append("fetch")
+        return real(tree)
+
+    def save(self, *args):
+        events.append("save")
+
+    monkeypatch.setattr(run_module, "train_step", step)
+    monkeypatch.setattr(run_module.jax, "device_get", device_get)
+    monkeypatch.setattr(run_files.RunFiles, "save", save)
+    fit(config, places, tmp_path, initial=params, quiet=True)
+    assert events[events.index("step") :] == ["step", "step", "fetch", "fetch", "save"]
+
+
+def test_between_steps_no_process_waits_for_the_others(tmp_path, places, params, monkeypatch):
+    """What they tell each other is read a step late; the end of an epoch alone is agreed upon."""
+    config, events = dataclasses.replace(RECIPE, epochs=1), []
+
+    def step(*args):
+        events.append("step")
         return train_step(*args)
 
     def all_max(*numbers):
-        if agreements:
-            agreements[-1] += 1
+        events.append("wait")
         return numbers
 
     monkeypatch.setattr(run_module, "train_step", step)
     monkeypatch.setattr(distributed, "all_max", all_max)
     fit(config, places, tmp_path, initial=params, quiet=True)
-    assert agreements[:-1] == [1]
+    first = events.index("step")
+    assert events[first : first + 3] == ["step", "step", "wait"]
 
 
 def test_an_error_of_the_system_that_is_none_of_writing_is_not_told_as_one(
@@ -626,3 +650,26 @@ def test_the_log_drops_what_will_be_repeated_and_a_line_cut_off(tmp_path):
     log.write({"step": 3, "loss": 0.1})
     log.close()
     assert read_metrics(path) == [first, validations[0], second, {"step": 3, "loss": 0.1}]
+
+
+def test_a_step_that_does_not_fit_is_told_before_the_first_file(
+    tmp_path, places, params, monkeypatch
+):
+    """A limit stands for a GPU's, which a CPU does not have."""
+    monkeypatch.setattr(run_module, "memory_limit", lambda devices: 2**12)
+    words = (
+        "^training: found a step that takes 0.0 GB of each device, expected at most 0.0 GB; "
+        "no --micro-batch is small enough: take --model.compute-dtype bfloat16"
+    )
+    with pytest.raises(InputError, match=words):
+        fit(RECIPE, places, tmp_path / "run", initial=params, quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_step_that_fits_is_compiled_once(tmp_path, places, params, monkeypatch, caplog):
+    monkeypatch.setattr(run_module, "memory_limit", lambda devices: 2**34)
+    jax.clear_caches()
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        fit(dataclasses.replace(RECIPE, epochs=1), places, tmp_path, initial=params, quiet=True)
+    compiled = re.findall(r"Finished XLA compilation of jit\((\w+)\)", caplog.text)
+    assert compiled.count("train_step") == 1

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 
+import jax
 import numpy as np
 import pytest
 
@@ -110,12 +111,28 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
+# It says when it starts a step (s) and when it waits for the other process (w).
 COMMAND_LINE = """
 import sys
+from jax.experimental import multihost_utils
 from crisalad_jax import cli
+from crisalad_jax.training import run
 from crisalad_jax.utils import devices
 devices.SHARD_FROM = 64
-sys.exit(cli.main())
+events = []
+
+def told(what, function):
+    def call(*args, **options):
+        events.append(what)
+        return function(*args, **options)
+    return call
+
+run.train_step = told("s", run.train_step)
+for name in ("process_allgather", "broadcast_one_to_all"):
+    setattr(multihost_utils, name, told("w", getattr(multihost_utils, name)))
+code = cli.main()
+print("events", "".join(events))
+sys.exit(code)
 """
 
 
@@ -220,6 +237,9 @@ def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
     out = tmp_path / "run"
     codes = ends(start(shared, out))
     assert [code for code, _ in codes] == [0, 0], codes
+    for _, words in codes:
+        # Five epochs of two steps: between steps of an epoch no process waits for the other.
+        assert re.search(r"^events w+(ssw+){5}$", words, re.MULTILINE), words
     assert_same_run(out, by_devices / "1")
     assert logged(out, RECALLS) == logged(by_devices / "1", RECALLS)
     assert len(logged(out, RECALLS)) == 5
@@ -230,7 +250,7 @@ def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
     [
         (("--data", "{smaller}"), "places"),
         (("--epochs", "9"), "configuration"),
-        (("--split-state",), "--split-state"),
+        (("--split-state",), "--shard-state"),
     ],
 )
 @pytest.mark.slow
@@ -247,7 +267,7 @@ def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "words"),
-    [(("--data", "none"), "crisalad: none"), (("--image-size", "43", "43"), "found 43")],
+    [(("--data", "none"), "crisalad: none"), (("--weights", "no.safetensors"), "no.safetensors")],
 )
 def test_what_fails_in_one_process_before_training_ends_both(shared, tmp_path, more, words):
     found = ends(start(shared, tmp_path / "run", *more))
@@ -314,3 +334,59 @@ def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp
 def test_processes_that_make_no_sense_are_refused(given):
     with pytest.raises(InputError, match=r"^processes: found .* expected"):
         processes.join_processes(*given)
+
+
+@pytest.fixture
+def initialised(monkeypatch) -> list[dict]:
+    """What JAX was asked for, in place of meeting other processes; nothing tells of a launcher."""
+    asked: list[dict] = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **given: asked.append(given))
+    monkeypatch.setattr(jax.config, "update", lambda name, value: None)
+    for name in ("SLURM_PROCID", "SLURM_LOCALID", "OMPI_COMM_WORLD_RANK", "CUDA_VISIBLE_DEVICES"):
+        monkeypatch.delenv(name, raising=False)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("coordinator", "environment", "given", "expected"),
+    [
+        ("localhost:{port}", {}, None, [3]),
+        ("127.0.0.1:{port}", {"SLURM_PROCID": "3", "SLURM_LOCALID": "1"}, None, [3]),
+        ("[::1]:{port}", {}, None, [3]),
+        ("host0:{port}", {}, None, None),
+        ("host0:{port}", {"SLURM_PROCID": "3", "SLURM_LOCALID": "1"}, None, [1]),
+        # Of a shell that Slurm began, whose processes it knows nothing of.
+        ("host0:{port}", {"SLURM_PROCID": "0", "SLURM_LOCALID": "0"}, None, None),
+        (
+            "host0:{port}",
+            {"OMPI_COMM_WORLD_RANK": "3", "OMPI_COMM_WORLD_LOCAL_RANK": "2"},
+            None,
+            [2],
+        ),
+        # A process that sees one GPU alone was given it: here it has the number 0.
+        ("localhost:{port}", {"CUDA_VISIBLE_DEVICES": "3"}, None, None),
+        ("localhost:{port}", {"CUDA_VISIBLE_DEVICES": "0,1,2,3"}, None, [3]),
+        ("localhost:{port}", {"JAX_LOCAL_DEVICE_IDS": "2"}, None, None),
+        ("localhost:{port}", {}, (4, 5), [4, 5]),
+        ("auto", {}, None, None),
+        ("auto", {}, (1,), [1]),
+    ],
+)
+def test_each_process_of_a_host_has_its_own_gpu(
+    initialised, monkeypatch, coordinator, environment, given, expected
+):
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    numbers = (None, None) if coordinator == "auto" else (4, 3)
+    processes.join_processes(coordinator.format(port=1234), *numbers, given)
+    (asked,) = initialised
+    assert asked.get("local_device_ids") == expected
+    if coordinator != "auto":
+        assert (asked["num_processes"], asked["process_id"]) == (4, 3)
+
+
+@pytest.mark.parametrize("given", [(), (0, -1)])
+def test_gpus_that_make_no_sense_are_refused(initialised, given):
+    with pytest.raises(InputError, match=r"^--local-device-ids: found .* expected"):
+        processes.join_processes("auto", None, None, given)
+    assert not initialised

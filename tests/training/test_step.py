@@ -18,6 +18,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import dropout
 from crisalad_jax.nn.model import (
     Crisalad,
+    cast_params,
     describe,
     extract_tokens,
     init_crisalad,
@@ -28,7 +29,6 @@ from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
 from crisalad_jax.training.step import (
     StepConfig,
-    cast_frozen,
     init_train_state,
     make_train_step,
     step_config,
@@ -597,7 +597,7 @@ def test_frozen_weights_in_half_the_memory_change_no_bit() -> None:
     model = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
     config = dataclasses.replace(STEP, model=model)
     results = []
-    for change in (lambda frozen, _: frozen, cast_frozen):
+    for change in (lambda frozen, _: frozen, cast_params):
         state, frozen = init_train_state(random_params(model), "adapters+head", config)
         frozen = change(frozen, model)
         state, metrics = train_step(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.utils import compiler
+from crisalad_jax.utils.target import GPU, PORTABLE, TPU, Target, lowering_for
 
 
 def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment: str) -> str:
@@ -36,7 +37,7 @@ def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment
 
 @pytest.fixture
 def _options_anew() -> Any:
-    options = compiler.compiler_options  # a test may put another in its place
+    options = compiler._known_options
     options.cache_clear()
     yield
     options.cache_clear()
@@ -53,10 +54,11 @@ def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.Monk
 
 
 @pytest.mark.usefixtures("_options_anew")
-def test_an_accelerator_has_no_options(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+@pytest.mark.parametrize("chosen", [GPU, TPU, PORTABLE], ids=lambda chosen: chosen.platform)
+def test_an_accelerator_has_no_options(chosen: Target) -> None:
     for library in ("Eigen", "oneDNN", "YNN"):
-        assert compiler.compiler_options(library, least_memory=True) == {}
+        with lowering_for(chosen):
+            assert compiler.compiler_options(library, least_memory=True) == {}
 
 
 def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,10 +9,17 @@ import jax
 import numpy as np
 
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, attend_across_images, extract_tokens, self_mask
+from crisalad_jax.nn.model import (
+    Crisalad,
+    attend_across_images,
+    cast_params,
+    extract_tokens,
+    self_mask,
+)
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.target import target
 
 _CALLS = 3
 """Number of calls of each in a round; their median counts."""
@@ -84,7 +91,7 @@ def describing(
         The call, which takes no argument and waits for its result.
     """
     devices = devices_for(batch_size)
-    shared = devices.replicate(params)
+    shared = devices.replicate(cast_params(params, config))
     images = devices.shard_batch(np.repeat(image[None], batch_size, axis=0))
     mask = self_mask(batch_size)
 
@@ -105,4 +112,4 @@ def machine() -> str:
 
 def is_absolute() -> bool:
     """Return whether times are comparable; a CPU's are not, for they depend on other load."""
-    return jax.default_backend() != "cpu"
+    return target().platform != "cpu"

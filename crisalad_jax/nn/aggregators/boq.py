@@ -117,7 +117,7 @@ class BoqConfig(Aggregator):
         """Return a token of `channels` numbers for each row."""
         patches = features.patches
         maps = patches.reshape(-1, *grid, patches.shape[-1])
-        maps = jax.vmap(lambda image: conv(params.proj_c, image))(maps)
+        maps = conv(params.proj_c, maps)
         x = maps.reshape(*patches.shape[:-1], maps.shape[-1])
         x = layer_norm(params.norm_input, x, epsilon=NORM_EPSILON)
         answers = []

@@ -55,8 +55,8 @@ class DinoV3Config(VisionTransformer):
         return None, None
 
     def add_positions(
-        self, params: ViT, patches: Float[Array, "patch dim"], grid: tuple[int, int]
-    ) -> tuple[Float[Array, " dim"], Float[Array, "patch dim"]]:
+        self, params: ViT, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
+    ) -> tuple[Float[Array, " dim"], Float[Array, "*batch patch dim"]]:
         """Return the class token and the patches as they are."""
         return params.cls_token, patches
 

@@ -35,6 +35,7 @@ from crisalad_jax.nn.attention import (
     Rotation,
     attention,
     first_token_attention,
+    padded_length,
 )
 from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
@@ -171,8 +172,8 @@ class VisionTransformer(Backbone):
 
     @abc.abstractmethod
     def add_positions(
-        self, params: ViT, patches: Float[Array, "patch dim"], grid: tuple[int, int]
-    ) -> tuple[Float[Array, " dim"], Float[Array, "patch dim"]]:
+        self, params: ViT, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
+    ) -> tuple[Float[Array, " dim"], Float[Array, "*batch patch dim"]]:
         """Return the class token and the embedded patches, with their positions added if any."""
 
     def rotation(self, grid: tuple[int, int]) -> Rotation | None:
@@ -267,14 +268,14 @@ class ViTConfig(VisionTransformer):
         return jnp.zeros(self.dim), positions
 
     def add_positions(
-        self, params: ViT, patches: Float[Array, "patch dim"], grid: tuple[int, int]
-    ) -> tuple[Float[Array, " dim"], Float[Array, "patch dim"]]:
+        self, params: ViT, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
+    ) -> tuple[Float[Array, " dim"], Float[Array, "*batch patch dim"]]:
         """Add the class token's position to it, and the resized grid of positions to patches."""
         assert params.pos_embed_cls is not None
         assert params.pos_embed is not None
         positions = interpolate_positions(params.pos_embed, grid, self)
         class_token = params.cls_token + params.pos_embed_cls
-        return class_token, at_least_float32(patches) + positions.reshape(len(patches), -1)
+        return class_token, at_least_float32(patches) + positions.reshape(patches.shape[-2:])
 
 
 def _one_stack(params: ViT) -> Block:
@@ -389,7 +390,7 @@ def train_vit(
         f"levels: found {levels} with adapters beside the blocks, expected the last alone, "
         f"{config.depth}",
     )
-    tokens = jax.vmap(lambda image: embed(params, image, config))(images)
+    tokens = embed(params, images, config)
     grid = config.grid((images.shape[1], images.shape[2]))
     blocks, outputs, attended = params.blocks, [], None
     if request.inserted is not None:
@@ -534,14 +535,17 @@ def _facet(
         # Index the stack: a slice of it to scan over would copy its weights.
         return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
 
+    tokens, length = _padded(tokens, config)
+
     def body(
         carry: Float[Array, "image token dim"], number: Int[Array, ""]
     ) -> tuple[Float[Array, "image token dim"], None]:
-        return block(numbered(number), carry, grid, config), None
+        return block(numbered(number), carry, grid, config, length=length), None
 
     whole = level if name == "token" else level - 1
     with jax.named_scope("blocks"):
         tokens, _ = jax.lax.scan(body, tokens, jnp.arange(whole))
+        tokens = tokens[:, :length]
         if name == "token":
             return tokens
         last = numbered(level - 1)
@@ -552,16 +556,18 @@ def _facet(
 
 
 def embed(
-    params: ViT, image: Float[Array, "height width 3"], config: VisionTransformer
-) -> Float[Array, "token dim"]:
-    """Embed an image: class token, registers and patches, with their positions added if any."""
-    rows, columns = config.grid((image.shape[0], image.shape[1]))
+    params: ViT, images: Float[Array, "*batch height width 3"], config: VisionTransformer
+) -> Float[Array, "*batch token dim"]:
+    """Embed images: class token, registers and patches, with their positions added if any."""
+    *batch, height, width, _ = images.shape
+    rows, columns = config.grid((height, width))
     size = config.patch_size
-    pixels = image.reshape(rows, size, columns, size, 3).transpose(0, 2, 1, 3, 4)
-    patches = linear(params.patch_embed, pixels.reshape(rows * columns, -1))
+    pixels = images.reshape(*batch, rows, size, columns, size, 3).swapaxes(-4, -3)
+    patches = linear(params.patch_embed, pixels.reshape(*batch, rows * columns, 3 * size**2))
     class_token, placed = config.add_positions(params, patches, (rows, columns))
-    whole = jnp.concatenate([class_token[None], params.register_tokens, placed])
-    return whole.astype(image.dtype)
+    first = jnp.concatenate([class_token[None], params.register_tokens])
+    first = jnp.broadcast_to(first, (*batch, *first.shape))
+    return jnp.concatenate([first, placed], axis=-2).astype(images.dtype)
 
 
 def run_blocks(
@@ -589,15 +595,18 @@ def _run_stacks(
     """Run stacks of blocks in turn; return the tokens and each stack's running statistics.
 
     Side adapters have a path beside the blocks, from which the tokens come. After every block its
-    adapter takes the sum of both paths.
+    adapter takes the sum of both paths. Between the first and the last block the tokens are padded
+    as `attention` needs them on this platform.
     """
+    tokens, length = _padded(tokens, config)
 
     def body(carry: Carry, layer: Block) -> tuple[Carry, Block]:
         if isinstance(carry, jax.Array):
-            return train_block(layer, carry, grid, config, valid)
+            return train_block(layer, carry, grid, config, valid, length=length)
         tokens, beside = carry
-        tokens = block(dataclasses.replace(layer, adapter=None), tokens, grid, config)
-        carry = tokens, _beside(layer, tokens + beside, grid, config)
+        layer_alone = dataclasses.replace(layer, adapter=None)
+        tokens = block(layer_alone, tokens, grid, config, length=length)
+        carry = tokens, _beside(layer, tokens + beside, grid, config, length)
         return carry, split_statistics(layer)[0]
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
@@ -608,7 +617,19 @@ def _run_stacks(
         for stack in stacks:
             carry, measured = jax.lax.scan(body, carry, stack)
             statistics.append(measured)
-    return carry if isinstance(carry, jax.Array) else carry[1], statistics
+    tokens = carry if isinstance(carry, jax.Array) else carry[1]
+    return tokens[:, :length], statistics
+
+
+def _padded(
+    tokens: Float[Array, "image token dim"], config: VisionTransformer
+) -> tuple[Float[Array, "image padded dim"], int | None]:
+    """Return tokens with padding after them, and their number; None where none is needed."""
+    count = tokens.shape[1]
+    more = padded_length(count, tokens.dtype, config.dim, config.heads) - count
+    if not more:
+        return tokens, None
+    return jnp.pad(tokens, ((0, 0), (0, more), (0, 0))), count
 
 
 def _beside(
@@ -616,11 +637,13 @@ def _beside(
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
     config: VisionTransformer,
+    length: int | None,
 ) -> Float[Array, "image token dim"]:
     """Apply a block's side adapter, with its skip."""
     assert isinstance(layer.adapter, SideAdapter)
     with jax.named_scope("adapter"):
-        update = config.adapter.alpha * at_least_float32(adapter(layer.adapter, tokens, grid))
+        adapted = adapter(layer.adapter, tokens, grid, length=length)
+        update = config.adapter.alpha * at_least_float32(adapted)
         return (at_least_float32(tokens) + update).astype(tokens.dtype)
 
 
@@ -629,9 +652,11 @@ def block(
     tokens: Float[Array, "image token dim"],
     grid: tuple[int, int],
     config: VisionTransformer,
+    *,
+    length: int | None = None,
 ) -> Float[Array, "image token dim"]:
     """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR."""
-    return train_block(params, tokens, grid, config, None)[0]
+    return train_block(params, tokens, grid, config, None, length=length)[0]
 
 
 def train_block(
@@ -640,6 +665,8 @@ def train_block(
     grid: tuple[int, int],
     config: VisionTransformer,
     valid: Bool[Array, " image"] | None,
+    *,
+    length: int | None = None,
 ) -> tuple[Float[Array, "image token dim"], Block]:
     """Run one block on a training batch.
 
@@ -649,17 +676,18 @@ def train_block(
         grid: rows and columns of patches.
         config: the backbone.
         valid: which images the batch norms' statistics are taken of; None takes the stored ones.
+        length: number of first tokens that are no padding; None is all.
 
     Returns:
         (tokens, statistics): the second as `train_vit` returns it.
     """
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
     attn, rotation = config.attention_of(params), config.rotation(grid)
-    attended = attention(attn, normed, config.heads, rotation=rotation, key=None)
+    attended = attention(attn, normed, config.heads, length=length, rotation=rotation, key=None)
     beside = params.adapter
     if isinstance(beside, SerialParallelAdapter):
         with jax.named_scope("adapter"):
-            attended = attended + adapter(beside.serial, attended, grid)
+            attended = attended + adapter(beside.serial, attended, grid, length=length)
         beside = beside.parallel
     tokens = (at_least_float32(tokens) + params.ls1 * at_least_float32(attended)).astype(
         tokens.dtype
@@ -670,9 +698,9 @@ def train_block(
     if beside is not None:
         with jax.named_scope("adapter"):
             if valid is None or isinstance(params.adapter, SerialParallelAdapter):
-                adapted = adapter(beside, normed, grid)
+                adapted = adapter(beside, normed, grid, length=length)
             else:
-                adapted, trained = train_adapter(beside, normed, grid, valid)
+                adapted, trained = train_adapter(beside, normed, grid, valid, length=length)
                 params = dataclasses.replace(params, adapter=trained)
             update = update + config.adapter.alpha * adapted
     tokens = (at_least_float32(tokens) + params.ls2 * at_least_float32(update)).astype(tokens.dtype)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from crisalad_jax.config.checks import choose
 from crisalad_jax.data.loader import ImageBatch, ImageCache
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, cast_params
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.retrieval.reranking import patch_netvlad, selavpr, transvpr
 from crisalad_jax.retrieval.search import Neighbours
@@ -205,7 +205,7 @@ class Reranker:
             return _Features(paths, read, describe, self._method.shape(self._config), file)
 
         devices = devices_for(batch_size)
-        shared = devices.replicate(reranking.params)
+        shared = devices.replicate(cast_params(reranking.params, reranking.config))
         self._database, self._queries = side("database", database), side("queries", queries)
 
     def __enter__(self) -> Self:

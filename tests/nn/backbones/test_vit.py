@@ -1,7 +1,7 @@
 """The backbone's parts that no golden file reaches; the rest is in parity/test_goldens.py."""
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 import torch
 
+from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.adapter import AdapterConfig, MlpAdapter
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones.base import FeatureRequest
+from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import (
     NORM_EPSILON,
     SwiGlu,
+    VisionTransformer,
+    ViT,
     ViTConfig,
     block,
     embed,
@@ -26,6 +30,7 @@ from crisalad_jax.nn.backbones.vit import (
 )
 from crisalad_jax.nn.layers import LayerNorm, layer_norm
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.target import CPU, GPU, TPU, Target, lowering_for
 
 CONFIG = ViTConfig(dim=16, depth=3, heads=2, position_grid=5)
 
@@ -232,3 +237,99 @@ def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, 
         np.testing.assert_allclose(found.class_token, expected[-1].class_token, atol=1e-6)
         patches = np.concatenate([features.patches for features in expected], axis=-1)
         np.testing.assert_allclose(found.patches, patches, atol=1e-6)
+
+
+HALF = ViTConfig(dim=32, depth=2, heads=2, position_grid=3)
+"""Of heads of 16, which cuDNN takes; 3 x 4 patches and a class token are padded to 16 tokens."""
+INSERTED = jax.random.normal(jax.random.key(9), (2, 32))
+REQUESTS = {
+    "the last tokens": FeatureRequest(),
+    "two levels": FeatureRequest((1, 2)),
+    "a level before the last": FeatureRequest((1,)),
+    "keys": FeatureRequest((2,), "key", norm=False),
+    "class attention": FeatureRequest(class_attention=True),
+    "inserted tokens": FeatureRequest(insertion=1, inserted=INSERTED),
+}
+KINDS = ("depthwise", "multi-resolution", "serial-parallel", "side", "none")
+
+
+def fresh(config: VisionTransformer) -> ViT:
+    """Parameters of which every one matters: adapters do not start at 0."""
+    params = config.init(jax.random.key(0))
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [
+        leaf + 0.1 * jax.random.normal(key, leaf.shape)
+        for leaf, key in zip(leaves, keys, strict=True)
+    ]
+    return jax.tree.unflatten(tree, noisy)
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        *((HALF, name) for name in REQUESTS),
+        *(
+            (dataclasses.replace(HALF, adapter=AdapterConfig(kind)), "the last tokens")
+            for kind in KINDS
+        ),
+        (dataclasses.replace(HALF, registers=3), "inserted tokens"),
+        (DinoV3Config(dim=32, depth=2, heads=2), "the last tokens"),
+        (DinoV3Config(dim=32, depth=2, heads=2), "keys"),
+    ],
+    ids=lambda each: each if isinstance(each, str) else "",
+)
+def test_padding_for_cudnn_changes_no_feature(
+    monkeypatch: pytest.MonkeyPatch, config: VisionTransformer, name: str
+) -> None:
+    """With XLA in cuDNN's place, which takes the same arguments."""
+    asked = []
+
+    def attend(q: jax.Array, *others: jax.Array, implementation: str, **options: Any) -> jax.Array:
+        asked.append((implementation, q.shape[1]))
+        return original(q, *others, implementation="xla", **options)
+
+    original = jax.nn.dot_product_attention
+    monkeypatch.setattr(jax.nn, "dot_product_attention", attend)
+    params, side = fresh(config), config.patch_size
+    pixels = images(2, 3 * side, 4 * side).astype(jnp.bfloat16)
+
+    def features(chosen: Target) -> list[np.ndarray]:
+        with lowering_for(chosen):
+            found = vit(params, pixels, config, REQUESTS[name])
+        return [np.asarray(leaf, np.float32) for leaf in jax.tree.leaves(found)]
+
+    expected, found = features(CPU), features(GPU)
+    # The blocks pad once: where attention is reached, its tokens are eights already.
+    assert all(implementation == "cudnn" and not tokens % 8 for implementation, tokens in asked)
+    assert asked or name == "keys"
+    for ours, theirs in zip(found, expected, strict=True):
+        # bfloat16 keeps 8 bits, and the two divide at different places, in two blocks.
+        np.testing.assert_allclose(ours, theirs, atol=0.04 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("name", ["the last tokens", "inserted tokens", "class attention"])
+def test_a_tpus_kernel_changes_no_feature(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Interpreted by JAX's own operations; 13 tokens are padded to 16, and 15 to as many."""
+    called = []
+
+    def call(*args: Any, **options: Any) -> Any:
+        called.append(options["out_shape"])
+        return original(*args, **options, interpret=True)
+
+    original = attention_pallas.pl.pallas_call
+    monkeypatch.setattr(attention_pallas.pl, "pallas_call", call)
+    config = dataclasses.replace(HALF, dim=128)
+    inserted = jax.random.normal(jax.random.key(9), (2, 128))
+    request = dataclasses.replace(
+        REQUESTS[name], inserted=None if REQUESTS[name].inserted is None else inserted
+    )
+    params, pixels = fresh(config), images(2, 42, 56)
+    expected = vit(params, pixels, config, request)
+    with lowering_for(TPU), jax.default_matmul_precision("highest"):
+        found = vit(params, pixels, config, request)
+    assert called
+    assert {shape.shape for shape in called} == {(2, 16, 128)}
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        # Two blocks in float32, of features up to 4.
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)

@@ -1,0 +1,162 @@
+"""The platform that a program is traced for: the one place that choices by platform read."""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
+
+Platform = Literal["cpu", "gpu", "tpu", "portable"]
+_LOWERED_AS = {"cpu": "cpu", "gpu": "cuda", "tpu": "tpu"}
+_CUDNN = 91000
+"""The cuDNN that an absent GPU is assumed to have: 9.10."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A platform, and what the choices of a program depend on there.
+
+    Example:
+        >>> GPU.product_dtype("bfloat16"), CPU.product_dtype("bfloat16")
+        (dtype(bfloat16), dtype('float32'))
+    """
+
+    platform: Platform
+    """The platform; "portable" is any of them, which a program is exported for."""
+    cudnn: bool = False
+    """Whether cuDNN's fused attention, which never writes scores to memory, compiles there."""
+
+    def product_dtype(self, dtype: Any) -> Any:
+        """Return the fastest output type for a product of matrices of `dtype`, before rounding.
+
+        A CPU uses its bfloat16 units only for products with float32 outputs. A GPU and a TPU round
+        as they write, at no cost.
+        """
+        narrow = self.platform in ("gpu", "tpu")
+        return jnp.dtype(dtype) if narrow else jnp.promote_types(dtype, jnp.float32)
+
+
+CPU, GPU, TPU = Target("cpu"), Target("gpu", cudnn=True), Target("tpu")
+PORTABLE = Target("portable")
+"""No choice by platform: a program runs on all of them."""
+TARGETS = {"cpu": CPU, "gpu": GPU, "tpu": TPU, "portable": PORTABLE}
+# JAX keeps traces apart by it: a function traced for one target is traced again for another.
+_chosen = jax.make_user_context(None)
+_mesh = jax.make_user_context(None)
+_ONE_DEVICE = AbstractMesh((1,), ("image",))
+
+
+def target() -> Target:
+    """Return the target of what is traced now: that of `lowering_for`, or this machine."""
+    return _chosen.value or machine()
+
+
+@functools.cache
+def machine() -> Target:
+    """Return this machine as a target, detected once."""
+    platform = jax.default_backend()
+    if platform == "gpu":
+        return Target("gpu", cudnn=_compiles_cudnn())
+    return TARGETS.get(platform, PORTABLE)
+
+
+def _compiles_cudnn() -> bool:
+    """Try a training step's attention, which cuDNN restricts more than inference."""
+    token = jax.ShapeDtypeStruct((1, 64, 1, 64), jnp.bfloat16)
+    lengths = jax.ShapeDtypeStruct((1,), jnp.int32)
+
+    def attend(q: jax.Array, k: jax.Array, v: jax.Array, lengths: jax.Array) -> jax.Array:
+        mixed = jax.nn.dot_product_attention(
+            q,
+            k,
+            v,
+            query_seq_lengths=lengths,
+            key_value_seq_lengths=lengths,
+            implementation="cudnn",
+        )
+        return mixed.astype(jnp.float32).sum()
+
+    try:
+        jax.jit(jax.grad(attend, argnums=(0, 1, 2))).lower(token, token, token, lengths).compile()
+    except Exception:  # a missing or old cuDNN and an old GPU raise different errors
+        return False
+    return True
+
+
+def traced_mesh() -> Mesh | AbstractMesh | None:
+    """Return the devices of what is traced now; None where they are not known.
+
+    A kernel, unlike an operation of XLA, must be told how it is sharded. The devices are those of
+    `jax.set_mesh`, of `over_devices_of`, or the machine's only one. Within `jax.shard_map` a device
+    computes its own images, and it is one device.
+    """
+    ambient = jax.sharding.get_abstract_mesh()
+    if not ambient.empty:
+        return _ONE_DEVICE if set(ambient.axis_types) == {AxisType.Manual} else ambient
+    if _mesh.value is not None:
+        return _mesh.value
+    return _ONE_DEVICE if jax.device_count() == 1 else None
+
+
+def over_devices_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[None]:
+    """Trace for the devices that the arguments of a program are on; see `traced_mesh`."""
+    if target().platform != "tpu":
+        return contextlib.nullcontext()
+    shardings = (getattr(leaf, "sharding", None) for leaf in leaves)
+    meshes = (each.mesh for each in shardings if isinstance(each, NamedSharding))
+    return _mesh(next((mesh for mesh in meshes if mesh.size > 1), _ONE_DEVICE))
+
+
+@contextlib.contextmanager
+def lowering_for(chosen: Target) -> Iterator[None]:
+    """Trace and lower for another platform while the block runs, whether it is here or not.
+
+    Every choice by platform reads `target`, and becomes that platform's. Traces of other targets
+    are neither used nor changed.
+
+    Args:
+        chosen: the target, such as `TPU`.
+
+    Example:
+        >>> with lowering_for(TPU):
+        ...     target().platform
+        'tpu'
+    """
+    absent = chosen.cudnn and machine().platform != "gpu"
+    with _chosen(chosen), _assuming_cudnn() if absent else contextlib.nullcontext():
+        yield
+
+
+def lowering_platforms() -> tuple[str, ...] | None:
+    """Return the platforms to lower for, as `jax.stages.Traced.lower` takes them.
+
+    None is JAX's own choice, outside of `lowering_for` and for a portable program.
+    """
+    chosen = _chosen.value
+    return None if chosen is None or chosen == PORTABLE else (_LOWERED_AS[chosen.platform],)
+
+
+@contextlib.contextmanager
+def _assuming_cudnn() -> Iterator[None]:
+    """Answer for an absent GPU what JAX's fused attention asks of it while it is traced.
+
+    These questions have no public answer: JAX reads the version of the loaded cuDNN, and the
+    devices' compute capability. It is the one place that replaces something of JAX, and a program
+    for a platform that is here never comes by. The assumed GPU is an H100.
+    """
+    from unittest import mock  # both imports are slow, and rarely needed
+
+    from jax._src.cudnn import fused_attention_stablehlo as fused
+
+    def has(capability: str) -> bool:
+        return tuple(map(int, capability.split("."))) <= (9, 0)
+
+    with (
+        mock.patch.object(fused, "check_cudnn_version", return_value=_CUDNN),
+        mock.patch.object(fused, "check_compute_capability", has),
+    ):
+        yield

@@ -1,0 +1,168 @@
+"""`crisalad compile-check`: its bad input, and what it compares."""
+
+import dataclasses
+import importlib
+import json
+import pathlib
+
+import pytest
+
+from crisalad_jax.experiments.compile_check import (
+    CompileCheck,
+    ProgramCheck,
+    differences,
+    read_check,
+)
+from crisalad_jax.experiments.compile_check.tables import COLUMNS, cells, markdown_table, rounded
+from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils.files import write_json
+from tests.cli.test_cli import fails
+
+ONE = ProgramCheck(
+    target="v5e-8",
+    program="train",
+    images=192,
+    memory=2_000_000_000,
+    card_memory=16e9,
+    aliased=138_000_000,
+    flops=2_580_000_000_000,
+    hbm_bytes=20_000_000_000,
+    sent=90_000_000,
+    collectives={"all-gather": 2, "all-reduce": 3},
+    bfloat16_sums=0,
+    fused_attention=36,
+    host_callbacks=0,
+    roofline=0.028,
+    messages=0.0004,
+    compiler=0.05,
+    kernels=0.008,
+)
+CHECK = CompileCheck(recipe("tiny"), (ONE,))
+
+
+@pytest.fixture
+def without_compilers(monkeypatch: pytest.MonkeyPatch):
+    """An installation without the extra `accelerators`."""
+    original = importlib.import_module
+
+    def missing(name: str, *rest):
+        if name.partition(".")[0] in ("libtpu", "jax_plugins"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return original(name, *rest)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+
+
+@pytest.mark.parametrize(("target", "module"), [("v5e-1", "libtpu"), ("h100", "jax_cuda12_plugin")])
+def test_a_compiler_that_is_not_installed_is_named(without_compilers, capfd, target, module):
+    fails(
+        capfd,
+        *("compile-check", "--preset", "tiny", "--targets", target),
+        words=(
+            f"target {target}: found no module {module}",
+            "pip install 'crisalad-jax[accelerators]'",
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--targets", "b200"), ("target: found 'b200'", "h100, h100-8, v4, v5e-1")),
+        (("--programs", "serve"), ("program: found 'serve'", "describe, train")),
+        (("--preset", "huge"), ("preset: found 'huge'", "tiny")),
+        (("--expect", "none.json"), ("none.json",)),
+        (("--keep", "nowhere"), ("nowhere: found no folder",)),
+        (("--model.compute-dtype", "int8"), ("compute-dtype", "int8")),
+    ],
+)
+def test_bad_input_is_one_line(flags, words, capfd):
+    fails(capfd, "compile-check", "--preset", "tiny", "--targets", "v5e-8", *flags, words=words)
+
+
+def test_more_devices_than_images(capfd):
+    fails(
+        capfd,
+        *("compile-check", "--preset", "tiny", "--targets", "v5e-256"),
+        words=("batch size: found 96 images for 256 devices, expected a multiple of 256",),
+    )
+
+
+def test_figures_of_another_configuration(tmp_path: pathlib.Path, capfd):
+    file = tmp_path / "expected.json"
+    write_json(file, CHECK.as_json())
+    fails(
+        capfd,
+        *("compile-check", "--preset", "tiny", "--model.compute-dtype", "bfloat16"),
+        *("--targets", "v5e-8", "--expect", file),
+        words=("found figures of another configuration (model.compute_dtype)",),
+    )
+
+
+def test_a_file_of_something_else(tmp_path: pathlib.Path, capfd):
+    file = tmp_path / "other.json"
+    file.write_text(json.dumps({"programs": [{"target": "v5e-8"}]}))
+    fails(
+        capfd,
+        *("compile-check", "--preset", "tiny", "--targets", "v5e-8", "--expect", file),
+        words=(file, "expected the JSON of `crisalad compile-check --json`"),
+    )
+
+
+def test_what_is_written_is_read_as_it_was(tmp_path: pathlib.Path):
+    file = tmp_path / "check.json"
+    write_json(file, CHECK.as_json())
+    again = read_check(file)
+    assert again == CHECK
+    assert differences(again, CHECK) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"memory": 2_090_000_000}, None),
+        ({"flops": 2_460_000_000_000}, None),
+        ({"roofline": 1.0, "hbm_bytes": 1, "sent": 1}, None),
+        (
+            {"memory": 2_110_000_000},
+            "found memory 2,110,000,000, expected 2,000,000,000 within 5 %",
+        ),
+        ({"memory": 1_890_000_000}, "found memory 1,890,000,000"),
+        ({"flops": 3_000_000_000_000}, "found flops 3,000,000,000,000"),
+        ({"aliased": 0}, "found aliased 0, expected 138000000"),
+        ({"bfloat16_sums": 1}, "found bfloat16_sums 1, expected 0"),
+        ({"fused_attention": 0}, "found fused_attention 0, expected 36"),
+        ({"host_callbacks": 1}, "found host_callbacks 1, expected 0"),
+        (
+            {"collectives": {"all-gather": 2, "all-to-all": 1}},
+            'found collectives {"all-gather": 2, "all-to-all": 1}, expected {"all-gather": 2, '
+            '"all-reduce": 3}',
+        ),
+        ({"images": 384}, "found no expected figures"),
+    ],
+)
+def test_one_line_for_each_difference(changes, line):
+    found = CompileCheck(CHECK.config, (dataclasses.replace(ONE, **changes),))
+    lines = differences(found, CHECK)
+    assert len(lines) == (line is not None)
+    if line is not None:
+        assert lines[0].startswith(f"v5e-8 train of {changes.get('images', 192)} images: ")
+        assert line in lines[0]
+
+
+def test_a_program_that_does_not_compile_is_a_difference():
+    found = CompileCheck(CHECK.config, (), ("v5e-1 train: found that it does not compile: HBM",))
+    assert differences(found, CHECK) == list(found.failures)
+
+
+def test_the_table_has_a_cell_for_each_column():
+    row = dict(zip(COLUMNS, cells(ONE), strict=True))
+    assert row["memory, GB"] == "2.00 of 16"
+    assert row["compiler, ms"] == "50"
+    # 192 images in 50.4 ms are 3,810 a second; two digits of a model are enough.
+    assert row["images/s"] == "3,800"
+    assert row["collectives"] == "2 gather, 3 reduce"
+    header, rule, first = markdown_table([ONE], COLUMNS[:3]).splitlines()
+    assert (header, rule) == ("| target | program | images |", "| --- | --- | ---: |")
+    assert first == "| v5e-8 | train | 192 |"
+    assert [rounded(x) for x in (0.4, 7.26, 3810, 99950)] == [0, 7, 3800, 100000]

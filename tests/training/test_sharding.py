@@ -1,0 +1,120 @@
+"""What devices exchange in a training step, and that this changes no result."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[2]
+PROGRAM = """
+import collections, dataclasses, re, sys, warnings
+import jax, numpy as np, optax
+from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.training import run
+from crisalad_jax.training.step import StepConfig, init_train_state, train_step
+from crisalad_jax.utils import devices as sharding
+from tests.conftest import RECIPE
+from tests.nn.test_model import pictures
+
+# Adam would make full steps of the rounding of gradients that are 0, as of a key's bias.
+SGD = optax.sgd(0.1)
+COLLECTIVE = re.compile(
+    r"= .* (all-reduce|all-gather|reduce-scatter|all-to-all|collective-permute)(?:-start)?\\("
+)
+COUNT, LABELS = 16, np.repeat(np.arange(8), 2).astype(np.int32)
+sharding.SHARD_FROM = 64
+devices = sharding.devices_for(COUNT)
+assert devices.mesh.size == 8
+images, valid = np.asarray(pictures(COUNT)), np.arange(COUNT) != 3
+key = jax.random.key(1)
+
+def step(model, shared=None, told=False, **options):
+    config = StepConfig(model, RECIPE.loss, SGD, 10, **options)
+    params = init_crisalad(jax.random.key(0), model)
+    state, frozen = init_train_state(params, "adapters+head", config)
+    batch, more = (images, LABELS, valid), ()
+    if shared is not None:
+        batch = [shared.shard_batch(x) for x in batch]
+        place = shared.shard if config.shard_over else shared.replicate
+        state, frozen = place(state), shared.replicate(frozen)
+        if told:
+            rows = np.zeros((8, 3), np.int32)
+            rows[5] = told
+            more = (shared.replicate(np.asarray(True)), shared.shard_batch(rows))
+    arguments = state, frozen, *batch, key, config, *more
+    if "count" in sys.argv:
+        text = train_step.lower(*arguments).compile().as_text()
+        return dict(sorted(collections.Counter(COLLECTIVE.findall(text)).items()))
+    state, metrics = train_step(*arguments)
+    return jax.tree.map(np.asarray, (state.trainable, metrics))
+
+def agree(found, expected):
+    # Sums in another order, of numbers up to about 1.
+    for a, b in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+MODEL = RECIPE.model
+assert MODEL.cross_image.dropout > 0 and MODEL.cross_image.layers == 2
+"""
+COUNTS = """
+print(step(MODEL, devices, told=(0, 15, 0), micro_batch=8))
+"""
+VALUES = """
+# Dropout too has the same bits: images are valid or not, one device or eight.
+alone = step(MODEL)
+assert alone[1].updated and alone[1].told is None
+agree(step(MODEL, devices), alone)
+agree(step(MODEL, devices, shard_over=devices.mesh), alone)
+# Two of eight devices would have no image of a micro-batch of four: each takes one.
+agree(step(MODEL, devices, micro_batch=4), alone)
+agree(step(MODEL, devices, micro_batch=8), step(MODEL, micro_batch=8))
+# What one process tells comes with the step, and a failure skips it.
+trained, metrics = step(MODEL, devices, told=(0, 15, 1))
+assert metrics.told.tolist() == [0, 15, 1] and metrics.updated
+agree(trained, alone[0])
+agree(metrics._replace(told=None), alone[1])
+before, metrics = step(MODEL, devices, told=(1, 0, 0))
+assert metrics.told.tolist() == [1, 0, 0] and not metrics.updated
+# Six images for eight devices: six take them, and a note says so.
+few = dataclasses.replace(RECIPE, trainable="adapters+head")
+with warnings.catch_warnings(record=True) as notes:
+    warnings.simplefilter("always")
+    assert run._devices(few).mesh.size == 6
+    assert run._devices(dataclasses.replace(few, places_per_batch=4)).mesh.size == 8
+for note in notes:
+    print(note.message)
+"""
+
+
+def on_eight_devices(source: str, *arguments: str) -> list[str]:
+    flags = "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=8"
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM + source, *arguments],
+        cwd=ROOT,
+        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_step_exchanges_what_it_must_and_no_more() -> None:
+    """Gathers of labels, of each layer's keys and values, and of descriptors; then gradients.
+
+    The gradient of a layer's keys and values is scattered, and those of all parameters are summed
+    at once. Nothing is exchanged in a loop, such as the transport's over images.
+    """
+    expected = "{'all-gather': 4, 'all-reduce': 1, 'reduce-scatter': 2}"
+    assert on_eight_devices(COUNTS, "count") == [expected]
+
+
+@pytest.mark.slow
+def test_eight_devices_take_the_step_of_one() -> None:
+    assert on_eight_devices(VALUES) == [
+        "training: found 8 devices for 6 images a step, of which 6 share them, the most that "
+        "divide them in each process"
+    ]
