@@ -2,7 +2,7 @@
 
     python scripts/bench/compile_check_page.py [--figures docs/accelerators] [--page PAGE.md]
 
-`compile_check.sh` makes the figures.
+`compile_check.sh` makes the figures. Machines that are not in them are left out of the page.
 """
 
 import argparse
@@ -52,6 +52,7 @@ def before_and_after(programs: Mapping[str, ProgramCheck]) -> Table:
     rows = [
         (name, what, before, goal, f"{figure(programs[name]):.3g}")
         for name, what, before, goal, figure in BEFORE
+        if name in programs
     ]
     caption = "Before and after the work on accelerators, counted in the same way."
     return Table(("program", "figure", "before", "goal", "now"), rows, caption, 2)
@@ -65,6 +66,8 @@ def scaling(programs: Mapping[str, ProgramCheck]) -> Table:
         ("v5e-1", "v5e-8", 8),
         ("v5e-8", "v5e-64", 8),
     ):
+        if not programs.keys() >= {f"{few} train", f"{many} train"}:
+            continue
         one, more = programs[f"{few} train"], programs[f"{many} train"]
         gain = more.images_per_second / one.images_per_second
         memory = f"{one.memory / 1e9:.2f} to {more.memory / 1e9:.2f}"
@@ -92,6 +95,8 @@ def loader(programs: Mapping[str, ProgramCheck], measured: pathlib.Path) -> Tabl
     }
     rows = []
     for name in ("h100", "h100-8", "v5e-1", "v5e-8", "v6e-8"):
+        if f"{name} train" not in programs:
+            continue
         wanted = programs[f"{name} train"].images_per_second
         cores = (str(math.ceil(wanted / rate)) for rate in rates.values())
         rows.append((name, f"{rounded(wanted):,}", *cores))
@@ -106,10 +111,11 @@ def main() -> None:
     parser.add_argument("--figures", type=pathlib.Path, default=pathlib.Path("docs/accelerators"))
     parser.add_argument("--page", type=pathlib.Path, default=pathlib.Path("docs/accelerators.md"))
     arguments = parser.parse_args()
-    usual, *grown = (read_check(arguments.figures / name).programs for name in FILES)
+    there = [arguments.figures / name for name in FILES if (arguments.figures / name).exists()]
+    usual, *grown = (read_check(path).programs for path in there)
     by_name = {f"{each.target} {each.program}": each for each in usual}
     larger = [each for programs in grown for each in programs if each.program == "train"]
-    larger = [by_name["v5e-8 train"], by_name["v5e-64 train"], *larger]
+    larger = [by_name[name] for name in ("v5e-8 train", "v5e-64 train") if name in by_name] + larger
     measured = pathlib.Path(__file__).parents[2] / "docs" / "training" / "bench_loader.json"
     versions = read_check(arguments.figures / FILES[0]).versions
     compilers = ", ".join(f"{name} {version}" for name, version in versions.items())
@@ -121,6 +127,8 @@ def main() -> None:
         "grown": figures(larger, TAKES, "Training on more devices, and on more images."),
         "loader": loader(by_name, measured),
     }
+    if len(larger) == 1:  # nothing larger than the reference was compiled
+        del tables["grown"]
     for name, table in tables.items():
         splice(arguments.page, f"compile_check {name}", table)
 
