@@ -15,6 +15,7 @@ from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import (
     attend_across_images,
+    cast_params,
     describe,
     extract_tokens,
     init_crisalad,
@@ -321,3 +322,13 @@ def test_whole_numbers_other_than_bytes_are_refused(params, dtype):
     words = f"^images: found {dtype}, expected uint8 pixels, or floats that are normalised"
     with pytest.raises(InputError, match=words):
         describe(params, pictures(2).astype(dtype), CONFIG)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_weights_cast_once_change_no_bit(params, dtype: str) -> None:
+    config = dataclasses.replace(CONFIG, compute_dtype=dtype)  # pyright: ignore
+    cast = cast_params(params, config)
+    assert cast.backbone.blocks.mlp.fc1.weight.dtype == dtype
+    assert cast.backbone.blocks.mlp.fc1.bias.dtype == jnp.float32
+    found, expected = (describe(each, pictures(4), config) for each in (cast, params))
+    np.testing.assert_array_equal(found, expected)
