@@ -171,7 +171,7 @@ def import_everything() -> None:
     from crisalad_jax import cli
 
     for name in cli._COMMANDS:
-        importlib.import_module(f"crisalad_jax.cli.{name}")
+        importlib.import_module(f"crisalad_jax.cli.{name.replace('-', '_')}")
     for name in (
         "faiss",
         "h5py",

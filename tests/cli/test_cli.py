@@ -118,8 +118,9 @@ def test_help_lists_every_command_and_flag(capfd):
     for command, summary in crisalad_jax.cli._COMMANDS.items():
         assert f"{command} {summary}" in out
         help_text = succeeds(capfd, command, "--help")
-        module = importlib.import_module(f"crisalad_jax.cli.{command}")
-        for field in dataclasses.fields(getattr(module, command.capitalize())):
+        module = importlib.import_module(f"crisalad_jax.cli.{command.replace('-', '_')}")
+        arguments = "".join(word.capitalize() for word in command.split("-"))
+        for field in dataclasses.fields(getattr(module, arguments)):
             if (command, field.name) in POSITIONAL:
                 assert POSITIONAL[command, field.name] in help_text
             elif field.name != "settings":
@@ -142,7 +143,7 @@ def test_no_command_prints_the_usage(capfd):
     [
         (
             "tran --data d --out o",
-            "command: found 'tran', expected one of ablate, compare, convert",
+            "command: found 'tran', expected one of ablate, compare, compile-check",
         ),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
         ("train --data d --out o --preset b16", "preset: found 'b16'"),
