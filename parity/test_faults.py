@@ -83,10 +83,10 @@ def _without_layer_scale(block: Any) -> Any:
 
 
 def _special_tokens_once(adapter: Any) -> Any:
-    def wrong(params: Any, tokens: Any, grid: tuple[int, int]) -> Any:
+    def wrong(params: Any, tokens: Any, grid: tuple[int, int], **more: Any) -> Any:
         # Without bias, half of what counts twice is what counts once.
         special = tokens.shape[-2] - grid[0] * grid[1]
-        return adapter(params, tokens, grid).at[..., :special, :].multiply(0.5)
+        return adapter(params, tokens, grid, **more).at[..., :special, :].multiply(0.5)
 
     return wrong
 
