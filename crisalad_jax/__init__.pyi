@@ -18,6 +18,8 @@ from crisalad_jax.data.images import read_image as read_image
 from crisalad_jax.data.loader import image_batches as image_batches
 from crisalad_jax.data.loader import training_batches as training_batches
 from crisalad_jax.data.places import read_places as read_places
+from crisalad_jax.data.query_set import QuerySet as QuerySet
+from crisalad_jax.data.query_set import read_query_set as read_query_set
 from crisalad_jax.data.resize import resize_image as resize_image
 from crisalad_jax.evaluation.evaluate import evaluate as evaluate
 from crisalad_jax.experiments.comparison import compare as compare
@@ -28,6 +30,8 @@ from crisalad_jax.losses import LossConfig as LossConfig
 from crisalad_jax.losses import LossValue as LossValue
 from crisalad_jax.losses import metric_loss as metric_loss
 from crisalad_jax.losses import register_loss as register_loss
+from crisalad_jax.losses import tuple_labels as tuple_labels
+from crisalad_jax.losses import tuple_pairs as tuple_pairs
 from crisalad_jax.nn.adapter import AdapterConfig as AdapterConfig
 from crisalad_jax.nn.aggregators import Aggregator as Aggregator
 from crisalad_jax.nn.aggregators import TokenShape as TokenShape
@@ -63,6 +67,7 @@ from crisalad_jax.sinkhorn import SinkhornConfig as SinkhornConfig
 from crisalad_jax.sinkhorn import register_dustbin as register_dustbin
 from crisalad_jax.sinkhorn import register_gradient as register_gradient
 from crisalad_jax.sinkhorn import register_step as register_step
+from crisalad_jax.training.config import MiningConfig as MiningConfig
 from crisalad_jax.training.config import OptimiserConfig as OptimiserConfig
 from crisalad_jax.training.config import TrainConfig as TrainConfig
 from crisalad_jax.training.loop import FitResult as FitResult

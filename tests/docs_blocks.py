@@ -68,7 +68,9 @@ def parse(command: str) -> None:
 
     if given:
         renamed.today(given, refuse)
-        cli._parse(verb, importlib.import_module(f"crisalad_jax.cli.{verb}"), given)
+        cli._parse(
+            verb, importlib.import_module(f"crisalad_jax.cli.{verb.replace('-', '_')}"), given
+        )
 
 
 def run(page: str, text: str) -> int:

@@ -18,10 +18,13 @@ class Train:
     """Train on places in the GSV-Cities layout; go on with the run if OUT holds one."""
 
     data: pathlib.Path
-    """Folder with Dataframes/ and Images/."""
+    """Folder with Dataframes/ and Images/; for netvlad, patch-netvlad and selavpr, which mine
+    tuples, a training set of queries in any layout that `evaluate` reads."""
     out: pathlib.Path
     """Folder of the run."""
     settings: Any
+    data_images: pathlib.Path | None = None
+    """Folder of the images that a .mat file at --data names; by default beside it."""
     val: pathlib.Path | None = None
     """Evaluation set for early stopping, in any layout that `evaluate` reads."""
     val_images: pathlib.Path | None = None
@@ -37,8 +40,9 @@ class Train:
     recipe: str | None = None
     """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
-    vlad-buff; over ResNet boq-resnet50, conv-ap, cosplace, mixvpr. In part as published:
-    eigenplaces-turns, netvlad-gsv, cosplace-vit, eigenplaces-vit. From random weights: scratch (the
+    vlad-buff, selavpr (preset l14); over ResNet boq-resnet50, conv-ap, cosplace, mixvpr; over
+    VGG netvlad, patch-netvlad. In part as published: eigenplaces-turns, netvlad-gsv, cosplace-vit,
+    eigenplaces-vit. From random weights: scratch (the
     default of tiny). RECIPE+PART is a recipe with a registered part in place, such as
     crisalad+gem."""
     config: pathlib.Path | None = None
@@ -121,6 +125,7 @@ def run(arguments: Train) -> None:
         config,
         arguments.data,
         arguments.out,
+        images=arguments.data_images,
         validation=arguments.val,
         validation_images=arguments.val_images,
         weights=arguments.weights,

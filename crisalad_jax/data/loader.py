@@ -5,12 +5,13 @@ import dataclasses
 import functools
 import itertools
 import os
+import pathlib
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.augmentations import Augmentation
@@ -37,7 +38,8 @@ class ImageBatch(NamedTuple):
     images: UInt8[np.ndarray, "batch h w 3"] | Float32[np.ndarray, "batch h w 3"]
     """8-bit pixels, or normalised floats; zeros where not valid."""
     labels: Int32[np.ndarray, " batch"]
-    """Place index; position in the list of paths where there are no places; -1 for padding."""
+    """Place index, or tuple and role (`losses.tuples`); position in the list of paths where there
+    are no groups; -1 for padding."""
     valid: Bool[np.ndarray, " batch"]
     indices: Int64[np.ndarray, " batch"]
     """Image index, also of an unreadable image; -1 for padding."""
@@ -175,9 +177,74 @@ def training_batches(
         epoch=epoch,
         steps=steps,
     )
+    return batches_of_groups(
+        places,
+        chosen,
+        places.image_place[chosen],
+        image_size=image_size,
+        preprocessing=preprocessing,
+        augmentation=augmentation,
+        seed=(seed, epoch),
+        start_step=start_step,
+        part=part,
+        on_bad_image=on_bad_image,
+        threads=threads,
+        num_workers=num_workers,
+        cache=cache,
+    )
+
+
+class ImageFiles(Protocol):
+    """Numbered images: `Places`, or a `QuerySet`."""
+
+    def path(self, image: int | np.integer) -> pathlib.Path:
+        """Return the path of one image."""
+        ...
+
+
+def batches_of_groups(
+    files: ImageFiles,
+    chosen: Int[np.ndarray, "steps groups images"],
+    labels: Int[np.ndarray, "steps groups images"],
+    *,
+    image_size: tuple[int, int],
+    augmentation: Augmentation,
+    seed: tuple[int, ...],
+    preprocessing: PreprocessingConfig = PreprocessingConfig(),
+    start_step: int = 0,
+    part: tuple[int, int] = (0, 1),
+    on_bad_image: OnBadImage = "stop",
+    threads: int = THREADS,
+    num_workers: int = 0,
+    cache: ImageCache | None = None,
+) -> Iterator[ImageBatch]:
+    """Yield batches of chosen images, which are groups of images of a place, or mined tuples.
+
+    Args:
+        files: the images.
+        chosen: the images of every batch.
+        labels: their labels.
+        image_size: see `training_batches`, as for all that follow.
+        augmentation: changes each image; what it draws for a place is the same in a group.
+        seed: numbers that draw the changes, together with the step.
+        preprocessing: whose filter resizes bytes.
+        start_step: the first batch to give.
+        part: (i, n) gives the i-th of n equal parts of every batch.
+        on_bad_image: "stop" or "skip".
+        threads: how many decode ahead.
+        num_workers: number of processes that decode ahead instead.
+        cache: holds decoded images.
+
+    Yields:
+        The batches.
+
+    Raises:
+        InputError: as `training_batches`.
+    """
     if not 0 <= start_step <= len(chosen):
         raise InputError(f"start_step: found {start_step}, expected 0 to {len(chosen)}")
-    batch_size = places_per_batch * images_per_place
+    _, groups, images_per_group = chosen.shape
+    batch_size = groups * images_per_group
     number, parts = part
     if not 0 <= number < parts or batch_size % parts:
         raise InputError(f"part: found {part}, expected the i-th of n, which divides {batch_size}")
@@ -185,18 +252,18 @@ def training_batches(
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
     images = _TrainingImages(
-        places,
+        files,
         indices,
         _read if cache is None or num_workers else cache.read,
         how=how,
         batch_size=batch_size,
-        images_per_place=images_per_place,
+        images_per_group=images_per_group,
         augmentation=augmentation,
-        seed=(seed, epoch),
+        seed=seed,
     )
     return _batches(
         images,
-        labels=places.image_place[indices],
+        labels=labels.reshape(-1),
         indices=indices,
         positions=slots[start_step:, number].reshape(-1),
         how=how,
@@ -211,22 +278,22 @@ def training_batches(
 class _TrainingImages:
     """Read and augment an image of an epoch, in this process or in a worker process."""
 
-    places: Places
+    files: ImageFiles
     indices: np.ndarray
     read: Callable[..., Pixels]
     _: dataclasses.KW_ONLY
     how: Preparation
     batch_size: int
-    images_per_place: int
+    images_per_group: int
     augmentation: Augmentation
-    seed: tuple[int, int]
+    seed: tuple[int, ...]
 
     def __call__(self, position: int) -> Pixels:
-        path = self.places.path(self.indices[position])
+        path = self.files.path(self.indices[position])
         image = self.read(path, self.how, quickly=True)
         step, slot = divmod(position, self.batch_size)
         # The spawn key makes this stream, one for each place, independent of each image's.
-        place = (*self.seed, step, slot // self.images_per_place)
+        place = (*self.seed, step, slot // self.images_per_group)
         of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
         generator = np.random.default_rng((*self.seed, step, slot))
         augmented = self.augmentation.apply(image, generator, of_place=of_place)

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.places import read_places
+from crisalad_jax.data.places import Places, read_places
+from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.experiments.report import training_curves
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
@@ -24,6 +25,7 @@ def train(
     data: Path,
     out: Path,
     *,
+    images: Path | None = None,
     validation: Path | None = None,
     validation_images: Path | None = None,
     weights: Path | None = None,
@@ -39,7 +41,9 @@ def train(
 
     Args:
         config: how to train.
-        data: folder in the layout of GSV-Cities.
+        data: folder in the layout of GSV-Cities; for a recipe that mines tuples, a set that
+            `open_benchmark` reads, such as pitts30k_train.mat.
+        images: folder of the images that such a file names.
         out: folder of the run; see `fit`.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
         validation_images: folder of the images that a .mat file or .npy lists at `validation` name.
@@ -56,7 +60,8 @@ def train(
         How the run ended.
 
     Raises:
-        InputError: what `read_start`, `read_places`, `open_benchmark` and `fit` raise.
+        InputError: what `read_start`, `read_places`, `read_query_set`, `open_benchmark` and `fit`
+            raise.
         Stopped: what `fit` raises; the same call resumes.
 
     Example:
@@ -78,13 +83,10 @@ def train(
             backbone=backbone,
             quiet=quiet or not distributed.is_primary(),
         )
-        places = read_places(
-            pathlib.Path(data), cities=config.cities, min_images=config.min_images_of_place
-        )
+        places = _read_set(config, data, images)
         if validation is None:
             return initial, places, None
-        images = None if validation_images is None else pathlib.Path(validation_images)
-        return initial, places, open_benchmark(validation, images=images)
+        return initial, places, open_benchmark(validation, images=validation_images)
 
     initial, places, benchmark = distributed.raise_together(read)
     if (weights, backbone) == (None, None) and config.trainable != "all":
@@ -92,8 +94,13 @@ def train(
             "Note: no --weights or --backbone, so the frozen part of the model "
             f"({config.trainable} trains) is random. --trainable all trains everything."
         )
+    groups = (
+        f"{len(places.queries)} queries with positives"
+        if isinstance(places, QuerySet)
+        else f"{len(places.place_id)} places"
+    )
     say(
-        f"{data}: {len(places.place_id)} places, {len(places.files)} images"
+        f"{data}: {groups}, {len(places.files)} images"
         + ("" if benchmark is None else f"; validation on {benchmark.name}")
     )
     if weights is None:
@@ -116,3 +123,25 @@ def train(
     if distributed.is_primary():
         training_curves(out / "curves.png", read_metrics(out / "metrics.jsonl"))
     return result
+
+
+def _read_set(config: TrainConfig, data: Path, images: Path | None) -> Places | QuerySet:
+    """Read the training set: places, or queries of which tuples are mined."""
+    mining = config.mining
+    if mining.kind == "none":
+        if images is not None:
+            raise InputError("--data-images: found for places, expected it for queries alone")
+        return read_places(
+            pathlib.Path(data), cities=config.cities, min_images=config.min_images_of_place
+        )
+    if (pathlib.Path(data) / "Dataframes").is_dir():
+        raise InputError(
+            f"{data}: found places in the layout of GSV-Cities, expected queries and a database, "
+            "such as pitts30k_train.mat or MSLS: this recipe mines tuples"
+        )
+    return read_query_set(
+        data,
+        positive_radius=mining.positive_radius,
+        negative_radius=mining.negative_radius,
+        images=images,
+    )

@@ -39,6 +39,8 @@ class LossBatch:
     """Pairs that the miner chose."""
     classes: Int[Array, ""] | int | None = None
     """Number of classes, where the loss has a vector for each."""
+    dense: Float[Array, "image feature local"] | None = None
+    """Unit local features (`Tokens.dense`), for a loss that `reads_dense`."""
 
     @functools.cached_property
     def similarities(self) -> Similarities:
@@ -84,6 +86,12 @@ class Loss(Part, abc.ABC):
 
     ranks_all: ClassVar[bool] = False
     """Whether the loss ranks all images, so that no miner may choose pairs."""
+
+    of_tuples: ClassVar[bool] = False
+    """Whether the loss takes mined tuples alone, where an image is in a single pair."""
+
+    reads_dense: ClassVar[bool] = False
+    """Whether the loss compares local features, which few aggregators have in training."""
 
     @property
     def grouping(self) -> ClassesConfig | None:

@@ -117,6 +117,8 @@ def metric_loss(
     valid: Bool[Array, " image"] | None = None,
     params: Any = None,
     classes: Int[Array, ""] | int | None = None,
+    pairs: Pairs | None = None,
+    dense: Float[Array, "image feature local"] | None = None,
 ) -> LossResult:
     """Compute the loss `config.kind` over the pairs that `config.miner` chooses.
 
@@ -129,12 +131,15 @@ def metric_loss(
         valid: images that take part; None means all. The others are neither anchors nor pairs.
         params: what trains beside the model (`Loss.init`).
         classes: number of classes, where `params` have a vector for each and more.
+        pairs: the pairs to choose from, such as `tuple_pairs`; None means `all_pairs`.
+        dense: local features of each image, for a loss that compares them.
 
     Returns:
         The loss and what is logged beside it.
 
     Raises:
-        InputError: a loss returns something else than a number, or lacks its parameters.
+        InputError: a loss returns something else than a number, or lacks its parameters, local
+            features or tuples.
 
     Example:
         >>> import jax.numpy as jnp
@@ -144,24 +149,36 @@ def metric_loss(
     """
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
     valid = jnp.ones(len(labels), bool) if valid is None else valid
-    every = all_pairs(labels, valid=valid)
-    batch = LossBatch(wide, labels, valid, every, classes)
+    every = all_pairs(labels, valid=valid) if pairs is None else pairs
+    require(
+        pairs is not None or not config.kind.of_tuples,
+        f"loss {config.kind.part_name}: found places, expected the pairs of mined tuples",
+    )
+    if config.kind.reads_dense:
+        require(
+            dense is not None,
+            f"loss {config.kind.part_name}: found no local features, expected an aggregator that "
+            "has them in training, such as selavpr",
+        )
+    batch = LossBatch(wide, labels, valid, every, classes, dense)
     similarities = jax.lax.stop_gradient(batch.similarities)
     mined = mine(similarities, every, margin=config.miner_margin)
-    pairs = every if config.miner == "none" else mined
+    chosen = every if config.miner == "none" else mined
     if params is None:
         draw = functools.partial(config.kind.init, classes=1, dim=wide.shape[1])
         require(
             jax.eval_shape(draw, jax.random.key(0)) is None,
             f"loss {config.kind.part_name}: found no params, expected those of its init",
         )
-    value = config.kind.apply(params, dataclasses.replace(batch, pairs=pairs))
+    value = config.kind.apply(params, dataclasses.replace(batch, pairs=chosen))
     check_value(value, config.kind.part_name)
     loss = value.loss
     if config.match_pml_zero:
-        few = (pairs.positives.sum() <= 1) & (pairs.negatives.sum() <= 1)
+        few = (chosen.positives.sum() <= 1) & (chosen.negatives.sum() <= 1)
         loss = jnp.where(few, 0.0, loss)
     # NaN similarities violate no margin: without this line the batch would look perfect.
     loss = jnp.where(jnp.isfinite(similarities).all(), loss, jnp.nan)
-    easy = 1 - mined.positives.any(axis=1).sum() / batch.anchors
+    # In tuples only queries are anchors.
+    anchors = batch.anchors if pairs is None else jnp.maximum(pairs.positives.any(axis=1).sum(), 1)
+    easy = 1 - mined.positives.any(axis=1).sum() / anchors
     return LossResult(loss, easy, value.accuracy)

@@ -1,7 +1,7 @@
 """Triplet margin loss (Schroff et al., CVPR 2015)."""
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,15 @@ class TripletConfig(Loss):
 
     margin: float = 0.1
     """Distance by which a positive must be nearer than a negative."""
+    average: Literal["violating", "all"] = "violating"
+    """Triplets that the mean is over: those that violate the margin, or all (NetVLAD's code)."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Average the violations over all triplets of distances that violate the margin.
+        """Average the violations of the margin over triplets of distances.
 
         No cubic array of triplets is made. With an anchor's negatives sorted, those that violate
         the margin with a positive come first, so that their sum is a prefix sum.
@@ -38,4 +40,7 @@ class TripletConfig(Loss):
         )
         counts = jnp.where(batch.pairs.positives, counts, 0)
         violations = counts * limits - jnp.take_along_axis(sums, counts, axis=1)
+        if self.average == "all":
+            negatives = batch.pairs.negatives.sum(axis=1, keepdims=True)
+            counts = jnp.where(batch.pairs.positives, negatives, 0)
         return LossValue(violations.sum() / jnp.maximum(counts.sum(), 1))

@@ -30,6 +30,8 @@ class Tokens(NamedTuple):
     local: Float[Array, "*batch token dim"]
     transport: TransportStatistics | None = None
     """Statistics of the image; None without a transport, or after the cross-image encoder."""
+    dense: Float[Array, "*batch feature local"] | None = None
+    """Local features of an image for a loss that compares them (SelaVPR); in training alone."""
 
     @classmethod
     def of_global(cls, token: Float[Array, "*batch dim"]) -> "Tokens":

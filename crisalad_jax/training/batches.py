@@ -1,12 +1,17 @@
 """The batches that a configuration asks for, epoch by epoch."""
 
+import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from crisalad_jax.data.class_groups import class_groups
-from crisalad_jax.data.loader import ImageBatch, training_batches
+from crisalad_jax.data.loader import ImageBatch, batches_of_groups, training_batches
 from crisalad_jax.data.places import Places, epoch_batches
+from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.losses.tuples import tuple_labels
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.mining import Mined
+from crisalad_jax.utils.errors import InputError
 
 
 def groups_of(config: TrainConfig, places: Places) -> tuple[Places, ...]:
@@ -47,6 +52,49 @@ def steps_per_epoch(config: TrainConfig, groups: Sequence[Places]) -> int:
             )
         )
         for group in groups
+    )
+
+
+class Rounds(NamedTuple):
+    """The rounds of an epoch, of equal size; tuples are mined before each."""
+
+    count: int
+    steps: int
+
+
+def rounds_of(config: TrainConfig, queries: QuerySet) -> Rounds:
+    """Divide an epoch into rounds of whole batches.
+
+    Raises:
+        InputError: the queries make no batch.
+    """
+    mining = config.mining
+    queries_per_epoch = mining.queries_per_epoch or len(queries.queries)
+    rounds = math.ceil(queries_per_epoch / mining.queries_per_round)
+    size = min(queries_per_epoch // rounds, len(queries.queries))
+    steps = size // config.places_per_batch
+    if not steps:
+        raise InputError(
+            f"{queries.root}: found {size} queries with positives for a round, expected at least "
+            f"places_per_batch {config.places_per_batch}"
+        )
+    return Rounds(rounds, steps)
+
+
+def batches_of_tuples(
+    config: TrainConfig, queries: QuerySet, mined: Mined, **options: Any
+) -> Iterator[ImageBatch]:
+    """Yield the batches of a round; `options` go to `batches_of_groups`."""
+    shape = (-1, config.places_per_batch, config.images_per_place)
+    return batches_of_groups(
+        queries,
+        mined.images.reshape(shape),
+        tuple_labels(mined.roles).reshape(shape),
+        image_size=config.model.input_size,
+        preprocessing=config.model.preprocessing,
+        augmentation=config.augmentation,
+        seed=(config.seed, mined.step),
+        **options,
     )
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from typing import Literal
 
 from crisalad_jax.config.checks import (
@@ -102,6 +103,57 @@ def _rises(numbers: tuple[int, ...]) -> bool:
 
 
 @dataclasses.dataclass(frozen=True)
+class MiningConfig:
+    """Tuples of a query, its nearest positive and its hardest negatives, by the model as it is.
+
+    An epoch is a number of rounds. Each begins by describing images, and then trains on a tuple of
+    each of its queries. Positives and negatives are database images, by their positions; where a
+    set has none, by its ground truth.
+
+    Example:
+        >>> MiningConfig(kind="whole", negatives=5).candidates
+        1000
+    """
+
+    kind: Literal["none", "whole", "sample"] = "none"
+    """What is described: nothing, for training sets of places; the "whole" database, of which each
+    query draws candidates of its own, and keeps its last negatives among them (NetVLAD); or a
+    "sample" of candidates for all queries of the round, and their positives (MSLS)."""
+    negatives: int = 10
+    """Negatives of a tuple, the nearest of the candidates."""
+    candidates: int = 1000
+    """Number of database images that are drawn for the negatives."""
+    queries_per_round: int = 1000
+    """Most queries of a round; the queries of an epoch make rounds of equal size."""
+    queries_per_epoch: int | None = None
+    """Queries of an epoch, drawn anew for each round; None takes every query once."""
+    positive_radius: float = 10.0
+    """Metres within which a database image is a query's positive."""
+    negative_radius: float = 25.0
+    """Metres within which a database image is no negative."""
+    margin: float | None = None
+    """Only negatives enter that are at most so much farther than the positive; None takes the
+    hardest in any case."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "negatives", "candidates", "queries_per_round")
+        for name in ("queries_per_epoch", "margin"):
+            if getattr(self, name) is not None:
+                require_positive(self, name)
+        require(
+            self.negatives <= self.candidates,
+            f"MiningConfig.candidates: found {self.candidates}, expected at least negatives "
+            f"({self.negatives})",
+        )
+        require(
+            0 < self.positive_radius <= self.negative_radius < math.inf,
+            f"MiningConfig.positive_radius: found {self.positive_radius} beside negative_radius "
+            f"{self.negative_radius}, expected metres above 0, and no more than the latter",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """A whole training run, apart from where its files lie.
 
@@ -134,6 +186,9 @@ class TrainConfig:
     the statistics of so many images alone, as in several forward passes of torch's."""
     min_images: int = 4
     """Places, or classes, with fewer images are left out."""
+    mining: MiningConfig = MiningConfig()
+    """Tuples of a set of queries, in the place of places. Then `places_per_batch` tuples make a
+    batch, each of `images_per_place` images: a query, a positive, and the negatives."""
     batch_order: Literal["within-city", "shuffled"] = "within-city"
     """A batch of one city's places (hard negatives; the public loaders) or of all cities'."""
     cities: tuple[str, ...] | None = None
@@ -172,8 +227,24 @@ class TrainConfig:
             f"TrainConfig.optimiser.accumulate: found {self.optimiser.accumulate}, expected 1 for "
             f"loss {self.loss.kind.part_name}, whose classifiers step with every batch",
         )
+        mined = self.mining.kind != "none"
         require(
-            self.min_images >= self.images_per_place,
+            not mined or self.images_per_place == 2 + self.mining.negatives,
+            f"TrainConfig.images_per_place: found {self.images_per_place} with mined tuples, "
+            f"expected {2 + self.mining.negatives}: a query, a positive and mining.negatives",
+        )
+        require(
+            not mined or self.loss.kind.grouping is None,
+            f"TrainConfig.mining: found {self.mining.kind!r} for loss {self.loss.kind.part_name}, "
+            "which classifies, expected a loss of pairs",
+        )
+        require(
+            mined or not self.loss.kind.of_tuples,
+            f"TrainConfig.mining: found 'none' for loss {self.loss.kind.part_name}, expected "
+            "'whole' or 'sample': it takes mined tuples",
+        )
+        require(
+            mined or self.min_images >= self.images_per_place,
             f"TrainConfig.min_images: found {self.min_images}, expected at least images_per_place "
             f"({self.images_per_place})",
         )

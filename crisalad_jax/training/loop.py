@@ -9,6 +9,7 @@ from typing import NamedTuple
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import THREADS, OnBadImage
 from crisalad_jax.data.places import Places
+from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.run import Batch, Run, Told
@@ -33,7 +34,7 @@ class FitResult(NamedTuple):
 
 def fit(
     config: TrainConfig,
-    places: Places,
+    places: Places | QuerySet,
     out: str | os.PathLike[str],
     *,
     validation: Benchmark | None = None,
@@ -48,15 +49,16 @@ def fit(
 
     The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
     same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
-    and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best recall by
-    `config.select_by` (grouping `single`), and the best `config.keep_best` weights in `best/`.
+    `last.safetensors`; and `mined.npz` where tuples are mined. A validation adds
+    `best.safetensors`, the weights of the best recall by `config.select_by` (grouping `single`),
+    and the best `config.keep_best` weights in `best/`.
 
     A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one
     (on a CPU; see docs/reliability.md for a GPU).
 
     Args:
         config: everything but the files.
-        places: training images.
+        places: training images; a `QuerySet` where `config.mining` mines tuples.
         out: folder of the run.
         validation: evaluated every `config.validate_every` epochs, for early stopping.
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
@@ -93,7 +95,9 @@ def fit(
         validation.ground_truth()
     run = Run(config, places, pathlib.Path(out), initial, validation, shard_state=shard_state)
     with contextlib.closing(run):
-        _train(run, lambda: run.rest_of_epoch(on_bad_image, num_workers, threads), quiet)
+        _train(
+            run, lambda: run.rest_of_round(on_bad_image, num_workers, threads), on_bad_image, quiet
+        )
         distributed.raise_together(run.save)
     record = run.record
     best = record.best[0][0] if record.best else None
@@ -113,10 +117,10 @@ def check_learns(config: TrainConfig) -> None:
         )
 
 
-_Epoch = Callable[[], Generator[Batch, None, None]]
+_Round = Callable[[], Generator[Batch, None, None]]
 
 
-def _train(run: Run, rest_of_epoch: _Epoch, quiet: bool) -> None:
+def _train(run: Run, rest_of_round: _Round, on_bad_image: OnBadImage, quiet: bool) -> None:
     silent = quiet or not distributed.is_primary()
     bar = progress_bar("training", run.steps, "steps", quiet=silent, done=run.step)
     with defer_signals() as signals, bar as bar:
@@ -130,7 +134,9 @@ def _train(run: Run, rest_of_epoch: _Epoch, quiet: bool) -> None:
                     if run.validation_is_due():
                         bar.say(run.validate(signals))
                         distributed.raise_together(run.save)
-                    _train_epoch(run, rest_of_epoch, signals, bar)
+                    if run.mining_is_due():
+                        bar.say(run.mine(on_bad_image, signals))
+                    _train_round(run, rest_of_round, signals, bar)
                 _stop_together(signals)  # one that came while the last validation was saved
             except InputError:
                 # A signal to the process group also ends the workers that read images.
@@ -149,12 +155,12 @@ def _stop_together(signals: SignalState) -> None:
         raise Stopped(number)
 
 
-def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar) -> None:
-    """Take the steps of an epoch.
+def _train_round(run: Run, rest_of_round: _Round, signals: SignalState, bar: Bar) -> None:
+    """Take the steps of a round, which is an epoch where nothing is mined.
 
     One process knows its errors, signals and clock before each step. Several tell them with the
     step, and learn what was told when its metrics are read, while the next one is computed: no
-    process waits for the others before the end of the epoch. A process that has failed goes on
+    process waits for the others before the end of the round. A process that has failed goes on
     with steps that none takes, until all have learnt it.
     """
     error: Exception | None = None
@@ -177,8 +183,8 @@ def _train_epoch(run: Run, rest_of_epoch: _Epoch, signals: SignalState, bar: Bar
     def own() -> Told:
         return Told(error is not None, signals.number, run.save_is_due())
 
-    with contextlib.closing(rest_of_epoch()) as batches:
-        for _ in range(run.steps_left_of_epoch()):
+    with contextlib.closing(rest_of_round()) as batches:
+        for _ in range(run.steps_left_of_round()):
             batch = None
             try:
                 batch = None if error is not None else run.next_batch(batches)

@@ -20,14 +20,30 @@ from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.places import Places
+from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.model import Crisalad, cast_params, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
+from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.photographs import photograph_batches
-from crisalad_jax.training.batches import batches_of, groups_of, steps_per_epoch
+from crisalad_jax.training.batches import (
+    Rounds,
+    batches_of,
+    batches_of_tuples,
+    groups_of,
+    rounds_of,
+    steps_per_epoch,
+)
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.memory import check_memory, memory_limit, memory_of
+from crisalad_jax.training.mining import (
+    Mined,
+    describe_mined,
+    draw_queries,
+    mine_tuples,
+    no_hardest,
+)
 from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
@@ -53,6 +69,8 @@ WATCHED_QUERIES = 16
 """Number of images whose transport statistics every validation logs."""
 SELECTED = {"R@1": (1,), "R@5": (5,), "R@1+R@5": (1, 5)}
 """Ranks whose recalls are added, by `TrainConfig.select_by`."""
+DESCRIBED_AT_ONCE = 1024
+"""Number of images whose tokens are in memory while tuples are mined."""
 SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
 
@@ -91,7 +109,7 @@ class Run:
     def __init__(
         self,
         config: TrainConfig,
-        places: Places,
+        places: Places | QuerySet,
         out: pathlib.Path,
         initial: Crisalad | None,
         validation: Benchmark | None,
@@ -107,8 +125,15 @@ class Run:
         }
         for what, number in (checksums | {"--shard-state": int(shard_state)}).items():
             distributed.check_same(what, number)
-        self._groups = groups_of(config, places)
-        self.steps_per_epoch = steps_per_epoch(config, self._groups)
+        check_set(config, places)
+        self._queries = places if isinstance(places, QuerySet) else None
+        if isinstance(places, QuerySet):
+            self._groups: tuple[Places, ...] = ()
+            self._rounds = rounds_of(config, places)
+        else:
+            self._groups = groups_of(config, places)
+            self._rounds = Rounds(1, steps_per_epoch(config, self._groups))
+        self.steps_per_epoch = self._rounds.count * self._rounds.steps
         self.config, self.out = config, out
         self._validation = validation
         self._devices = _devices(config)
@@ -139,6 +164,7 @@ class Run:
             self._devices.mesh if shard_state else None,
             self.classes,
             config.batch_norm,
+            self._queries is not None,
         )
         self._all_is_well = self._devices.replicate(np.asarray(True))
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
@@ -164,6 +190,9 @@ class Run:
         state = self._open_files(state)
         # Copied, because a step donates the buffers of its state.
         self.state: TrainState = _copied(place(state))
+        self._mined: Mined | None = None
+        if self._queries is not None:
+            self._load_mined(self._queries)
         self._before: _Pending | None = None
         self._pending: _Pending | None = None
         self._saved_at = self._stepped_at = time.monotonic()
@@ -236,28 +265,132 @@ class Run:
         new = step == 0 and self.step > self.record.validated
         return self._validation is not None and new and asked
 
-    def rest_of_epoch(
+    def mining_is_due(self) -> bool:
+        """Return whether the round that begins now still needs its tuples."""
+        begins = self.step % self._rounds.steps == 0 and not self.is_done()
+        is_there = self._mined is not None and self._mined.step == self.step
+        return self._queries is not None and begins and not is_there
+
+    def mine(self, on_bad_image: OnBadImage, signals: SignalState) -> str:
+        """Mine the tuples of the round that begins, by the model as it is, and keep them in a file.
+
+        The primary process mines, and the others wait.
+
+        Returns:
+            How hard they are, in words.
+        """
+        assert self._queries is not None
+        queries = self._queries
+        self.save()  # so that no state is left that needs the tuples before
+        params, mined = self.params(), self._no_tuples(queries)
+        words = ""
+
+        def on_primary() -> None:
+            nonlocal mined, words
+            assert self._files is not None
+            with signals.at_once():
+                mined = self._mine(params, queries, on_bad_image)
+            self._files.save_mined(mined)
+            words = describe_mined(mined)
+
+        distributed.run_on_primary(on_primary)
+        self._mined = Mined(self.step, *distributed.broadcast(tuple(mined[1:])))
+        self._stepped_at = time.monotonic()
+        return words
+
+    def _mine(self, params: Crisalad, queries: QuerySet, on_bad_image: OnBadImage) -> Mined:
+        config = self.config
+        epoch, step = divmod(self.step, self.steps_per_epoch)
+        chosen = draw_queries(
+            config.mining,
+            len(queries.queries),
+            self._rounds.steps * config.places_per_batch,
+            seed=config.seed,
+            epoch=epoch,
+            number=step // self._rounds.steps,
+        )
+
+        def describe(images: np.ndarray) -> np.ndarray:
+            rows = np.empty((len(images), config.model.descriptor_dim), np.float32)
+            for start in range(0, len(images), DESCRIBED_AT_ONCE):
+                part = slice(start, start + DESCRIBED_AT_ONCE)
+                paths = [queries.path(image) for image in images[part]]
+                tokens = read_tokens(
+                    params,
+                    config.model,
+                    paths,
+                    batch_size=16,
+                    label="mining",
+                    on_bad_image=on_bad_image,
+                    cache=self._cache,
+                    quiet=True,
+                )
+                rows[part] = group(params, config.model, tokens, "single", batch_size=16)
+                rows[part][~tokens.readable] = np.nan
+            return rows
+
+        hardest = no_hardest(config.mining, queries) if self._mined is None else self._mined.hardest
+        return mine_tuples(
+            config.mining, queries, chosen, hardest, describe, seed=config.seed, step=self.step
+        )
+
+    def _no_tuples(self, queries: QuerySet) -> Mined:
+        shape = self._rounds.steps * self.config.places_per_batch, self.config.images_per_place
+        none = np.zeros(shape, np.int32)
+        return Mined(-1, none, none, no_hardest(self.config.mining, queries))
+
+    def _load_mined(self, queries: QuerySet) -> None:
+        """Load the tuples that were mined last; those of the round that the run resumes in."""
+        mined = self._no_tuples(queries)
+
+        def find() -> int:
+            nonlocal mined
+            assert self._files is not None
+            loaded = self._files.load_mined(mined.images.shape, mined.hardest.shape)
+            begin = self.step - self.step % self._rounds.steps
+            found = -1 if loaded is None else loaded.step
+            if found < begin < self.step:
+                raise InputError(
+                    f"{self.out / 'mined.npz'}: found "
+                    f"{'no such file' if loaded is None else f'the tuples of step {found}'}, "
+                    f"expected those of step {begin}; the run cannot go on without them"
+                )
+            mined = mined if loaded is None else loaded
+            return found
+
+        step = distributed.run_on_primary(find)
+        arrays = distributed.broadcast(tuple(mined[1:]))
+        self._mined = None if step < 0 else Mined(step, *arrays)
+
+    def rest_of_round(
         self, on_bad_image: OnBadImage, num_workers: int, threads: int
     ) -> Generator[Batch, None, None]:
-        """Yield the batches from the next step to the end of its epoch; none if the run is done.
+        """Yield the batches from the next step to the end of its round; none if the run is done.
 
         Each is copied to the devices while they compute the one before.
         """
         if self.is_done():
             return
-        epoch, start_step = divmod(self.step, self.steps_per_epoch)
-        batches = batches_of(
-            self.config,
-            self._groups[epoch % len(self._groups)],
-            epoch,
-            steps=self.steps_per_epoch,
-            start_step=start_step,
-            part=(jax.process_index(), jax.process_count()),
-            on_bad_image=on_bad_image,
-            num_workers=num_workers,
-            threads=threads,
-            cache=self._cache,
-        )
+        options: dict[str, Any] = {
+            "start_step": self.step % self._rounds.steps,
+            "part": (jax.process_index(), jax.process_count()),
+            "on_bad_image": on_bad_image,
+            "num_workers": num_workers,
+            "threads": threads,
+            "cache": self._cache,
+        }
+        if self._queries is not None:
+            assert self._mined is not None
+            batches = batches_of_tuples(self.config, self._queries, self._mined, **options)
+        else:
+            epoch = self.step // self.steps_per_epoch
+            batches = batches_of(
+                self.config,
+                self._groups[epoch % len(self._groups)],
+                epoch,
+                steps=self.steps_per_epoch,
+                **options,
+            )
         yield from one_ahead(
             Batch(*map(self._devices.shard_batch, (batch.images, batch.labels, batch.valid)))
             for batch in batches
@@ -277,9 +410,9 @@ class Run:
         self._waited = time.monotonic() - begin
         return batch
 
-    def steps_left_of_epoch(self) -> int:
-        """Return how many steps of the epoch are to be taken; 0 if the run is done."""
-        return 0 if self.is_done() else self.steps_per_epoch - self.step % self.steps_per_epoch
+    def steps_left_of_round(self) -> int:
+        """Return how many steps of the round are to be taken; 0 if the run is done."""
+        return 0 if self.is_done() else self._rounds.steps - self.step % self._rounds.steps
 
     def start_step(self, batch: Batch | None, told: Told) -> None:
         """Start a step, while the devices may still compute the one before.
@@ -471,6 +604,20 @@ class Run:
         """Wait for files that are being written, and close them."""
         if self._files is not None:
             self._files.close()
+
+
+def check_set(config: TrainConfig, places: Places | QuerySet) -> None:
+    """Check that a training set is what a configuration trains on: places, or queries.
+
+    Raises:
+        InputError: it is not.
+    """
+    mines = config.mining.kind != "none"
+    if mines != isinstance(places, QuerySet):
+        found, expected = ("places", "a QuerySet") if mines else ("a QuerySet", "places")
+        raise InputError(
+            f"places: found {found} with mining {config.mining.kind!r}, expected {expected}"
+        )
 
 
 @jax.jit

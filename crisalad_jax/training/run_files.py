@@ -15,9 +15,11 @@ from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
+from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
+from crisalad_jax.training.mining import Mined, load_mined, save_mined
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
@@ -110,6 +112,16 @@ class RunFiles:
             self._drop_old_best(record)
         self._saved = step, record
 
+    def load_mined(self, shape: tuple[int, int], hardest: tuple[int, int]) -> Mined | None:
+        """Load the tuples of the last round that was mined; see `mining.load_mined`."""
+        return load_mined(self._out / "mined.npz", shape, hardest)
+
+    def save_mined(self, mined: Mined) -> None:
+        """Write the tuples of a round, after the state before it: older ones are not needed."""
+        with self._writing():
+            self._states.wait()
+            save_mined(self._out / "mined.npz", mined)
+
     def close(self) -> None:
         """Wait for files that are being written, and close them."""
         with self._lock, self._writing(), contextlib.ExitStack() as closed:
@@ -175,8 +187,11 @@ def _text(names: Iterable[Any]) -> np.ndarray:
     return np.frombuffer("\n".join(map(str, names)).encode(), np.uint8)
 
 
-def checksum_of_places(places: Places) -> int:
-    """Compute the CRC of all images' names and of their division into places."""
+def checksum_of_places(places: Places | QuerySet) -> int:
+    """Compute the CRC of all images' names, and of their places or of the queries' positives."""
+    if isinstance(places, QuerySet):
+        names = (pathlib.Path(file).name for file in places.files)
+        return checksum([_text(names), places.queries, *places.positives, *places.near])
     return checksum([_text(places.files), places.place_start])
 
 

@@ -9,6 +9,7 @@ from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.places import Places
+from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
@@ -55,7 +56,7 @@ def read_start(
 def with_vocabulary_of(
     initial: Crisalad | None,
     config: TrainConfig,
-    places: Places,
+    places: Places | QuerySet,
     *,
     on_bad_image: OnBadImage = "stop",
     quiet: bool = False,

@@ -14,7 +14,14 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.losses import Loss, LossConfig, LossResult, LossValue, metric_loss
+from crisalad_jax.losses import (
+    Loss,
+    LossConfig,
+    LossResult,
+    LossValue,
+    metric_loss,
+    tuple_pairs,
+)
 from crisalad_jax.losses.base import call_loss, check_value
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import split_key, split_statistics
@@ -100,6 +107,8 @@ class StepConfig:
     """Number of classes of each group, where the loss classifies; an epoch trains one group."""
     batch_norm: Literal["batch", "stored"] = "batch"
     """See `TrainConfig.batch_norm`."""
+    tuples: bool = False
+    """Whether labels are those of mined tuples (`tuple_labels`), not of places."""
 
     def learning_rate(self, step: Int[Array, ""]) -> Float[Array, ""] | None:
         """Compute the learning rate of a step, from 0; None if the optimiser is passed in."""
@@ -249,6 +258,7 @@ def step_config(
         micro_batch=config.micro_batch,
         classes=classes,
         batch_norm=config.batch_norm,
+        tuples=config.mining.kind != "none",
     )
 
 
@@ -376,7 +386,8 @@ def train_step(
         )
         # On each device the whole loss: a thousandth of a step's work (docs/training.md).
         descriptors = devices.gather_images(descriptors)
-        result = _loss(descriptors, all_labels, all_valid, classifier, group, config)
+        dense = devices.gather_images(tokens.dense) if _reads_dense(config) else None
+        result = _loss(descriptors, dense, all_labels, all_valid, classifier, group, config)
         return result.loss, (result, tokens.transport, measured)
 
     def placed(tree: PyTree, *, whole: bool = False) -> PyTree:
@@ -447,8 +458,13 @@ def _gathered(
     return devices.gather_images((labels, valid, told))
 
 
+def _reads_dense(config: StepConfig) -> bool:
+    return isinstance(config.loss, LossConfig) and config.loss.kind.reads_dense
+
+
 def _loss(
     descriptors: Float[Array, "image descriptor"],
+    dense: Float[Array, "image feature local"] | None,
     labels: Int[Array, " image"],
     valid: Bool[Array, " image"],
     classifier: PyTree,
@@ -456,12 +472,20 @@ def _loss(
     config: StepConfig,
 ) -> LossResult:
     """Compute the loss of a batch, by the configuration or by a function that was passed in."""
+    pairs = tuple_pairs(labels, valid=valid) if config.tuples else None
     if isinstance(config.loss, LossConfig):
         classes = jnp.asarray(config.classes)[group] if config.classes else None
         return metric_loss(
-            descriptors, labels, config.loss, valid=valid, params=classifier, classes=classes
+            descriptors,
+            labels,
+            config.loss,
+            valid=valid,
+            params=classifier,
+            classes=classes,
+            pairs=pairs,
+            dense=dense,
         )
-    easy = metric_loss(descriptors, labels, valid=valid).easy_anchor_fraction
+    easy = metric_loss(descriptors, labels, valid=valid, pairs=pairs).easy_anchor_fraction
     value = call_loss(config.loss, descriptors, labels, valid)
     check_value(LossValue(value), getattr(config.loss, "__name__", "given"))
     return LossResult(value, easy)

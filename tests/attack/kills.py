@@ -235,7 +235,7 @@ TRAINING = Marks(
     {
         "opening the run": "crisalad_jax.training.run:Run.__init__",
         "loading a state": "crisalad_jax.checkpoints.train_state:StateStore.load",
-        "steps": "crisalad_jax.training.loop:_train_epoch",
+        "steps": "crisalad_jax.training.loop:_train_round",
         "saving": "crisalad_jax.training.run_files:RunFiles.save",
         "validating": "crisalad_jax.training.run:Run._validate",
         "keeping the best": "crisalad_jax.training.run_files:RunFiles.keep_if_best",

@@ -15,6 +15,7 @@ from crisalad_jax.training.recipes import (
     split_name,
     with_part,
 )
+from crisalad_jax.utils.notes import tell
 
 
 class ComparedMethod(NamedTuple):
@@ -52,7 +53,6 @@ another, on CriSALAD's backbone and with its training. Other names are recipes o
 second stage."""
 OLD_NAMES: Mapping[str, str] = {
     **RENAMED,
-    "patch-netvlad": "crisalad+patch-netvlad",
 }
 """Names of methods in earlier versions, but those that are now a recipe's or are a part's."""
 
@@ -77,6 +77,13 @@ def method_of(name: str, preset: str) -> ComparedMethod:
     """
     if name in METHODS:
         return METHODS[name]
+    if _mines(name):
+        tell(
+            f"--methods: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
+            f"{name} here, trained on places as all others are (`crisalad train` has the recipe)"
+        )
+        whole = f"crisalad+{name}"
+        return METHODS.get(whole, ComparedMethod(whole, whole))
     if name in RECIPES:
         return ComparedMethod(name, name)
     if name in OLD_NAMES:
@@ -96,7 +103,13 @@ def is_method(name: str) -> bool:
         >>> is_method("salad"), is_method("crisalad+gem"), is_method("megaloc")
         (True, True, False)
     """
-    return name in METHODS or name in RECIPES or name in OLD_NAMES or "+" in name or ":" in name
+    named = name in METHODS or name in RECIPES or name in OLD_NAMES
+    return (named and not _mines(name)) or "+" in name or ":" in name
+
+
+def _mines(name: str) -> bool:
+    """Return whether a name is that of a recipe that mines tuples."""
+    return name in RECIPES and recipe("b14", name).mining.kind != "none"
 
 
 def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> TrainConfig:

@@ -71,9 +71,13 @@ class SelaVprConfig(Aggregator):
     def apply(
         self, params: SelaVpr, features: Features, grid: tuple[int, int], *, key: Keys | None
     ) -> Tokens:
-        """Return the mean of all patches, a global token as wide as the backbone."""
+        """Return the mean of all patches; and in training, for its loss, the local features."""
         mean = generalised_mean(log_units(at_least_float32(features.patches)), params.p, axis=-2)
-        return Tokens.of_global(mean)
+        tokens = Tokens.of_global(mean)
+        if key is None:
+            return tokens
+        dense = local_features(params, features.patches, grid)
+        return tokens._replace(dense=dense.reshape(*dense.shape[:-3], -1, self.local))
 
 
 def init_upconv(key: PRNGKeyArray, d_in: int, d_out: int) -> Conv:

@@ -242,7 +242,7 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
 
     The recipe's model and kind of loss are kept, for they make its method. The optimiser, the
     loss's constants, the augmentation and the batches are those of `scratch`, in float32. All of
-    the model trains. A plug-in's augmentation is kept.
+    the model trains. A plug-in's augmentation is kept, and so are batches of mined tuples.
 
     Args:
         config: the recipe.
@@ -255,6 +255,11 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         'all'
     """
     loss = dataclasses.replace(config.loss, kind=config.loss.kind.from_scratch())
+    batches = {
+        "places_per_batch": TrainConfig.places_per_batch,
+        "images_per_place": 2,
+        "min_images": 2,
+    }
     built_in = type(config.augmentation).__module__.startswith("crisalad_jax.")
     return dataclasses.replace(
         config,
@@ -272,9 +277,7 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         augmentation=LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6)
         if built_in
         else config.augmentation,
-        places_per_batch=TrainConfig.places_per_batch,
-        images_per_place=2,
-        min_images=2,
+        **(batches if config.mining.kind == "none" else {}),
         batch_order="shuffled",
         epochs=150,
         validate_every=10,

@@ -1,4 +1,4 @@
-"""Recipes over ResNet and VGG: MixVPR, Conv-AP, BoQ, CosPlace, EigenPlaces and NetVLAD.
+"""Recipes over ResNet and VGG: MixVPR, Conv-AP, BoQ, CosPlace and EigenPlaces.
 
 Their sizes are the published ones for every preset but `tiny`, whose backbone is smaller.
 """
@@ -14,7 +14,6 @@ from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
-from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
@@ -26,7 +25,7 @@ _TINY = "tiny"
 _ADAM = OptimiserConfig(kind="adam", learning_rate=1e-5, end_lr_fraction=1.0, weight_decay=0.0)
 
 
-def _model(
+def model_over(
     preset: str,
     tiny: ModelConfig,
     backbone: Backbone,
@@ -52,7 +51,7 @@ def _model(
 def mixvpr(model: ModelConfig, preset: str) -> TrainConfig:
     """Make MixVPR's recipe, of amaralibey/MixVPR: ResNet-50, whose third stage trains, and SGD."""
     return TrainConfig(
-        model=_model(
+        model=model_over(
             preset,
             model,
             ResNetConfig(stages=3),
@@ -76,7 +75,7 @@ def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
     called Adam there, and is AdamW.
     """
     return TrainConfig(
-        model=_model(
+        model=model_over(
             preset,
             model,
             ResNetConfig(),
@@ -111,7 +110,7 @@ def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
     if preset != _TINY:
         queries = dataclasses.replace(queries, channels=512)
     return trained_as_boq(
-        _model(preset, model, ResNetConfig(stages=3), queries, (320, 320)),
+        model_over(preset, model, ResNetConfig(stages=3), queries, (320, 320)),
         trainable="last-2-blocks+head",
     )
 
@@ -151,7 +150,7 @@ def _classified(
 ) -> TrainConfig:
     aggregator: Aggregator = AGGREGATORS.make("cosplace", preset)
     return TrainConfig(
-        model=_model(
+        model=model_over(
             preset,
             model,
             ResNetConfig(layers=18),
@@ -171,33 +170,4 @@ def _classified(
         epochs=epochs,
         select_by="R@1",
         patience=None,
-    )
-
-
-@register_recipe("netvlad-gsv")
-def netvlad_gsv(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make NetVLAD's network and optimiser, of Nanne/pytorch-NetVlad, for places of GSV-Cities.
-
-    Its VGG-16 trains the last stage. Its own training mines triplets in Pittsburgh's images; here
-    batches, loss and augmentation are CriSALAD's, as for all methods of the paper's Table 1.
-    """
-    return TrainConfig(
-        model=_model(
-            preset,
-            model,
-            VggConfig(),
-            AGGREGATORS.make("netvlad", preset),
-            (480, 640),
-            compute_dtype="float32",
-        ),
-        optimiser=OptimiserConfig(
-            kind="sgd",
-            learning_rate=1e-4,
-            schedule="step",
-            step_epochs=5,
-            weight_decay=1e-3,
-        ),
-        trainable="last-1-blocks+head",
-        epochs=30,
-        patience=10,
     )

@@ -92,7 +92,7 @@ REFUSED = [
     (("--epochs", 0), ("--epochs: found 0, expected at least 1",)),
     (("--rerank", 1), ("--rerank: found 1, expected at least 2",)),
     (
-        ("--methods", "patch-netvlad", "--rerank", 7, "--image-size", 28, 28),
+        ("--methods", "crisalad+patch-netvlad", "--rerank", 7, "--image-size", 28, 28),
         ("patch-netvlad: found images of 28 x 28, expected at least 42 x 42",),
     ),
     (("--grouping", "alone"), ("grouping: found 'alone', expected one of",)),

@@ -1,0 +1,106 @@
+"""A training set of queries and a database, of which tuples are mined (NetVLAD, SelaVPR)."""
+
+import dataclasses
+import os
+import pathlib
+
+import numpy as np
+from jaxtyping import Int64
+
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.benchmarks.folders_on_disk import has_split
+from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
+from crisalad_jax.data.benchmarks.msls import is_msls
+from crisalad_jax.utils.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class QuerySet:
+    """Queries that have positives in a database, and these positives."""
+
+    name: str
+    root: pathlib.Path
+    files: tuple[str, ...]
+    """Image -> path, as text: the database, then all queries."""
+    database: int
+    """Number of database images, the first of `files`."""
+    queries: Int64[np.ndarray, " query"]
+    """Image of each query that has positives."""
+    positives: tuple[Int64[np.ndarray, " _"], ...]
+    """Query -> database images that show its place, at least one, ascending."""
+    near: tuple[Int64[np.ndarray, " _"], ...]
+    """Query -> database images that are no negatives, ascending; its positives are among them."""
+
+    def path(self, image: int | np.integer) -> pathlib.Path:
+        """Return the path of one image."""
+        return pathlib.Path(self.files[image])
+
+
+def read_query_set(
+    root: str | os.PathLike[str],
+    *,
+    positive_radius: float = 10.0,
+    negative_radius: float = 25.0,
+    images: str | os.PathLike[str] | None = None,
+) -> QuerySet:
+    r"""Read the training split of a set that `open_benchmark` reads, such as pitts30k_train.mat.
+
+    Args:
+        root: a folder or file; of a folder with several splits, `train` is taken.
+        positive_radius: in metres, inclusive.
+        negative_radius: in metres; database images within it are no negatives.
+        images: the folder of the images that a file names.
+
+    Returns:
+        The queries with at least one positive.
+
+    Raises:
+        InputError: what `open_benchmark` raises; the set has neither positions nor ground truth, or
+            no query has a positive.
+
+    Example:
+        >>> import shutil
+        >>> for side in ("queries", "database"):
+        ...     _ = shutil.copytree(pictures, folder / "set" / side)
+        >>> lines = ["query,database", *(f"{number}.png,{number}.png" for number in range(4))]
+        >>> _ = (folder / "set" / "ground_truth.csv").write_text("\n".join(lines))
+        >>> read_query_set(folder / "set").queries.tolist()
+        [4, 5, 6, 7]
+    """
+    root = pathlib.Path(root)
+    split = "train" if root.is_dir() and (has_split(root) or is_msls(root)) else None
+    check_radius(positive_radius)
+    check_radius(negative_radius)
+    benchmark = open_benchmark(root, split, images=images)
+    positives, near = _matches(benchmark, positive_radius, negative_radius)
+    kept = [query for query, matches in enumerate(positives) if matches.size]
+    if not kept:
+        raise InputError(
+            f"{root}: found no query of {len(benchmark.queries)} with a database image within "
+            f"{positive_radius:g} m, expected some"
+        )
+    count = len(benchmark.database)
+    return QuerySet(
+        name=benchmark.name,
+        root=benchmark.root,
+        files=tuple(map(str, (*benchmark.database, *benchmark.queries))),
+        database=count,
+        queries=count + np.array(kept, np.int64),
+        positives=tuple(positives[query] for query in kept),
+        near=tuple(near[query] for query in kept),
+    )
+
+
+_Matches = tuple[Int64[np.ndarray, " _"], ...]
+
+
+def _matches(
+    benchmark: Benchmark, positive_radius: float, negative_radius: float
+) -> tuple[_Matches, _Matches]:
+    """Find the positives, and what is no negative, of all queries."""
+    there, asked = benchmark.database_positions, benchmark.query_positions
+    if there is None or asked is None:
+        truth = benchmark.ground_truth()
+        return truth, truth
+    positives, near = (within(there, asked, each) for each in (positive_radius, negative_radius))
+    return positives, near

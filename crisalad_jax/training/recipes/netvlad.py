@@ -1,0 +1,86 @@
+"""NetVLAD and Patch-NetVLAD over VGG-16, of Nanne/pytorch-NetVlad and QVPR/Patch-NetVLAD."""
+
+import dataclasses
+
+from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.backbones.vgg import VggConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
+from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.convolutional import model_over
+
+MARGIN = 0.1**0.5
+"""The code squares distances in its mind: the root of 0.1 is the margin of Euclidean ones."""
+_SGD = OptimiserConfig(
+    kind="sgd", learning_rate=1e-4, schedule="step", step_epochs=5, weight_decay=1e-3
+)
+
+
+@register_recipe("netvlad")
+def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make NetVLAD's recipe, of Nanne/pytorch-NetVlad: tuples mined in pitts30k_train.mat.
+
+    VGG-16 trains its last stage. 4 tuples of 12 images make a batch. Every 1,000 queries all images
+    are described anew, and each query takes the 10 hardest of 1,000 random negatives and its last
+    ones, if they violate the margin.
+    """
+    mining = MiningConfig(kind="whole", negatives=10, margin=MARGIN)
+    return TrainConfig(
+        model=model_over(
+            preset,
+            model,
+            VggConfig(),
+            AGGREGATORS.make("netvlad", preset),
+            (480, 640),
+            compute_dtype="float32",
+        ),
+        loss=LossConfig(kind=TripletConfig(margin=MARGIN, average="all"), miner="none"),
+        optimiser=_SGD,
+        trainable="last-1-blocks+head",
+        augmentation=NoAugmentation(),
+        mining=mining,
+        places_per_batch=4,
+        images_per_place=2 + mining.negatives,
+        epochs=30,
+        patience=10,
+    )
+
+
+@register_recipe("patch-netvlad")
+def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make the recipe of Patch-NetVLAD's Mapillary weights: NetVLAD's, of 16 clusters, on MSLS.
+
+    Tuples have 5 negatives, the hardest of 1,000 for all queries of a round. The code takes queries
+    at night or sideways more often than others, here all alike. It looks for violations by inner
+    products with a sign that nearly every query passes; here every one does. Re-ranking by patches
+    learns nothing, and `crisalad pca --whiten` fits the whitening.
+    """
+    config = netvlad(model, preset)
+    mining = MiningConfig(kind="sample", negatives=5)
+    aggregator = config.model.aggregator
+    if preset != "tiny":
+        aggregator = dataclasses.replace(aggregator, clusters=16)
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, aggregator=aggregator),
+        mining=mining,
+        images_per_place=2 + mining.negatives,
+    )
+
+
+@register_recipe("netvlad-gsv")
+def netvlad_gsv(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make NetVLAD's network and optimiser for places of GSV-Cities.
+
+    Batches, loss and augmentation are CriSALAD's, as for all methods of the paper's Table 1.
+    """
+    return TrainConfig(
+        model=netvlad(model, preset).model,
+        optimiser=_SGD,
+        trainable="last-1-blocks+head",
+        epochs=30,
+        patience=10,
+    )

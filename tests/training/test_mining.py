@@ -1,0 +1,497 @@
+"""Mined tuples: their pairs and losses against torch, the mining by hand, and runs that resume."""
+
+import dataclasses
+import itertools
+import json
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+
+from crisalad_jax import recipe
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.data.places import read_places
+from crisalad_jax.data.query_set import QuerySet, read_query_set
+from crisalad_jax.experiments.train import train
+from crisalad_jax.losses import LossConfig, Role, metric_loss, tuple_labels, tuple_pairs
+from crisalad_jax.losses.selavpr import SelaVprLoss
+from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
+from crisalad_jax.training import run as run_module
+from crisalad_jax.training.batches import batches_of_tuples, rounds_of
+from crisalad_jax.training.config import MiningConfig, TrainConfig
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.mining import Mined, draw_queries, mine_tuples, no_hardest
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import RECIPE, write_picture
+
+ROLES = np.array([[0, 1, 2, 2, 2], [0, 1, 2, 3, 3], [0, 1, 3, 3, 3]])
+"""Three tuples: of three negatives, of one, and of none."""
+
+
+def unit(x: np.ndarray) -> np.ndarray:
+    return (x / np.linalg.norm(x, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def batch(seed: int, dim: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """Descriptors of the tuples of ROLES, and their labels."""
+    drawn = np.random.default_rng(seed).standard_normal((ROLES.size, dim))
+    return unit(drawn), tuple_labels(ROLES).ravel()
+
+
+def triplets() -> list[tuple[int, int, int]]:
+    """(query, positive, negative) of ROLES, by a loop."""
+    width = ROLES.shape[1]
+    return [
+        (start, start + 1, start + place)
+        for start, row in zip(itertools.count(0, width), ROLES, strict=False)
+        for place, role in enumerate(row)
+        if role == Role.NEGATIVE
+    ]
+
+
+def test_pairs_of_tuples_by_a_loop():
+    _, labels = batch(0)
+    pairs = tuple_pairs(jnp.asarray(labels))
+    expected = {(query, negative) for query, _, negative in triplets()}
+    assert {tuple(pair) for pair in np.argwhere(pairs.negatives).tolist()} == expected
+    assert np.argwhere(pairs.positives).tolist() == [[0, 1], [5, 6], [10, 11]]
+    valid = np.ones(len(labels), bool)
+    valid[[1, 5]] = False
+    pairs = tuple_pairs(jnp.asarray(labels), valid=jnp.asarray(valid))
+    assert np.argwhere(pairs.positives).tolist() == [[10, 11]]
+    assert np.argwhere(pairs.negatives).tolist() == [[0, 2], [0, 3], [0, 4]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_triplets_of_tuples_are_torchs(seed):
+    """Nanne/pytorch-NetVlad sums torch's loss of each triplet and divides by their number.
+
+    Torch adds 1e-6 to each of 8 differences, which moves a distance by at most 3e-6.
+    """
+    descriptors, labels = batch(seed)
+    margin = 0.1**0.5
+    config = LossConfig(kind=TripletConfig(margin, average="all"), miner="none")
+
+    def loss(descriptors):
+        pairs = tuple_pairs(jnp.asarray(labels))
+        return metric_loss(descriptors, jnp.asarray(labels), config, pairs=pairs).loss
+
+    found, gradient = jax.value_and_grad(loss)(jnp.asarray(descriptors))
+    theirs = torch.tensor(descriptors, requires_grad=True)
+    summed = torch.nn.TripletMarginLoss(margin=margin, p=2, reduction="sum")
+    total = sum(summed(*(theirs[[image]] for image in each)) for each in triplets())
+    expected = torch.as_tensor(total / len(triplets()))
+    expected.backward()
+    np.testing.assert_allclose(found, expected.item(), rtol=0, atol=1e-5)
+    assert theirs.grad is not None
+    # Ours differentiates 2 - 2 x.y, theirs |x - y|^2: they differ along the unit vectors alone.
+    along = (np.asarray(gradient) - theirs.grad.numpy()) * descriptors
+    rest = np.asarray(gradient) - theirs.grad.numpy() - along.sum(1, keepdims=True) * descriptors
+    np.testing.assert_allclose(rest, 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_loss_of_selavpr_by_a_loop_in_torch(seed):
+    """Equations of Lu et al. (ICLR 2024), section 3.3, image by image.
+
+    Descriptors as above; local similarities are means of inner products of order 1 in float32.
+    """
+    descriptors, labels = batch(seed)
+    generator = np.random.default_rng(seed)
+    dense = unit(generator.standard_normal((ROLES.size, 30, 5)))
+    config = LossConfig(kind=SelaVprLoss(), miner="none")
+
+    def loss(dense):
+        pairs = tuple_pairs(jnp.asarray(labels))
+        arrays = jnp.asarray(descriptors), jnp.asarray(labels)
+        return metric_loss(*arrays, config, pairs=pairs, dense=dense).loss
+
+    found, gradient = jax.value_and_grad(loss)(jnp.asarray(dense))
+    theirs = torch.tensor(dense, requires_grad=True)
+
+    def similarity(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        products = first @ second.T
+        pairs = [
+            (i, int(products[i].argmax()))
+            for i in range(len(first))
+            if int(products[:, int(products[i].argmax())].argmax()) == i
+        ]
+        return torch.stack([(first[i] * second[j]).sum() for i, j in pairs]).mean()
+
+    total = torch.zeros(())
+    summed = torch.nn.TripletMarginLoss(margin=0.1, p=2, reduction="sum")
+    images = torch.tensor(descriptors)
+    for query, positive, negative in triplets():
+        total = total + summed(*(images[[image]] for image in (query, positive, negative)))
+        near, far = (similarity(theirs[query], theirs[other]) for other in (positive, negative))
+        total = total + torch.relu(far - near)
+    expected = total / len(triplets())
+    expected.backward()
+    np.testing.assert_allclose(found, expected.item(), rtol=0, atol=1e-5)
+    assert theirs.grad is not None
+    assert np.abs(theirs.grad.numpy()).max() > 0
+    np.testing.assert_allclose(gradient, theirs.grad.numpy(), rtol=0, atol=1e-6)
+
+
+def test_a_loss_of_tuples_refuses_places_and_models_without_local_features():
+    descriptors, labels = batch(0)
+    config = LossConfig(kind=SelaVprLoss(), miner="none")
+    arrays = jnp.asarray(descriptors), jnp.asarray(labels)
+    with pytest.raises(InputError, match="loss selavpr: found places, expected the pairs of mined"):
+        metric_loss(*arrays, config)
+    with pytest.raises(InputError, match="loss selavpr: found no local features"):
+        metric_loss(*arrays, config, pairs=tuple_pairs(arrays[1]))
+
+
+def line_set(database: list[float], queries: list[float]) -> QuerySet:
+    """A set on a street: positions in metres, of which 10 are a positive's and 25 not a negative's.
+
+    Images have no files; their descriptors are the tests' own.
+    """
+    apart = np.abs(np.subtract.outer(queries, database))
+    kept = [q for q, row in enumerate(apart) if (row <= 10).any()]
+    return QuerySet(
+        "street",
+        pathlib.Path("street"),
+        tuple(f"{n}.jpg" for n in range(len(database) + len(queries))),
+        len(database),
+        len(database) + np.array(kept, np.int64),
+        tuple(np.flatnonzero(apart[q] <= 10) for q in kept),
+        tuple(np.flatnonzero(apart[q] <= 25) for q in kept),
+    )
+
+
+STREET = line_set([0, 5, 20, 100, 200, 300, 400], [1, 101, 1000])
+# On a line: the query at 1 m has its positives at 0.3 and 0.1, something near at 0.05, which is no
+# negative, and negatives at 0.2, 0.9, 0.35 and 2.
+LINE = np.array([0.3, 0.1, 0.05, 0.2, 0.9, 0.35, 2.0, 0.0, 0.21, 9.0])
+
+
+def on_the_line(images: np.ndarray) -> np.ndarray:
+    return np.stack([LINE[images], np.zeros(len(images))], axis=1).astype(np.float32)
+
+
+def mined(config: MiningConfig, describe=on_the_line, before=None, seed=0, step=0) -> Mined:
+    before = no_hardest(config, STREET) if before is None else before
+    chosen = np.arange(len(STREET.queries))
+    return mine_tuples(config, STREET, chosen, before, describe, seed=seed, step=step)
+
+
+@pytest.mark.parametrize("kind", ["whole", "sample"])
+def test_tuples_by_hand(kind):
+    found = mined(MiningConfig(kind=kind, negatives=3, candidates=7, margin=0.15))
+    # Query 7: its nearest positive is 1, at 0.1; 3 (0.2) violates 0.1 + 0.15, 5 and 4 do not.
+    assert found.images[0].tolist() == [7, 1, 3, 5, 4]
+    assert found.roles[0].tolist() == [0, 1, 2, 3, 3]
+    # Query 8, at 0.21 and 101 m: its positive is 3, at 0.01; 0 (0.09), 1 (0.11) and 5 (0.14)
+    # violate 0.01 + 0.15.
+    assert found.images[1].tolist() == [8, 3, 0, 1, 5]
+    assert found.roles[1].tolist() == [0, 1, 2, 2, 2]
+    hardest = mined(MiningConfig(kind=kind, negatives=3, candidates=7))
+    assert hardest.roles.tolist() == [[0, 1, 2, 2, 2]] * 2
+    assert found.hardest[0].tolist() == [3, -1, -1]
+
+
+def test_negatives_of_earlier_rounds_are_candidates_again():
+    """One candidate is drawn of seven; the hardest before comes to it."""
+    config = MiningConfig(kind="whole", negatives=1, candidates=1)
+    hardest, seen = None, []
+    for step in range(30):
+        round_ = mined(config, before=hardest, step=step)
+        hardest = round_.hardest
+        seen.append(abs(LINE[round_.images[0, 2]] - LINE[7]) if round_.roles[0, 2] == 2 else 9)
+    assert seen == sorted(seen, reverse=True)  # never easier again
+    assert seen[-1] == pytest.approx(0.2)  # and once all were drawn, the hardest of all
+
+
+def test_too_few_candidates_leave_spare_images():
+    found = mined(MiningConfig(kind="whole", negatives=6, candidates=7))
+    # Four database images are negatives of the first query; its positive fills the tuple.
+    assert found.images[0].tolist() == [7, 1, 3, 5, 4, 6, 1, 1]
+    assert found.roles[0].tolist() == [0, 1, 2, 2, 2, 2, 3, 3]
+
+
+def test_images_that_cannot_be_read_are_no_negatives():
+    def describe(images):
+        rows = on_the_line(images)
+        rows[np.isin(images, (1, 3))] = np.nan
+        return rows
+
+    found = mined(MiningConfig(kind="whole", negatives=3, candidates=7), describe)
+    assert found.images[0].tolist() == [7, 0, 5, 4, 6]
+
+
+@pytest.mark.parametrize("kind", ["whole", "sample"])
+def test_mining_is_that_of_all_distances(kind):
+    """Random descriptors and places, against a sort of all distances in float64."""
+    generator = np.random.default_rng(4)
+    queries = line_set(
+        generator.uniform(0, 2000, 120).tolist(), generator.uniform(0, 2000, 30).tolist()
+    )
+    descriptors = unit(generator.standard_normal((150, 16)))
+    config = MiningConfig(kind=kind, negatives=5, candidates=120)
+    chosen = generator.permutation(len(queries.queries))
+    start = no_hardest(config, queries)
+    found = mine_tuples(config, queries, chosen, start, lambda i: descriptors[i], seed=0, step=0)
+    wide = descriptors.astype(np.float64)
+    for query, row in zip(chosen, found.images, strict=True):
+        far = np.linalg.norm(wide - wide[row[0]], axis=1)
+        assert row[0] == queries.queries[query]
+        assert row[1] == min(queries.positives[query], key=lambda image: far[image])
+        others = np.setdiff1d(np.arange(120), queries.near[query])
+        assert row[2:].tolist() == sorted(others, key=lambda image: far[image])[:5]
+
+
+def test_every_query_has_its_turn_in_an_epoch():
+    config = MiningConfig(kind="whole")
+    rounds = [draw_queries(config, 30, 7, seed=1, epoch=2, number=n) for n in range(4)]
+    assert len(set(np.concatenate(rounds).tolist())) == 28
+    again = draw_queries(config, 30, 7, seed=1, epoch=3, number=0)
+    assert again.tolist() != rounds[0].tolist()
+    drawn = dataclasses.replace(config, queries_per_epoch=100)
+    rounds = [draw_queries(drawn, 30, 20, seed=1, epoch=0, number=n) for n in range(5)]
+    assert all(len(set(each.tolist())) == 20 for each in rounds)
+    assert rounds[0].tolist() != rounds[1].tolist()
+
+
+def test_rounds_of_pitts30k_are_the_codes():
+    """Nanne splits n queries into ceil(n / 1,000) parts; pitts30k_train has some 7,320."""
+    config = recipe("b14", "netvlad")
+    street = dataclasses.replace(STREET, queries=np.arange(7320))
+    assert rounds_of(config, street) == (8, 915 // 4)
+    selavpr = recipe("l14", "selavpr")
+    assert rounds_of(selavpr, street) == (30, 250)
+    with pytest.raises(InputError, match="street: found 2 queries with positives for a round, exp"):
+        rounds_of(config, STREET)
+
+
+def test_recipes_are_the_codes():
+    """Constants of Nanne/pytorch-NetVlad, QVPR/Patch-NetVLAD and Lu-Feng/SelaVPR."""
+    netvlad, patches, selavpr = (
+        recipe(preset, name)
+        for preset, name in (("b14", "netvlad"), ("b14", "patch-netvlad"), ("l14", "selavpr"))
+    )
+    for config in netvlad, patches:
+        assert config.model.image_size == (480, 640)
+        assert config.loss.kind == TripletConfig(0.1**0.5, "all")
+        sgd = config.optimiser
+        assert (sgd.kind, sgd.learning_rate, sgd.momentum) == ("sgd", 1e-4, 0.9)
+        assert (sgd.weight_decay, sgd.step_epochs, sgd.step_gamma) == (1e-3, 5, 0.5)
+        assert (config.epochs, config.patience, config.select_by) == (30, 10, "R@5")
+        assert (config.mining.positive_radius, config.mining.negative_radius) == (10, 25)
+        assert config.places_per_batch == 4
+    assert (netvlad.mining.kind, netvlad.images_per_place) == ("whole", 12)
+    assert (patches.mining.kind, patches.images_per_place) == ("sample", 7)
+    assert netvlad.model.descriptor_dim == 64 * 512
+    assert patches.model.descriptor_dim == 16 * 512
+    assert (selavpr.places_per_batch, selavpr.images_per_place) == (4, 4)
+    assert (selavpr.model.descriptor_dim, selavpr.model.image_size) == (1024, (224, 224))
+    adam = selavpr.optimiser
+    assert (adam.kind, adam.learning_rate, adam.weight_decay) == ("adam", 1e-5, 0)
+    assert (selavpr.epochs, selavpr.patience, selavpr.select_by) == (50, 3, "R@5")
+    assert selavpr.trainable == "adapters+head"
+
+
+def write_street(root: pathlib.Path) -> pathlib.Path:
+    """Ten places, 100 m apart, of two database images and a query each, with @UTM names."""
+    for part, offsets in (("database", (0, 6)), ("queries", (3,))):
+        for place in range(10):
+            for offset in offsets:
+                name = f"@{500_000 + 100 * place + offset:09.2f}@5000000.00@{part}@.jpg"
+                seed = 900 + place
+                write_picture(root / "images" / "train" / part / name, seed, noise=20.0)
+    return root
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory) -> pathlib.Path:
+    return write_street(tmp_path_factory.mktemp("street"))
+
+
+CONFIG = dataclasses.replace(
+    RECIPE,
+    model=dataclasses.replace(RECIPE.model, aggregator=SelaVprConfig(hidden=8, local=4)),
+    loss=LossConfig(kind=SelaVprLoss(margin=2.0), miner="none"),  # which every triplet violates
+    augmentation=NoAugmentation(),
+    mining=MiningConfig(kind="whole", negatives=2, candidates=5, queries_per_round=5),
+    places_per_batch=2,
+    images_per_place=4,
+    epochs=2,
+)
+"""Two rounds an epoch, of two batches of two tuples."""
+
+
+def test_query_sets_are_read_by_positions(street):
+    found = read_query_set(street)
+    assert (found.database, len(found.files)) == (20, 30)
+    assert found.queries.tolist() == list(range(20, 30))
+    assert [each.tolist() for each in found.positives] == [[2 * n, 2 * n + 1] for n in range(10)]
+    assert [each.tolist() for each in found.near] == [[2 * n, 2 * n + 1] for n in range(10)]
+    # 3.5 m reach both of a place's images; 103 m the first or both of the next as well.
+    wide = read_query_set(street, positive_radius=3.5, negative_radius=97)
+    assert wide.near[1].tolist() == [1, 2, 3, 4]
+    assert wide.positives[1].tolist() == [2, 3]
+    with pytest.raises(InputError, match="found no query of 10 with a database image within 2 m"):
+        read_query_set(street, positive_radius=2)
+
+
+def test_batches_hold_the_tuples_and_their_roles(street):
+    queries = read_query_set(street)
+    images = np.array([[20, 0, 4, 6], [21, 2, 8, 0], [22, 4, 0, 2], [23, 6, 2, 0]], np.int32)
+    roles = np.array([[0, 1, 2, 2], [0, 1, 2, 3], [0, 1, 2, 2], [0, 1, 3, 3]], np.int32)
+    round_ = Mined(0, images, roles, no_hardest(CONFIG.mining, queries))
+    first, second = batches_of_tuples(CONFIG, queries, round_)
+    assert first.indices.tolist() == images[:2].ravel().tolist()
+    assert second.labels.tolist() == [8, 9, 10, 10, 12, 13, 15, 15]
+    (again,) = batches_of_tuples(CONFIG, queries, round_, start_step=1)
+    np.testing.assert_array_equal(again.images, second.images)
+    (half, _) = batches_of_tuples(CONFIG, queries, round_, part=(1, 2))
+    np.testing.assert_array_equal(half.images, first.images[4:])
+
+
+class Interrupted(Exception):
+    """Stands for a kill: nothing is saved on its way out."""
+
+
+def lines_of(out: pathlib.Path) -> list[dict]:
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    times = "images_per_second", "waited_for_images"
+    return [{k: v for k, v in line.items() if k not in times} for line in lines]
+
+
+@pytest.fixture(scope="module")
+def whole(street, tmp_path_factory) -> pathlib.Path:
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    assert fit(CONFIG, read_query_set(street), out, quiet=True).steps == 8
+    return out
+
+
+def test_a_run_learns_from_its_tuples(whole):
+    lines = lines_of(whole)
+    assert [line["epoch"] for line in lines] == [1] * 4 + [2] * 4
+    assert all(np.isfinite(line["loss"]) for line in lines)
+    assert all(line["gradient_norm"] > 0 for line in lines)
+    with np.load(whole / "mined.npz") as file:
+        assert int(file["step"]) == 6
+
+
+@pytest.mark.parametrize("saves", ["rarely", "always"])
+@pytest.mark.parametrize("call", [1, 2, 3, 4, 6])
+def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
+    street, whole, tmp_path, monkeypatch, call, saves
+):
+    """Ends at a step, or (call 1) as the first tuples were just mined."""
+    queries, out = read_query_set(street), tmp_path / "run"
+    step, calls = run_module.train_step, itertools.count(1)
+
+    def interrupted(*arguments):
+        if next(calls) == call:
+            raise Interrupted
+        return step(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "train_step", interrupted)
+        if saves == "always":
+            patch.setattr(run_module, "SAVE_SECONDS", -1)
+        with pytest.raises(Interrupted):
+            fit(CONFIG, queries, out, quiet=True)
+    fit(CONFIG, queries, out, quiet=True)
+    assert lines_of(out) == lines_of(whole)
+    for mine, theirs in zip(
+        *(jax.tree.leaves(load_weights(each / "last.safetensors")[0]) for each in (out, whole)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(mine, theirs)
+    assert not [path for path in out.rglob("*") if "tmp" in path.name]
+
+
+@pytest.mark.parametrize("harm", ["gone", "cut", "other"])
+def test_tuples_that_are_lost_are_told(street, tmp_path, monkeypatch, harm):
+    queries, out = read_query_set(street), tmp_path / "run"
+    step, calls = run_module.train_step, itertools.count(1)
+
+    def interrupted(*arguments):
+        if next(calls) == 4:
+            raise Interrupted
+        return step(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "train_step", interrupted)
+        patch.setattr(run_module, "SAVE_SECONDS", -1)
+        with pytest.raises(Interrupted):
+            fit(CONFIG, queries, out, quiet=True)
+    path = out / "mined.npz"
+    if harm == "gone":
+        path.unlink()
+        message = r"mined.npz: found no such file, expected those of step 2; the run cannot go on"
+    elif harm == "cut":
+        path.write_bytes(path.read_bytes()[:99])
+        message = r"mined.npz: cannot be read as the tuples of a round: "
+    else:
+        with np.load(path) as file:
+            np.savez(path, **{**file, "images": file["images"][:1]})
+        message = r"mined.npz: found tuples of shape \(1, 4\) and negatives of \(10, 2\), expected"
+    with pytest.raises(InputError, match=message):
+        fit(CONFIG, queries, out, quiet=True)
+
+
+def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
+    out = tmp_path / "run"
+    city = read_places(shared / "city", min_images=2)
+    with pytest.raises(InputError, match="places: found places with mining 'whole', expected a Q"):
+        fit(CONFIG, city, out, quiet=True)
+    with pytest.raises(InputError, match="places: found a QuerySet with mining 'none', expected"):
+        fit(RECIPE, read_query_set(street), out, quiet=True)
+    with pytest.raises(InputError, match="found places in the layout of GSV-Cities, expected quer"):
+        train(CONFIG, shared / "city", out, quiet=True)
+    with pytest.raises(InputError, match="--data-images: found for places"):
+        train(RECIPE, shared / "city", out, images=tmp_path, quiet=True)
+    assert not out.exists()
+
+
+def test_a_set_without_positions_goes_by_its_ground_truth(tmp_path):
+    for side in ("database", "queries"):
+        for number in range(3):
+            write_picture(tmp_path / side / f"{number}.jpg", number)
+    with pytest.raises(InputError, match="no ground truth, nothing to score"):
+        read_query_set(tmp_path)
+    table = "query,database\n0.jpg,1.jpg\n0.jpg,2.jpg\n1.jpg,\n2.jpg,0.jpg\n"
+    (tmp_path / "ground_truth.csv").write_text(table)
+    found = read_query_set(tmp_path)
+    assert found.queries.tolist() == [3, 5]
+    assert [each.tolist() for each in found.near] == [[1, 2], [0]]
+
+
+@pytest.mark.parametrize(
+    ("config", "changes", "message"),
+    [
+        (MiningConfig(), {"negatives": 0}, r"MiningConfig\.negatives: found 0"),
+        (
+            MiningConfig(),
+            {"candidates": 9},
+            r"MiningConfig\.candidates: found 9, expected at l",
+        ),
+        (MiningConfig(), {"positive_radius": 30.0}, r"positive_radius: found 30.0 beside"),
+        (MiningConfig(), {"margin": -1.0}, r"MiningConfig\.margin: found -1.0"),
+        (
+            CONFIG,
+            {"images_per_place": 5},
+            r"images_per_place: found 5 with mined tuples, exp",
+        ),
+        (CONFIG, {"mining": MiningConfig()}, r"mining: found 'none' for loss selavpr, expected 'w"),
+    ],
+)
+def test_a_configuration_that_does_not_fit_is_refused(config, changes, message):
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(config, **changes)
+
+
+def test_a_loss_of_classes_takes_no_tuples():
+    classes = recipe("tiny", "cosplace").loss
+    with pytest.raises(InputError, match="mining: found 'whole' for loss large-margin-cosine"):
+        TrainConfig(loss=classes, mining=MiningConfig(kind="whole"), images_per_place=12)
