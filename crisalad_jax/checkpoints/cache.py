@@ -17,7 +17,7 @@ import jax
 from crisalad_jax.checkpoints.layouts import LAYOUTS
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.torch_io import Checkpoint, read_checkpoint, read_vocabulary
-from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.checkpoints.weights import CACHE_RECORD, save_weights
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
@@ -29,7 +29,6 @@ from crisalad_jax.utils.version import VERSION
 CACHE, OFFLINE, MIRROR = "CRISALAD_CACHE", "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
 """Variables of the environment: the cache's folder, whether to use no network, and where to look
 for files by their names before their published addresses."""
-_RECORD = "record.json"
 
 
 def cache_folder() -> pathlib.Path:
@@ -111,13 +110,13 @@ def _is_ready(model: Published) -> bool:
     if not record.items() >= _stamp(published).items():  # as after a copy of the folder
         _check_same(model, record, sha256_of(published))
         with contextlib.suppress(InputError):  # where the cache is for reading alone
-            write_json(_folder(model) / _RECORD, record | _stamp(published))
+            write_json(_folder(model) / CACHE_RECORD, record | _stamp(published))
     return record["version"] == VERSION
 
 
 def _record(model: Published) -> dict[str, Any] | None:
     """Read what is known of the published file; None before its first download."""
-    path = _folder(model) / _RECORD
+    path = _folder(model) / CACHE_RECORD
     if not path.exists():
         return None
     record = read_json(path, "the record of a download", must=lambda _: True)
@@ -246,4 +245,4 @@ def _convert(
         "sha256": digest,
         "version": VERSION,
     }
-    write_json(_folder(model) / _RECORD, known | _stamp(published))
+    write_json(_folder(model) / CACHE_RECORD, known | _stamp(published))

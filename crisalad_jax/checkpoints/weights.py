@@ -19,7 +19,7 @@ from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
-from crisalad_jax.utils.checksums import checked_safetensors
+from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, is_html
 from crisalad_jax.utils.notes import tell
@@ -92,6 +92,10 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
         return False
 
 
+CACHE_RECORD = "record.json"
+"""File beside the weights of a published model in the cache (`checkpoints.cache`)."""
+
+
 def load_extras(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Return the `extras` that `save_weights` wrote."""
     with safetensors.safe_open(path, framework="numpy") as file:
@@ -129,8 +133,15 @@ def load_weights(
         crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
     """
     path = pathlib.Path(path)
-    with checked_safetensors(path, verify=verify):
-        params, config, metadata = _load(path, expected)
+    try:
+        with checked_safetensors(path, verify=verify):
+            params, config, metadata = _load(path, expected)
+    except ChangedFileError as error:
+        if not path.with_name(CACHE_RECORD).is_file():
+            raise
+        raise InputError(
+            f"{error}; it is in the cache: once it is removed, the same command makes it anew"
+        ) from error
     same_version = metadata.get("version") == VERSION
     changed = changed_sources(config, metadata.get("parts", {}), same_version)
     if changed:
