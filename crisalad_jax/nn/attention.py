@@ -53,7 +53,7 @@ class _Axes(NamedTuple):
 
 # With the heads in front every product is a plain batched matmul. Queries and outputs are columns,
 # and the softmax runs down columns, which is faster on a CPU.
-_COLUMNS = _Axes("...di", "...jd", "...ji")
+COLUMNS = _Axes("...di", "...jd", "...ji")
 # As the linear layer leaves them: an accelerator's compiler has no use for the copies.
 _ROWS = _Axes("...ihd", "...jhd", "...hji")
 _EIGHT = 8
@@ -118,17 +118,17 @@ def attention(
     queries, keys, values = _split_heads(qkv, heads, length, rotation)
     queries = queries / math.sqrt(dim // heads)
     seen = None if mask is None else mask.T
-    precision = _precision(x.dtype)
+    precision = rule_precision(x.dtype)
     if target().platform != "cpu":
-        mixed = _mix(queries, keys, values, seen, dropout_mask, _ROWS, precision)
+        mixed = mix(queries, keys, values, seen, dropout_mask, _ROWS, precision)
         return linear(params.proj, mixed.reshape(x.shape))
-    mixed = _mix(
+    mixed = mix(
         jnp.moveaxis(queries, -3, -1),
         jnp.moveaxis(keys, -3, -2),
         jnp.moveaxis(values, -3, -2),
         seen,
         dropout_mask,
-        _COLUMNS,
+        COLUMNS,
         precision,
     )
     return linear(params.proj, jnp.moveaxis(mixed, -1, -3).reshape(x.shape))
@@ -198,7 +198,7 @@ def _pallas(
         flat = [part.reshape(*batch, tokens, width // 3) for part in parts]
         qkv = jnp.concatenate(flat, axis=-1)
     sequences = qkv.reshape(-1, tokens, width)
-    mixed = attention_pallas.attend(sequences, heads, length, _precision(qkv.dtype), mesh)
+    mixed = attention_pallas.attend(sequences, heads, length, rule_precision(qkv.dtype), mesh)
     return mixed.reshape(*batch, tokens, width // 3)
 
 
@@ -260,16 +260,16 @@ def cross_attention(
     offered = linear(Linear(weight[:, dim:], bias[dim:]), x)
     offered = offered.reshape(*batch, tokens, 2 * heads, dim // heads)
     asked = asked.reshape(*asked.shape[:-1], heads, dim // heads)
-    precision = _precision(x.dtype)
+    precision = rule_precision(x.dtype)
     if target().platform != "cpu":
         keys, values = jnp.split(offered, 2, axis=-2)
         asked = jnp.broadcast_to(asked, (*batch, *asked.shape[-3:]))
-        mixed = _mix(asked, keys, values, None, None, _ROWS, precision)
+        mixed = mix(asked, keys, values, None, None, _ROWS, precision)
     else:
         keys, values = jnp.split(jnp.moveaxis(offered, -3, -2), 2, axis=-3)
         columns = jnp.moveaxis(asked, -3, -1)
         columns = jnp.broadcast_to(columns, (*batch, *columns.shape[-3:]))
-        mixed = _mix(columns, keys, values, None, None, _COLUMNS, precision)
+        mixed = mix(columns, keys, values, None, None, COLUMNS, precision)
         mixed = jnp.moveaxis(mixed, -1, -3)
     return linear(params.proj, mixed.reshape(*batch, queries.shape[-2], dim))
 
@@ -302,7 +302,7 @@ def _wide(x: Array) -> Any:
     return jnp.promote_types(x.dtype, jnp.float32)
 
 
-def _precision(dtype: Any) -> str | None:
+def rule_precision(dtype: Any) -> str | None:
     """Return the precision of products, for rules whose backward half is traced outside of it."""
     if product_precision(dtype) is not None:
         return "default"
@@ -313,7 +313,7 @@ def _product(formula: str, a: Array, b: Array, precision: Any = None) -> Array:
     return jnp.einsum(formula, a, b, precision=precision, preferred_element_type=_wide(a))
 
 
-def _mix_plainly(
+def _mix_values(
     queries: Float[Array, "..."],
     keys: Float[Array, "..."],
     values: Float[Array, "..."],
@@ -342,7 +342,7 @@ def _mix_plainly(
     return (mixed / _beside_queries(totals, axes)).astype(values.dtype)
 
 
-_mix = jax.custom_vjp(_mix_plainly, nondiff_argnums=(5, 6))
+mix = jax.custom_vjp(_mix_values, nondiff_argnums=(5, 6))
 
 
 def _softmax(
@@ -360,11 +360,11 @@ def _softmax(
 def _beside_queries(
     totals: Float[Array, "*batch head 1 query"], axes: _Axes
 ) -> Float[Array, "..."]:
-    return totals if axes == _COLUMNS else jnp.moveaxis(totals, -1, -3)
+    return totals if axes == COLUMNS else jnp.moveaxis(totals, -1, -3)
 
 
 def _mix_forward(*inputs: Any) -> tuple[Array, tuple[Any, ...]]:
-    return _mix(*inputs), inputs[:5]
+    return mix(*inputs), inputs[:5]
 
 
 def _mix_backward(
@@ -389,4 +389,4 @@ def _mix_backward(
     return to_queries, to_keys, to_values, None, nothing
 
 
-_mix.defvjp(_mix_forward, _mix_backward)
+mix.defvjp(_mix_forward, _mix_backward)

@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.nn.attention import (
-    _COLUMNS,
+    COLUMNS,
     Attention,
-    _mix,
-    _precision,
     attention,
     init_torch_attention,
+    mix,
+    rule_precision,
 )
 from crisalad_jax.nn.layers import (
     LayerNorm,
@@ -178,14 +178,14 @@ def _attention_over_devices(
             part.reshape(len(part), tokens, heads, dim // heads)
             for part in (queries / math.sqrt(dim // heads), keys, values)
         )
-        mixed = _mix(
+        mixed = mix(
             jnp.transpose(queries, (1, 2, 3, 0)),
             jnp.transpose(keys, (1, 2, 0, 3)),
             jnp.transpose(values, (1, 2, 0, 3)),
             mask,
             dropout_mask,
-            _COLUMNS,
-            _precision(qkv.dtype),
+            COLUMNS,
+            rule_precision(qkv.dtype),
         )
         return jnp.transpose(mixed, (3, 0, 1, 2)).reshape(-1, tokens, dim)
 

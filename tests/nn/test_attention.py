@@ -10,12 +10,12 @@ import torch
 
 from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.attention import (
-    _COLUMNS,
+    COLUMNS,
     Attention,
     Rotation,
-    _mix,
     attention,
     cross_attention,
+    mix,
     padded_length,
 )
 from crisalad_jax.nn.layers import init_linear
@@ -112,7 +112,7 @@ def test_gradient_equals_that_of_torchs_softmax(masked: bool, dropping: bool) ->
 
     def ours(queries: jax.Array, keys: jax.Array, values: jax.Array) -> jax.Array:
         return (
-            _mix(queries, keys, values, *jax.tree.map(jnp.asarray, (mask, kept)), _COLUMNS, None)
+            mix(queries, keys, values, *jax.tree.map(jnp.asarray, (mask, kept)), COLUMNS, None)
             * change
         ).sum()
 
