@@ -13,7 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from crisalad_jax.experiments.compile_check.targets import COMPILER_OPTIONS, Machine, devices_of
 from crisalad_jax.nn.model import cast_params, describe, parameter_shapes
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.step import StepConfig, init_train_state, train_step
+from crisalad_jax.training.step import init_train_state, step_config, train_step
 from crisalad_jax.utils.target import GPU, TPU, lowering_for
 
 _TARGETS = {"tpu": TPU, "cuda": GPU}
@@ -80,15 +80,11 @@ def _lower_describe(config: TrainConfig, images: int, mesh: Mesh) -> jax.stages.
 
 def _lower_train(config: TrainConfig, images: int, mesh: Mesh) -> jax.stages.Lowered:
     # Only schedules depend on the number of steps.
-    step = StepConfig(
-        config.model,
-        config.loss,
-        config.optimiser,
+    step = step_config(
+        config,
         steps=1000,
         steps_per_epoch=100,
-        micro_batch=config.micro_batch,
         classes=(images,) if config.loss.kind.grouping is not None else (),
-        batch_norm=config.batch_norm,
     )
     key = jax.eval_shape(lambda: jax.random.key(0))
     state, frozen = jax.eval_shape(
