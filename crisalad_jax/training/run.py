@@ -53,9 +53,9 @@ from crisalad_jax.training.run_files import (
 )
 from crisalad_jax.training.step import (
     Metrics,
-    StepConfig,
     TrainState,
     init_train_state,
+    step_config,
     train_step,
 )
 from crisalad_jax.training.trainable import merge_params, shards_batch
@@ -154,18 +154,14 @@ class Run:
             else ()
         )
         self._cache = ImageCache()
-        self._step_config = StepConfig(
-            config.model,
-            config.loss,
-            config.optimiser,
-            self.steps,
-            self.steps_per_epoch,
-            config.micro_batch,
-            self._devices.mesh if shard_state else None,
-            self.classes,
-            config.batch_norm,
-            self._queries is not None,
+        step = step_config(
+            config,
+            steps=self.steps,
+            steps_per_epoch=self.steps_per_epoch,
+            classes=self.classes,
         )
+        mesh = self._devices.mesh if shard_state else None
+        self._step_config = dataclasses.replace(step, shard_over=mesh)
         self._all_is_well = self._devices.replicate(np.asarray(True))
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.
