@@ -47,6 +47,9 @@ from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils import compiler, devices, distributed
 from crisalad_jax.utils.errors import InputError
 
+WHOLE_LOSS = 1024
+"""Most images whose loss every device computes whole, at most a hundredth of a step's work
+(docs/training.md). Of more images XLA splits it, and exchanges its parts."""
 LossFunction = Callable[..., Float[Array, ""]]
 """Takes descriptors, labels and, if it has a third argument, which images are valid."""
 
@@ -384,10 +387,12 @@ def train_step(
         descriptors = attend_across_images(
             params, tokens, config.model, mask=valid_mask(all_valid), key=cross_key
         )
-        # On each device the whole loss: a thousandth of a step's work (docs/training.md).
         descriptors = devices.gather_images(descriptors)
         dense = devices.gather_images(tokens.dense) if _reads_dense(config) else None
-        result = _loss(descriptors, dense, all_labels, all_valid, classifier, group, config)
+        loss = functools.partial(_loss, config=config)
+        if len(all_labels) <= WHOLE_LOSS:
+            loss = devices.whole_on_each(loss)
+        result = loss(descriptors, dense, all_labels, all_valid, classifier, group)
         return result.loss, (result, tokens.transport, measured)
 
     def placed(tree: PyTree, *, whole: bool = False) -> PyTree:

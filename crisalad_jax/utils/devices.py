@@ -181,6 +181,17 @@ def image_mesh() -> AbstractMesh | None:
     return mesh if mesh.axis_names == (IMAGE,) and mesh.axis_types == (AxisType.Auto,) else None
 
 
+def whole_on_each(function: Callable[..., _Tree]) -> Callable[..., _Tree]:
+    """Make a function of gathered arrays that every device computes whole.
+
+    XLA would otherwise split it, and exchange its parts. On one device it is the function itself.
+    """
+    mesh = image_mesh()
+    if mesh is None:
+        return function
+    return jax.shard_map(function, mesh=mesh, in_specs=PartitionSpec(), out_specs=PartitionSpec())
+
+
 def gather_images(tree: _Tree) -> _Tree:
     """Gather arrays whose first axis is of images, so that every device has all of them.
 
