@@ -33,7 +33,7 @@ from crisalad_jax.nn.pixels import check_pixels, normalise
 from crisalad_jax.nn.projection import project
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
-from crisalad_jax.utils.devices import IMAGE, image_mesh
+from crisalad_jax.utils.devices import IMAGE, image_mesh, over_images
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
 
@@ -232,6 +232,7 @@ def _check_token_class(tokens: Any, _: ModelConfig) -> None:
 
 
 @_door("images", _check_images)
+@over_images("images", 1)
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def describe(
     params: Crisalad,
@@ -285,6 +286,7 @@ def describe(
 
 
 @_door("images", _check_images)
+@over_images("images", 1)
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def extract_tokens(
     params: Crisalad,

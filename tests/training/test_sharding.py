@@ -11,7 +11,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 PROGRAM = """
 import collections, dataclasses, re, sys, warnings
 import jax, numpy as np, optax
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import describe, extract_tokens, init_crisalad
 from crisalad_jax.training import run
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.utils import devices as sharding
@@ -60,6 +60,10 @@ assert MODEL.cross_image.dropout > 0 and MODEL.cross_image.layers == 2
 """
 COUNTS = """
 print(step(MODEL, devices, told=(0, 15, 0), micro_batch=8))
+params = devices.replicate(init_crisalad(jax.random.key(0), MODEL))
+for function in describe, extract_tokens:
+    text = function.lower(params, devices.shard_batch(images), MODEL).compile().as_text()
+    print(dict(collections.Counter(COLLECTIVE.findall(text))))
 """
 VALUES = """
 # Dropout too has the same bits: images are valid or not, one device or eight.
@@ -77,6 +81,11 @@ agree(trained, alone[0])
 agree(metrics._replace(told=None), alone[1])
 before, metrics = step(MODEL, devices, told=(1, 0, 0))
 assert metrics.told.tolist() == [1, 0, 0] and not metrics.updated
+params = init_crisalad(jax.random.key(0), MODEL)
+agree(
+    describe(devices.replicate(params), devices.shard_batch(images), MODEL),
+    describe(params, images, MODEL),
+)
 # Six images for eight devices: six take them, and a note says so.
 few = dataclasses.replace(RECIPE, trainable="adapters+head")
 with warnings.catch_warnings(record=True) as notes:
@@ -106,10 +115,11 @@ def test_a_step_exchanges_what_it_must_and_no_more() -> None:
     """Gathers of labels, of each layer's keys and values, and of descriptors; then gradients.
 
     The gradient of a layer's keys and values is scattered, and those of all parameters are summed
-    at once. Nothing is exchanged in a loop, such as the transport's over images.
+    at once. Nothing is exchanged in a loop, such as the transport's over images. Describing gathers
+    each layer's keys and values, and its first half nothing.
     """
     expected = "{'all-gather': 4, 'all-reduce': 1, 'reduce-scatter': 2}"
-    assert on_eight_devices(COUNTS, "count") == [expected]
+    assert on_eight_devices(COUNTS, "count") == [expected, "{'all-gather': 2}", "{}"]
 
 
 @pytest.mark.slow

@@ -60,7 +60,8 @@ class Counts(NamedTuple):
     collectives: dict[str, int]
     """Number of collectives in the program's text, by kind."""
     bfloat16_sums: int
-    """Number of collectives in the text that sum in bfloat16."""
+    """Number of collectives in the text that sum bfloat16 numbers. A float32 sum whose result a TPU
+    rounds as it arrives is none."""
     fused_attention: int
     """Number of calls in the text of cuDNN's attention, and of Pallas kernels on a TPU."""
     host_callbacks: int
@@ -101,11 +102,10 @@ def count(
     work = list(counter.walk(module.entry, 1))
     operations = module.operations()
     collectives = [each for each in operations if _collective(each) is not None]
-    sums = [each for each in collectives if _collective(each) in ("all-reduce", "reduce-scatter")]
     return Counts(
         work,
         dict(collections.Counter(str(_collective(each)) for each in collectives)),
-        sum(any(array.dtype == "bf16" for array in each.arrays) for each in sums),
+        sum(map(_bfloat16_sums, module.computations.values())),
         sum(each.target == KERNEL or each.target.startswith(_CUDNN) for each in operations),
         sum(map(_waits_for_host, operations)),
         counter.unknown_loops,
@@ -115,6 +115,19 @@ def count(
 def _collective(operation: Operation) -> str | None:
     kind = operation.kind.removesuffix("-start")
     return kind if kind in COLLECTIVES else None
+
+
+def _bfloat16_sums(computation: Computation) -> int:
+    operations = computation.operations
+    sums = [
+        each
+        for each in operations.values()
+        if _collective(each) in ("all-reduce", "reduce-scatter")
+    ]
+    return sum(
+        any(array.dtype == "bf16" for name in each.operands for array in operations[name].arrays)
+        for each in sums
+    )
 
 
 def _waits_for_host(operation: Operation) -> bool:
