@@ -10,7 +10,7 @@ from jaxtyping import Int64
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import has_split
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
-from crisalad_jax.data.benchmarks.msls import is_msls
+from crisalad_jax.data.benchmarks.msls import is_msls, read_msls
 from crisalad_jax.utils.errors import InputError
 
 
@@ -72,7 +72,12 @@ def read_query_set(
     check_radius(positive_radius)
     check_radius(negative_radius)
     benchmark = open_benchmark(root, split, images=images)
-    positives, near = _matches(benchmark, positive_radius, negative_radius)
+    radii = positive_radius, negative_radius
+    if root.is_dir() and is_msls(root):
+        # Images of different cities match in no radius, whatever their positions.
+        positives, near = (read_msls(root, split, each).ground_truth() for each in radii)
+    else:
+        positives, near = _matches(benchmark, *radii)
     kept = [query for query, matches in enumerate(positives) if matches.size]
     if not kept:
         raise InputError(
@@ -80,6 +85,11 @@ def read_query_set(
             f"{positive_radius:g} m, expected some"
         )
     count = len(benchmark.database)
+    if all(len(near[query]) == count for query in kept):
+        raise InputError(
+            f"{root}: found all {count} database images within {negative_radius:g} m of every "
+            "query, expected some farther, as negatives"
+        )
     return QuerySet(
         name=benchmark.name,
         root=benchmark.root,
@@ -100,7 +110,11 @@ def _matches(
     """Find the positives, and what is no negative, of all queries."""
     there, asked = benchmark.database_positions, benchmark.query_positions
     if there is None or asked is None:
-        truth = benchmark.ground_truth()
-        return truth, truth
+        if benchmark.positives is None:
+            raise InputError(
+                f"{benchmark.root}: found neither positions nor ground truth, expected one of the "
+                "two, for positives and negatives"
+            )
+        return benchmark.positives, benchmark.positives
     positives, near = (within(there, asked, each) for each in (positive_radius, negative_radius))
     return positives, near

@@ -134,6 +134,8 @@ def _read_set(config: TrainConfig, data: Path, images: Path | None) -> Places | 
         return read_places(
             pathlib.Path(data), cities=config.cities, min_images=config.min_images_of_place
         )
+    if images is not None and pathlib.Path(data).is_dir():
+        raise InputError(f"--data-images: found beside the folder {data}, expected it for a file")
     if (pathlib.Path(data) / "Dataframes").is_dir():
         raise InputError(
             f"{data}: found places in the layout of GSV-Cities, expected queries and a database, "

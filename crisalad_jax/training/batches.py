@@ -75,8 +75,10 @@ def rounds_of(config: TrainConfig, queries: QuerySet) -> Rounds:
     steps = size // config.places_per_batch
     if not steps:
         raise InputError(
-            f"{queries.root}: found {size} queries with positives for a round, expected at least "
-            f"places_per_batch {config.places_per_batch}"
+            f"{queries.root}: found rounds of {size} queries, of {len(queries.queries)} with "
+            f"positives, mining.queries_per_epoch {mining.queries_per_epoch} and queries_per_round "
+            f"{mining.queries_per_round}, expected at least places_per_batch "
+            f"{config.places_per_batch}"
         )
     return Rounds(rounds, steps)
 
@@ -93,7 +95,7 @@ def batches_of_tuples(
         image_size=config.model.input_size,
         preprocessing=config.model.preprocessing,
         augmentation=config.augmentation,
-        seed=(config.seed, mined.step),
+        seed=(config.seed, int(mined.step)),
         **options,
     )
 

@@ -126,7 +126,7 @@ class MiningConfig:
     queries_per_round: int = 1000
     """Most queries of a round; the queries of an epoch make rounds of equal size."""
     queries_per_epoch: int | None = None
-    """Queries of an epoch, drawn anew for each round; None takes every query once."""
+    """Queries of an epoch, drawn anew for each round; None takes every query at most once."""
     positive_radius: float = 10.0
     """Metres within which a database image is a query's positive."""
     negative_radius: float = 25.0

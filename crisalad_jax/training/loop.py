@@ -49,9 +49,8 @@ def fit(
 
     The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
     same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
-    `last.safetensors`; and `mined.npz` where tuples are mined. A validation adds
-    `best.safetensors`, the weights of the best recall by `config.select_by` (grouping `single`),
-    and the best `config.keep_best` weights in `best/`.
+    and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best recall by
+    `config.select_by` (grouping `single`), and the best `config.keep_best` weights in `best/`.
 
     A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one
     (on a CPU; see docs/reliability.md for a GPU).

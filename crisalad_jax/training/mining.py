@@ -4,8 +4,6 @@ NetVLAD's cached hard mining (Arandjelovic et al., CVPR 2016), and the partial m
 code and of Berton et al. (CVPR 2022), which Patch-NetVLAD and SelaVPR train with.
 """
 
-import pathlib
-import zipfile
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,18 +13,16 @@ from jaxtyping import Float, Int, Int32, Int64
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.losses.tuples import Role
 from crisalad_jax.training.config import MiningConfig
-from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path
 
 Describe = Callable[[Int[np.ndarray, " n"]], Float[np.ndarray, "n descriptor"]]
 """Takes image numbers; returns their descriptors, NaN for images that cannot be read."""
 
 
 class Mined(NamedTuple):
-    """The tuples of a round."""
+    """The tuples of a round, which a run saves with its state."""
 
-    step: int
-    """First step of the round."""
+    step: Int32[np.ndarray, ""]
+    """First step of the round; -1 before the first."""
     images: Int32[np.ndarray, "tuple image"]
     roles: Int32[np.ndarray, "tuple image"]
     """See `losses.tuples.Role`."""
@@ -34,9 +30,11 @@ class Mined(NamedTuple):
     """Last negatives of each query, which are candidates again; -1 for none."""
 
 
-def no_hardest(config: MiningConfig, queries: QuerySet) -> Int32[np.ndarray, "query negative"]:
-    """Return the last negatives of queries that have none yet."""
-    return np.full((len(queries.queries), config.negatives), -1, np.int32)
+def no_tuples(config: MiningConfig, queries: QuerySet, size: int) -> Mined:
+    """Return what a run has before its first round, in the shapes of a round of `size` tuples."""
+    none = np.zeros((size, 2 + config.negatives), np.int32)
+    hardest = np.full((len(queries.queries), config.negatives), -1, np.int32)
+    return Mined(np.array(-1, np.int32), none, none, hardest)
 
 
 def draw_queries(
@@ -124,7 +122,9 @@ def mine_tuples(
             hardest[query] = np.where(role == Role.NEGATIVE, negatives, -1)
         tuples.append((queries.queries[query], positives[nearest], *negatives))
         roles.append((Role.QUERY, Role.POSITIVE, *role))
-    return Mined(step, np.array(tuples, np.int32), np.array(roles, np.int32), hardest)
+    return Mined(
+        np.array(step, np.int32), np.array(tuples, np.int32), np.array(roles, np.int32), hardest
+    )
 
 
 def _distances(
@@ -147,38 +147,3 @@ def describe_mined(mined: Mined) -> str:
         f"mined {len(negatives)} tuples: {100 * (negatives > 0).mean():.0f} % have hard negatives, "
         f"{negatives.mean():.1f} in the mean"
     )
-
-
-def save_mined(path: pathlib.Path, mined: Mined) -> None:
-    """Write the tuples of a round."""
-    with atomic_path(path) as temporary:
-        np.savez(temporary, **mined._asdict())
-
-
-def load_mined(
-    path: pathlib.Path, shape: tuple[int, int], hardest: tuple[int, int]
-) -> Mined | None:
-    """Read the tuples of the last round; None where there is no file.
-
-    Args:
-        path: of `save_mined`.
-        shape: expected tuples and images of each.
-        hardest: expected queries and negatives of each.
-
-    Raises:
-        InputError: the file holds something else.
-    """
-    if not path.exists():
-        return None
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            mined = Mined(int(file["step"]), *(file[name] for name in Mined._fields[1:]))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as the tuples of a round: {error}") from error
-    found = mined.images.shape, mined.roles.shape, mined.hardest.shape
-    if found != (shape, shape, hardest) or any(each.dtype != np.int32 for each in mined[1:]):
-        raise InputError(
-            f"{path}: found tuples of shape {found[0]} and negatives of {found[2]}, expected "
-            f"{shape} and {hardest}"
-        )
-    return mined

@@ -42,11 +42,12 @@ from crisalad_jax.training.mining import (
     describe_mined,
     draw_queries,
     mine_tuples,
-    no_hardest,
+    no_tuples,
 )
 from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
+    RunState,
     checksum,
     checksum_of_benchmark,
     checksum_of_places,
@@ -183,12 +184,16 @@ class Run:
         place = self._devices.shard if shard_state else self._devices.replicate
         self._check_memory(state, place)
         self._files: RunFiles | None = None
-        state = self._open_files(state)
+        mined = None
+        if isinstance(places, QuerySet):
+            tuples = self._rounds.steps * config.places_per_batch
+            mined = no_tuples(config.mining, places, tuples)
+        saved = self._open_files(RunState.of(state, mined))
         # Copied, because a step donates the buffers of its state.
-        self.state: TrainState = _copied(place(state))
+        self.state: TrainState = _copied(place(saved.of_training))
         self._mined: Mined | None = None
-        if self._queries is not None:
-            self._load_mined(self._queries)
+        if saved.mined is not None:
+            self._mined = Mined(*map(np.asarray, saved.mined))
         self._before: _Pending | None = None
         self._pending: _Pending | None = None
         self._saved_at = self._stepped_at = time.monotonic()
@@ -211,7 +216,7 @@ class Run:
         arguments = place(state), self._frozen_there, *batch, self._step_key
         check_memory(compiled_size, self.config, limit, self._devices.mesh.size)
 
-    def _open_files(self, state: TrainState) -> TrainState:
+    def _open_files(self, state: RunState) -> RunState:
         """Open the run's files in the primary process; return the saved state, or `state`."""
 
         def find() -> tuple[int, dict[str, Any]]:
@@ -263,39 +268,39 @@ class Run:
 
     def mining_is_due(self) -> bool:
         """Return whether the round that begins now still needs its tuples."""
-        begins = self.step % self._rounds.steps == 0 and not self.is_done()
-        is_there = self._mined is not None and self._mined.step == self.step
-        return self._queries is not None and begins and not is_there
+        if self._mined is None or self.is_done():
+            return False
+        return self.step % self._rounds.steps == 0 and int(self._mined.step) != self.step
 
     def mine(self, on_bad_image: OnBadImage, signals: SignalState) -> str:
-        """Mine the tuples of the round that begins, by the model as it is, and keep them in a file.
+        """Mine the tuples of the round that begins, by the model as it is.
 
-        The primary process mines, and the others wait.
+        The primary process mines, and the others wait. States that are saved in the round have its
+        tuples; one from before mines again.
 
         Returns:
             How hard they are, in words.
         """
         assert self._queries is not None
-        queries = self._queries
-        self.save()  # so that no state is left that needs the tuples before
-        params, mined = self.params(), self._no_tuples(queries)
-        words = ""
+        assert self._mined is not None
+        queries, mined = self._queries, self._mined
+        params, words = self.params(), ""
 
         def on_primary() -> None:
             nonlocal mined, words
-            assert self._files is not None
             with signals.at_once():
-                mined = self._mine(params, queries, on_bad_image)
-            self._files.save_mined(mined)
-            words = describe_mined(mined)
+                mined, words = self._mine(params, queries, mined, on_bad_image)
 
         distributed.run_on_primary(on_primary)
-        self._mined = Mined(self.step, *distributed.broadcast(tuple(mined[1:])))
+        self._mined = Mined(*map(np.asarray, distributed.broadcast(tuple(mined))))
         self._stepped_at = time.monotonic()
         return words
 
-    def _mine(self, params: Crisalad, queries: QuerySet, on_bad_image: OnBadImage) -> Mined:
-        config = self.config
+    def _mine(
+        self, params: Crisalad, queries: QuerySet, before: Mined, on_bad_image: OnBadImage
+    ) -> tuple[Mined, str]:
+        """Return the tuples, and how hard they are in words."""
+        config, unreadable = self.config, 0
         epoch, step = divmod(self.step, self.steps_per_epoch)
         chosen = draw_queries(
             config.mining,
@@ -307,6 +312,7 @@ class Run:
         )
 
         def describe(images: np.ndarray) -> np.ndarray:
+            nonlocal unreadable
             rows = np.empty((len(images), config.model.descriptor_dim), np.float32)
             for start in range(0, len(images), DESCRIBED_AT_ONCE):
                 part = slice(start, start + DESCRIBED_AT_ONCE)
@@ -323,40 +329,20 @@ class Run:
                 )
                 rows[part] = group(params, config.model, tokens, "single", batch_size=16)
                 rows[part][~tokens.readable] = np.nan
+                unreadable += int((~tokens.readable).sum())
             return rows
 
-        hardest = no_hardest(config.mining, queries) if self._mined is None else self._mined.hardest
-        return mine_tuples(
-            config.mining, queries, chosen, hardest, describe, seed=config.seed, step=self.step
+        mined = mine_tuples(
+            config.mining,
+            queries,
+            chosen,
+            before.hardest,
+            describe,
+            seed=config.seed,
+            step=self.step,
         )
-
-    def _no_tuples(self, queries: QuerySet) -> Mined:
-        shape = self._rounds.steps * self.config.places_per_batch, self.config.images_per_place
-        none = np.zeros(shape, np.int32)
-        return Mined(-1, none, none, no_hardest(self.config.mining, queries))
-
-    def _load_mined(self, queries: QuerySet) -> None:
-        """Load the tuples that were mined last; those of the round that the run resumes in."""
-        mined = self._no_tuples(queries)
-
-        def find() -> int:
-            nonlocal mined
-            assert self._files is not None
-            loaded = self._files.load_mined(mined.images.shape, mined.hardest.shape)
-            begin = self.step - self.step % self._rounds.steps
-            found = -1 if loaded is None else loaded.step
-            if found < begin < self.step:
-                raise InputError(
-                    f"{self.out / 'mined.npz'}: found "
-                    f"{'no such file' if loaded is None else f'the tuples of step {found}'}, "
-                    f"expected those of step {begin}; the run cannot go on without them"
-                )
-            mined = mined if loaded is None else loaded
-            return found
-
-        step = distributed.run_on_primary(find)
-        arrays = distributed.broadcast(tuple(mined[1:]))
-        self._mined = None if step < 0 else Mined(step, *arrays)
+        words = describe_mined(mined)
+        return mined, words + (f"; {unreadable} unreadable images left out" if unreadable else "")
 
     def rest_of_round(
         self, on_bad_image: OnBadImage, num_workers: int, threads: int
@@ -592,7 +578,8 @@ class Run:
         state = self._devices.gather(self.state)
         if self._files is not None:
             params = functools.partial(self._merged, state.trainable)
-            self._files.save(self.step, self.record, state, params)
+            arrays = RunState.of(state, self._mined)
+            self._files.save(self.step, self.record, arrays, params)
         self._saved_at = self._stepped_at = time.monotonic()
         self.told = Told()  # whose processes did not know that this would save
 

@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,12 +19,33 @@ from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
-from crisalad_jax.training.mining import Mined, load_mined, save_mined
+from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.locks import one_writer
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
+
+
+class RunState(NamedTuple):
+    """The arrays of a run: those of `TrainState`, and the tuples of the round that it is in."""
+
+    step: Any
+    trainable: Any
+    optimiser: Any
+    classifiers: Any
+    mined: Mined | None
+    """None where nothing is mined."""
+
+    @classmethod
+    def of(cls, state: TrainState, mined: Mined | None) -> "RunState":
+        """Join the two."""
+        return cls(*state, mined)
+
+    @property
+    def of_training(self) -> TrainState:
+        """The training state alone."""
+        return TrainState(*self[:-1])
 
 
 @dataclasses.dataclass
@@ -72,7 +93,7 @@ class RunFiles:
             self._saved: tuple[int, RunRecord] | None = None
             self._lock = opened.pop_all()
 
-    def load(self, like: TrainState) -> SavedState | None:
+    def load(self, like: RunState) -> SavedState | None:
         """Load the saved state; see `StateStore.load`."""
         return self._states.load(like)
 
@@ -100,7 +121,7 @@ class RunFiles:
                 save_weights(path, params, self._config.model)
 
     def save(
-        self, step: int, record: RunRecord, state: TrainState, params: Callable[[], Crisalad]
+        self, step: int, record: RunRecord, state: RunState, params: Callable[[], Crisalad]
     ) -> None:
         """Write the weights and the state, unless they are saved already."""
         record = copy.deepcopy(record)
@@ -111,16 +132,6 @@ class RunFiles:
             self._states.save(step, state, dataclasses.asdict(record))
             self._drop_old_best(record)
         self._saved = step, record
-
-    def load_mined(self, shape: tuple[int, int], hardest: tuple[int, int]) -> Mined | None:
-        """Load the tuples of the last round that was mined; see `mining.load_mined`."""
-        return load_mined(self._out / "mined.npz", shape, hardest)
-
-    def save_mined(self, mined: Mined) -> None:
-        """Write the tuples of a round, after the state before it: older ones are not needed."""
-        with self._writing():
-            self._states.wait()
-            save_mined(self._out / "mined.npz", mined)
 
     def close(self) -> None:
         """Wait for files that are being written, and close them."""

@@ -84,7 +84,8 @@ def with_vocabulary_of(
     if initial is None:
         initial = init_crisalad(jax.random.key(config.seed), config.model)
     start = initial
-    paths = [places.path(image) for image in range(len(places.files))]
+    count = places.database if isinstance(places, QuerySet) else len(places.files)
+    paths = [places.path(image) for image in range(count)]
 
     def build() -> Crisalad:
         return with_vocabulary(

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import pathlib
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import torch
 from crisalad_jax import recipe
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.experiments.train import train
@@ -21,11 +23,14 @@ from crisalad_jax.losses import LossConfig, Role, metric_loss, tuple_labels, tup
 from crisalad_jax.losses.selavpr import SelaVprLoss
 from crisalad_jax.losses.triplet import TripletConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
+from crisalad_jax.nn.model import describe
 from crisalad_jax.training import run as run_module
 from crisalad_jax.training.batches import batches_of_tuples, rounds_of
 from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.training.loop import fit
-from crisalad_jax.training.mining import Mined, draw_queries, mine_tuples, no_hardest
+from crisalad_jax.training.mining import Mined, draw_queries, mine_tuples, no_tuples
+from crisalad_jax.training.optimiser import learning_rate_schedule
+from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import RECIPE, write_picture
 
@@ -177,8 +182,8 @@ def on_the_line(images: np.ndarray) -> np.ndarray:
 
 
 def mined(config: MiningConfig, describe=on_the_line, before=None, seed=0, step=0) -> Mined:
-    before = no_hardest(config, STREET) if before is None else before
     chosen = np.arange(len(STREET.queries))
+    before = no_tuples(config, STREET, len(chosen)).hardest if before is None else before
     return mine_tuples(config, STREET, chosen, before, describe, seed=seed, step=step)
 
 
@@ -195,6 +200,39 @@ def test_tuples_by_hand(kind):
     hardest = mined(MiningConfig(kind=kind, negatives=3, candidates=7))
     assert hardest.roles.tolist() == [[0, 1, 2, 2, 2]] * 2
     assert found.hardest[0].tolist() == [3, -1, -1]
+
+
+def test_a_query_without_a_violation_keeps_its_last_negatives():
+    config = MiningConfig(kind="whole", negatives=3, candidates=7, margin=0.05)
+    before = np.array([[3, 5, -1], [0, -1, -1]], np.int32)
+    found = mined(config, before=before)
+    # Nothing is within 0.1 + 0.05 of the first query; 0 is within 0.01 + 0.05 of no other's.
+    assert found.roles[0].tolist() == [0, 1, 3, 3, 3]
+    assert found.hardest[0].tolist() == [3, 5, -1]
+
+
+def test_a_negative_at_the_margin_is_none():
+    config = MiningConfig(kind="whole", negatives=3, candidates=7, margin=0.5)
+    exact = np.array([0.25, 0.25, 9, 0.75, 0.5, 0.7, 2.0, 0.0, 9, 9])
+
+    def describe(images):
+        return np.stack([exact[images], np.zeros(len(images))], axis=1).astype(np.float32)
+
+    found = mined(config, describe)
+    assert found.images[0].tolist() == [7, 0, 4, 5, 3]
+    assert found.roles[0].tolist() == [0, 1, 2, 2, 3]  # 3 is at 0.75 = 0.25 + 0.5
+
+
+def test_candidates_are_drawn_by_the_seed_and_the_step():
+    config = MiningConfig(kind="whole", negatives=2, candidates=2)
+    seen = {
+        (seed, step): tuple(mined(config, seed=seed, step=step).images[0].tolist())
+        for seed in range(4)
+        for step in range(4)
+    }
+    assert len({seen[seed, 0] for seed in range(4)}) > 1
+    assert len({seen[0, step] for step in range(4)}) > 1
+    assert seen[1, 1] == tuple(mined(config, seed=1, step=1).images[0].tolist())
 
 
 def test_negatives_of_earlier_rounds_are_candidates_again():
@@ -236,7 +274,7 @@ def test_mining_is_that_of_all_distances(kind):
     descriptors = unit(generator.standard_normal((150, 16)))
     config = MiningConfig(kind=kind, negatives=5, candidates=120)
     chosen = generator.permutation(len(queries.queries))
-    start = no_hardest(config, queries)
+    start = no_tuples(config, queries, len(chosen)).hardest
     found = mine_tuples(config, queries, chosen, start, lambda i: descriptors[i], seed=0, step=0)
     wide = descriptors.astype(np.float64)
     for query, row in zip(chosen, found.images, strict=True):
@@ -266,7 +304,7 @@ def test_rounds_of_pitts30k_are_the_codes():
     assert rounds_of(config, street) == (8, 915 // 4)
     selavpr = recipe("l14", "selavpr")
     assert rounds_of(selavpr, street) == (30, 250)
-    with pytest.raises(InputError, match="street: found 2 queries with positives for a round, exp"):
+    with pytest.raises(InputError, match="street: found rounds of 2 queries, of 2 with"):
         rounds_of(config, STREET)
 
 
@@ -278,23 +316,47 @@ def test_recipes_are_the_codes():
     )
     for config in netvlad, patches:
         assert config.model.image_size == (480, 640)
-        assert config.loss.kind == TripletConfig(0.1**0.5, "all")
+        assert config.loss == LossConfig(kind=TripletConfig(0.1**0.5, "all"), miner="none")
         sgd = config.optimiser
         assert (sgd.kind, sgd.learning_rate, sgd.momentum) == ("sgd", 1e-4, 0.9)
-        assert (sgd.weight_decay, sgd.step_epochs, sgd.step_gamma) == (1e-3, 5, 0.5)
-        assert (config.epochs, config.patience, config.select_by) == (30, 10, "R@5")
-        assert (config.mining.positive_radius, config.mining.negative_radius) == (10, 25)
-        assert config.places_per_batch == 4
-    assert (netvlad.mining.kind, netvlad.images_per_place) == ("whole", 12)
-    assert (patches.mining.kind, patches.images_per_place) == ("sample", 7)
+        assert sgd.weight_decay == 1e-3
+        # Both stop after more than 10 epochs without gain.
+        assert (config.epochs, config.patience, config.select_by) == (30, 11, "R@5")
+        assert (config.places_per_batch, config.trainable) == (4, "last-1-blocks+head")
+    assert netvlad.mining == MiningConfig("whole", 10, 1000, 1000, None, 10.0, 25.0, 0.1**0.5)
+    assert patches.mining == MiningConfig("sample", 5, 1000, 1000, None, 10.0, 25.0, None)
+    assert (netvlad.images_per_place, patches.images_per_place) == (12, 7)
     assert netvlad.model.descriptor_dim == 64 * 512
     assert patches.model.descriptor_dim == 16 * 512
+    assert selavpr.mining == MiningConfig("sample", 2, 1000, 1000, 30_000, 10.0, 25.0, None)
+    assert selavpr.loss == LossConfig(kind=SelaVprLoss(margin=0.1), miner="none")
     assert (selavpr.places_per_batch, selavpr.images_per_place) == (4, 4)
     assert (selavpr.model.descriptor_dim, selavpr.model.image_size) == (1024, (224, 224))
     adam = selavpr.optimiser
     assert (adam.kind, adam.learning_rate, adam.weight_decay) == ("adam", 1e-5, 0)
+    assert adam.end_lr_fraction == 1
     assert (selavpr.epochs, selavpr.patience, selavpr.select_by) == (50, 3, "R@5")
     assert selavpr.trainable == "adapters+head"
+
+
+@pytest.mark.filterwarnings("ignore:The epoch parameter:UserWarning")
+@pytest.mark.parametrize(("name", "steps_first"), [("netvlad", True), ("patch-netvlad", False)])
+def test_learning_rates_are_torchs(name, steps_first):
+    """Nanne's loop calls `scheduler.step(epoch)` before an epoch, Patch-NetVLAD's after it."""
+    optimiser = torch.optim.SGD([torch.nn.Parameter(torch.ones(1))], lr=1e-4)
+    schedule = torch.optim.lr_scheduler.StepLR(optimiser, step_size=5, gamma=0.5)
+    expected = []
+    for epoch in range(1, 31):
+        optimiser.step()
+        if steps_first:
+            schedule.step(epoch)
+        expected.append(optimiser.param_groups[0]["lr"])
+        if not steps_first:
+            schedule.step(epoch)
+    ours = learning_rate_schedule(recipe("b14", name).optimiser, 30 * 7, 7)
+    for step in range(30 * 7):
+        # Powers of a half, in float32.
+        assert float(ours(step)) == pytest.approx(expected[step // 7], rel=1e-6)
 
 
 def write_street(root: pathlib.Path) -> pathlib.Path:
@@ -338,13 +400,79 @@ def test_query_sets_are_read_by_positions(street):
     assert wide.positives[1].tolist() == [2, 3]
     with pytest.raises(InputError, match="found no query of 10 with a database image within 2 m"):
         read_query_set(street, positive_radius=2)
+    with pytest.raises(InputError, match="found all 20 database images within 5000 m of e"):
+        read_query_set(street, negative_radius=5000)
+
+
+def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
+    """Radii, and the images of a file, reach the reader; what is unreadable is told."""
+    asked = {}
+
+    def read(data, **options):
+        asked.update(options, data=data)
+        return read_query_set(street)
+
+    monkeypatch.setattr("crisalad_jax.experiments.train.read_query_set", read)
+    mining = dataclasses.replace(CONFIG.mining, positive_radius=4.0, negative_radius=50.0)
+    config = dataclasses.replace(CONFIG, mining=mining, epochs=1)
+    file = tmp_path / "set.mat"
+    train(config, file, tmp_path / "run", images=street, quiet=True)
+    assert asked == {
+        "data": file,
+        "positive_radius": 4.0,
+        "negative_radius": 50.0,
+        "images": street,
+    }
+
+
+def test_unreadable_images_are_told_in_mining(tmp_path, capfd):
+    root = write_street(tmp_path / "street")
+    broken = sorted((root / "images" / "train" / "database").iterdir())[:3]
+    for path in broken:
+        path.write_bytes(b"no picture")
+    config = dataclasses.replace(CONFIG, epochs=1)
+    fit(config, read_query_set(root), tmp_path / "run", on_bad_image="skip")
+    assert "; 3 unreadable images left out" in " ".join(capfd.readouterr().err.split())
+
+
+def test_images_of_other_cities_are_no_positives(tmp_path):
+    """Two cities of MSLS whose positions are alike, in other zones of UTM."""
+    for city in ("boston", "paris"):
+        for side, norths in (("query", (0, 500)), ("database", (3, 503, 900))):
+            folder = tmp_path / "train_val" / city / side
+            keys = [f"{city}{side}{number}" for number in range(len(norths))]
+            for number, key in enumerate(keys):
+                write_picture(folder / "images" / f"{key}.jpg", number)
+            raw = [f"{n},{key},0,0,0,2020-01-01,False" for n, key in enumerate(keys)]
+            (folder / "raw.csv").write_text(
+                "\n".join([",key,lon,lat,ca,captured_at,pano", *raw]) + "\n"
+            )
+            rows = [
+                f"{n},{key},500000,{4e6 + north}"
+                for n, (key, north) in enumerate(zip(keys, norths, strict=True))
+            ]
+            (folder / "postprocessed.csv").write_text(
+                "\n".join([",key,easting,northing", *rows]) + "\n"
+            )
+    found = read_query_set(tmp_path)
+    assert [each.tolist() for each in found.positives] == [[0], [1], [3], [4]]
+    assert [each.tolist() for each in found.near] == [[0], [1], [3], [4]]
+
+
+def test_checksums_tell_other_positives(street):
+    narrow, wide = read_query_set(street), read_query_set(street, negative_radius=97)
+    assert checksum_of_places(narrow) != checksum_of_places(wide)
+    fewer = dataclasses.replace(narrow, positives=tuple(each[:1] for each in narrow.positives))
+    assert checksum_of_places(narrow) != checksum_of_places(fewer)
 
 
 def test_batches_hold_the_tuples_and_their_roles(street):
     queries = read_query_set(street)
     images = np.array([[20, 0, 4, 6], [21, 2, 8, 0], [22, 4, 0, 2], [23, 6, 2, 0]], np.int32)
     roles = np.array([[0, 1, 2, 2], [0, 1, 2, 3], [0, 1, 2, 2], [0, 1, 3, 3]], np.int32)
-    round_ = Mined(0, images, roles, no_hardest(CONFIG.mining, queries))
+    round_ = no_tuples(CONFIG.mining, queries, 4)._replace(
+        step=np.array(0), images=images, roles=roles
+    )
     first, second = batches_of_tuples(CONFIG, queries, round_)
     assert first.indices.tolist() == images[:2].ravel().tolist()
     assert second.labels.tolist() == [8, 9, 10, 10, 12, 13, 15, 15]
@@ -376,8 +504,6 @@ def test_a_run_learns_from_its_tuples(whole):
     assert [line["epoch"] for line in lines] == [1] * 4 + [2] * 4
     assert all(np.isfinite(line["loss"]) for line in lines)
     assert all(line["gradient_norm"] > 0 for line in lines)
-    with np.load(whole / "mined.npz") as file:
-        assert int(file["step"]) == 6
 
 
 @pytest.mark.parametrize("saves", ["rarely", "always"])
@@ -410,13 +536,59 @@ def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
     assert not [path for path in out.rglob("*") if "tmp" in path.name]
 
 
-@pytest.mark.parametrize("harm", ["gone", "cut", "other"])
-def test_tuples_that_are_lost_are_told(street, tmp_path, monkeypatch, harm):
+def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatch):
+    """Against `mine_tuples` by hand: the model of each round's begin, and the last negatives."""
+    queries, out, seen = read_query_set(street), tmp_path / "run", []
+    mine = run_module.Run._mine
+
+    def recorded(self, params, *rest):
+        mined, words = mine(self, params, *rest)
+        seen.append((jax.tree.map(np.array, params), mined))  # a step uses up its buffers
+        return mined, words
+
+    monkeypatch.setattr(run_module.Run, "_mine", recorded)
+    config = dataclasses.replace(
+        CONFIG, mining=dataclasses.replace(CONFIG.mining, candidates=3), epochs=2
+    )
+    fit(config, queries, out, quiet=True)
+    assert [int(mined.step) for _, mined in seen] == [0, 2, 4, 6]
+    hardest = no_tuples(config.mining, queries, 4).hardest
+    for number, (params, mined) in enumerate(seen):
+
+        def describe_all(images, params=params):
+            paths = [queries.path(image) for image in images]
+            (batch,) = image_batches(
+                paths,
+                image_size=config.model.image_size,
+                batch_size=len(paths),
+                preprocessing=config.model.preprocessing,
+            )
+            alone = jnp.eye(len(paths), dtype=bool)
+            return np.asarray(describe(params, batch.images, config.model, mask=alone))
+
+        epoch, round_ = divmod(number, 2)
+        chosen = draw_queries(config.mining, 10, 4, seed=5, epoch=epoch, number=round_)
+        step = 2 * number
+        expected = mine_tuples(
+            config.mining, queries, chosen, hardest, describe_all, seed=5, step=step
+        )
+        assert mined.images.tolist() == expected.images.tolist()
+        assert mined.hardest.tolist() == expected.hardest.tolist()
+        hardest = expected.hardest
+    first, second = seen[0][0], seen[1][0]
+    assert any(
+        not np.array_equal(*leaves)
+        for leaves in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True)
+    )
+
+
+def test_an_older_state_has_its_own_tuples(street, whole, tmp_path, monkeypatch):
+    """The newest state is damaged and deleted, as the message says: the one before goes on."""
     queries, out = read_query_set(street), tmp_path / "run"
     step, calls = run_module.train_step, itertools.count(1)
 
     def interrupted(*arguments):
-        if next(calls) == 4:
+        if next(calls) == 5:
             raise Interrupted
         return step(*arguments)
 
@@ -425,19 +597,14 @@ def test_tuples_that_are_lost_are_told(street, tmp_path, monkeypatch, harm):
         patch.setattr(run_module, "SAVE_SECONDS", -1)
         with pytest.raises(Interrupted):
             fit(CONFIG, queries, out, quiet=True)
-    path = out / "mined.npz"
-    if harm == "gone":
-        path.unlink()
-        message = r"mined.npz: found no such file, expected those of step 2; the run cannot go on"
-    elif harm == "cut":
-        path.write_bytes(path.read_bytes()[:99])
-        message = r"mined.npz: cannot be read as the tuples of a round: "
-    else:
-        with np.load(path) as file:
-            np.savez(path, **{**file, "images": file["images"][:1]})
-        message = r"mined.npz: found tuples of shape \(1, 4\) and negatives of \(10, 2\), expected"
-    with pytest.raises(InputError, match=message):
-        fit(CONFIG, queries, out, quiet=True)
+    newest, older = sorted(
+        (path for path in (out / "state").iterdir() if path.name.isdigit()),
+        key=lambda path: -int(path.name),
+    )
+    assert (newest.name, older.name) == ("4", "3")  # of two rounds
+    shutil.rmtree(newest)
+    fit(CONFIG, queries, out, quiet=True)
+    assert lines_of(out) == lines_of(whole)
 
 
 def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
@@ -451,6 +618,8 @@ def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
         train(CONFIG, shared / "city", out, quiet=True)
     with pytest.raises(InputError, match="--data-images: found for places"):
         train(RECIPE, shared / "city", out, images=tmp_path, quiet=True)
+    with pytest.raises(InputError, match="--data-images: found beside the folder"):
+        train(CONFIG, street, out, images=tmp_path, quiet=True)
     assert not out.exists()
 
 
@@ -458,7 +627,7 @@ def test_a_set_without_positions_goes_by_its_ground_truth(tmp_path):
     for side in ("database", "queries"):
         for number in range(3):
             write_picture(tmp_path / side / f"{number}.jpg", number)
-    with pytest.raises(InputError, match="no ground truth, nothing to score"):
+    with pytest.raises(InputError, match="found neither positions nor ground truth, expected one"):
         read_query_set(tmp_path)
     table = "query,database\n0.jpg,1.jpg\n0.jpg,2.jpg\n1.jpg,\n2.jpg,0.jpg\n"
     (tmp_path / "ground_truth.csv").write_text(table)

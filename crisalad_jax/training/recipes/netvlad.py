@@ -26,6 +26,11 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     VGG-16 trains its last stage. 4 tuples of 12 images make a batch. Every 1,000 queries all images
     are described anew, and each query takes the 10 hardest of 1,000 random negatives and its last
     ones, if they violate the margin.
+
+    Its schedule steps before an epoch and not after: the first four epochs have the whole learning
+    rate. It stops after more than 10 epochs without gain. It draws a round's queries from a fixed
+    part of the file; here all are shuffled. Its loader's processes forget a query's last negatives
+    with each round, which the paper keeps, as is done here.
     """
     mining = MiningConfig(kind="whole", negatives=10, margin=MARGIN)
     return TrainConfig(
@@ -38,14 +43,16 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
             compute_dtype="float32",
         ),
         loss=LossConfig(kind=TripletConfig(margin=MARGIN, average="all"), miner="none"),
-        optimiser=_SGD,
+        optimiser=dataclasses.replace(
+            _SGD, schedule="milestones", milestones=(4, 9, 14, 19, 24, 29), step_gamma=0.5
+        ),
         trainable="last-1-blocks+head",
         augmentation=NoAugmentation(),
         mining=mining,
         places_per_batch=4,
         images_per_place=2 + mining.negatives,
         epochs=30,
-        patience=10,
+        patience=11,
     )
 
 
@@ -53,10 +60,13 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
 def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of Patch-NetVLAD's Mapillary weights: NetVLAD's, of 16 clusters, on MSLS.
 
-    Tuples have 5 negatives, the hardest of 1,000 for all queries of a round. The code takes queries
-    at night or sideways more often than others, here all alike. It looks for violations by inner
-    products with a sign that nearly every query passes; here every one does. Re-ranking by patches
-    learns nothing, and `crisalad pca --whiten` fits the whitening.
+    Tuples have 5 negatives, the hardest of 1,000 for all queries of a round. The learning rate
+    falls after every fifth epoch.
+
+    The code draws queries with replacement, those at night or sideways more often; here each has
+    its turn. It leaves out candidates near any query of a round, here those near the tuple's own.
+    It looks for violations by inner products with a sign that nearly every query passes; here every
+    one does. Re-ranking by patches learns nothing, and `crisalad pca` fits the whitening.
     """
     config = netvlad(model, preset)
     mining = MiningConfig(kind="sample", negatives=5)
@@ -66,6 +76,7 @@ def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     return dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, aggregator=aggregator),
+        optimiser=_SGD,
         mining=mining,
         images_per_place=2 + mining.negatives,
     )
