@@ -507,7 +507,9 @@ def test_a_run_learns_from_its_tuples(whole):
 
 
 @pytest.mark.parametrize("saves", ["rarely", "always"])
-@pytest.mark.parametrize("call", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize(
+    "call", [1, 4, *(pytest.param(call, marks=pytest.mark.slow) for call in (2, 3, 6))]
+)
 def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
     street, whole, tmp_path, monkeypatch, call, saves
 ):
