@@ -197,6 +197,9 @@ class TrainConfig:
     """The paper converged within five, and stopped after three without gain."""
     validate_every: int = 1
     """Epochs from one validation to the next."""
+    validation_size: tuple[int, int] | None = None
+    """Height and width that validations resize to; None is the model's. The model that is saved has
+    its own."""
     select_by: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
     """Recall of a validation that tells which weights are the best."""
     patience: int | None = 3
@@ -261,7 +264,15 @@ class TrainConfig:
             self.patience is None or self.patience > 0,
             f"TrainConfig.patience: found {self.patience}, expected more than 0, or None",
         )
+        if self.validation_size is not None:
+            self.model.check_image_size(self.validation_size)
         check_seed("TrainConfig.seed", self.seed)
+
+    @property
+    def validation_model(self) -> ModelConfig:
+        """The model as validations describe with it."""
+        size = self.validation_size
+        return self.model if size is None else dataclasses.replace(self.model, image_size=size)
 
     @property
     def min_images_of_place(self) -> int:

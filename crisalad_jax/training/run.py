@@ -530,7 +530,7 @@ class Run:
         with signals.at_once():
             (result,) = evaluate(
                 params,
-                self.config.model,
+                self.config.validation_model,
                 benchmark,
                 groupings=("single",),
                 cache=self._cache,
@@ -555,7 +555,7 @@ class Run:
 
     def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:
         """Compute statistics of the transport on the first queries, without dropout."""
-        model = self.config.model
+        model = self.config.validation_model
         paths = benchmark.queries[:WATCHED_QUERIES]
         batches = photograph_batches(model, paths, batch_size=len(paths), cache=self._cache)
         batch = next(iter(batches))  # of the size of the first, where sizes differ

@@ -123,6 +123,20 @@ def test_the_recipes_are_their_papers():
     assert recipe("tiny", "scratch") == recipe("tiny")
 
 
+def test_validations_are_of_the_codes_sizes():
+    """Of amaralibey/Bag-of-Queries, Tong-Jin01/EDTformer, Lu-Feng/ImAge and Lu-Feng/SuperVLAD."""
+    for name in ("boq", "edtformer", "image", "supervlad"):
+        config = recipe("b14", name)
+        assert config.model.image_size == (224, 224)
+        assert config.validation_model.image_size == config.validation_size == (322, 322)
+        assert recipe("tiny", name).validation_size is None
+    assert recipe("b14", "boq-resnet50").validation_size == (384, 384)
+    assert recipe("b14", "salad").validation_model == recipe("b14", "salad").model
+    # Another head, or other patches, may not fit the size.
+    assert recipe("b14", "boq+mixvpr").validation_size is None
+    assert recipe("b14", "boq+dinov3").validation_size is None
+
+
 def test_classification_is_as_published():
     """gmberton/CosPlace and gmberton/EigenPlaces: their papers' constants and their code's."""
     cosplace = recipe("b14", "cosplace-vit")
@@ -536,6 +550,7 @@ def test_one_patch_more_than_clusters_is_enough():
         (TrainConfig, {"trainable": "tail"}, "TrainConfig.trainable: found 'tail', expected head"),
         (TrainConfig, {"trainable": "last--1-blocks+head"}, "TrainConfig.trainable"),
         (TrainConfig, {"patience": 0}, "TrainConfig.patience: found 0"),
+        (TrainConfig, {"validation_size": (320, 322)}, "image size: found 320 x 322, expected"),
         (TrainConfig, {"seed": -1}, "TrainConfig.seed: found -1"),
     ],
 )

@@ -15,7 +15,7 @@ from tensorboardX.proto import event_pb2
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.io import read_config
-from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.data.resize import resize_image
@@ -286,6 +286,28 @@ def test_validations_come_every_so_many_epochs_and_at_the_end(
     fit(config, places, tmp_path, validation=benchmark, initial=params, quiet=True)
     assert [line["epoch"] for line in metrics_of(tmp_path) if "R@5" in line] == [2, 3]
     assert len(seen) == 2
+
+
+def test_a_validation_has_its_own_size(shared, places, tmp_path, monkeypatch):
+    """Recalls of the model at that size, by hand; the weights keep the size of training."""
+    town = open_benchmark(shared / "town")
+    config = dataclasses.replace(ENDLESS, epochs=1, validation_size=(56, 84))
+    result = fit(config, places, tmp_path / "run", validation=town, quiet=True)
+    params, model = load_weights(tmp_path / "run" / "best.safetensors")
+    assert model == config.model
+    larger = dataclasses.replace(model, image_size=(56, 84))
+    (expected,) = evaluate(params, larger, town, groupings=("single",), quiet=True)
+    assert result.best_recall == expected.recalls[5]
+    line = metrics_of(tmp_path / "run")[-1]
+    assert {f"R@{k}": recall for k, recall in expected.recalls.items()}.items() <= line.items()
+    seen = []
+    monkeypatch.setattr(
+        run_module,
+        "evaluate",
+        lambda params, model, *rest, **options: seen.append(model) or [expected],
+    )
+    fit(config, places, tmp_path / "again", validation=town, quiet=True)
+    assert seen == [larger]
 
 
 def test_a_validation_watches_the_transport_on_the_first_queries(

@@ -121,6 +121,11 @@ def with_resizing(config: TrainConfig, **fields: Any) -> TrainConfig:
     return dataclasses.replace(config, model=model)
 
 
+def validated_at(config: TrainConfig, preset: str, size: tuple[int, int]) -> TrainConfig:
+    """Set the size that a recipe's code validates at; of preset tiny it is the model's."""
+    return dataclasses.replace(config, validation_size=None if preset == "tiny" else size)
+
+
 def split_name(name: str) -> tuple[str | None, str]:
     """Split RECIPE+PART into the two; of a part alone the recipe is None.
 
@@ -193,13 +198,13 @@ def _with_aggregator(config: TrainConfig, part: Any) -> TrainConfig:
     """
     cross_image = dataclasses.replace(config.model.cross_image, layers=0)
     model = dataclasses.replace(config.model, aggregator=part, cross_image=cross_image)
-    return dataclasses.replace(config, model=model)
+    return dataclasses.replace(config, model=model, validation_size=None)
 
 
 def _with_backbone(config: TrainConfig, part: Any) -> TrainConfig:
     model = dataclasses.replace(config.model, backbone=part)
     trainable = "head" if getattr(part, "adapter", None) is None else config.trainable
-    return dataclasses.replace(config, model=model, trainable=trainable)
+    return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
 
 
 def _with_loss(config: TrainConfig, part: Any) -> TrainConfig:

@@ -7,7 +7,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe, with_resizing
+from crisalad_jax.training.recipes.base import register_recipe, validated_at, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 
@@ -16,10 +16,10 @@ def boq(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of BoQ over DINOv2, whose last two blocks train.
 
     The head is that of the published weights, of 12,288 numbers; the code's own default is wider
-    and has 8,192. The code validates at 322 x 322, here at the size of training.
+    and has 8,192.
     """
     backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
-    return trained_as_boq(
+    config = trained_as_boq(
         without_encoder(
             model,
             backbone=backbone,
@@ -28,6 +28,7 @@ def boq(model: ModelConfig, preset: str) -> TrainConfig:
         ),
         trainable="last-2-blocks+head",
     )
+    return validated_at(config, preset, (322, 322))
 
 
 def trained_as_boq(model: ModelConfig, *, trainable: str) -> TrainConfig:

@@ -17,7 +17,7 @@ from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, validated_at
 from crisalad_jax.training.recipes.boq import trained_as_boq
 from crisalad_jax.training.recipes.mixvpr import MIXVPR_OPTIMISER
 
@@ -103,16 +103,16 @@ def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
 def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of BoQ over ResNet-50, whose second and third stages train.
 
-    The head is that of the published weights, of 16,384 numbers. The code validates at 384 x 384,
-    here at the size of training.
+    The head is that of the published weights, of 16,384 numbers.
     """
     queries: Any = AGGREGATORS.make("boq", preset)
     if preset != _TINY:
         queries = dataclasses.replace(queries, channels=512)
-    return trained_as_boq(
+    config = trained_as_boq(
         model_over(preset, model, ResNetConfig(stages=3), queries, (320, 320)),
         trainable="last-2-blocks+head",
     )
+    return validated_at(config, preset, (384, 384))
 
 
 @register_recipe("cosplace")

@@ -6,7 +6,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe, with_resizing
+from crisalad_jax.training.recipes.base import register_recipe, validated_at, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 _ADAPTER_WIDTH = 4
@@ -14,10 +14,7 @@ _ADAPTER_WIDTH = 4
 
 @register_recipe("edtformer")
 def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make EDTformer's recipe: adapters beside the blocks, a decoder, Adam with step decay.
-
-    The code validates at 322 x 322, here at the size of training.
-    """
+    """Make EDTformer's recipe: adapters beside the blocks, a decoder, Adam with step decay."""
     adapter = AdapterConfig(kind="side", bottleneck=_ADAPTER_WIDTH / model.backbone.dim, alpha=0.5)
     backbone = dataclasses.replace(model.backbone, adapter=adapter)
     aggregator = AGGREGATORS.make("edtformer", preset)
@@ -30,4 +27,6 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
         epochs=15,
         patience=15,
     )
-    return with_resizing(config, pixels="floats", round_to_patch=True)
+    return validated_at(
+        with_resizing(config, pixels="floats", round_to_patch=True), preset, (322, 322)
+    )

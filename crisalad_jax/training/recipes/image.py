@@ -7,7 +7,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe, with_resizing
+from crisalad_jax.training.recipes.base import register_recipe, validated_at, with_resizing
 from crisalad_jax.training.recipes.crisalad import without_encoder
 
 
@@ -16,7 +16,7 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
     """Make ImAge's recipe: DINOv2 with registers, whose blocks train from the tokens' on.
 
     The tokens start from centroids of the last features of 5,000 training images. The code takes
-    images of MSLS for these, unless asked otherwise, at 322 x 322; it validates at that size too.
+    images of MSLS for these, unless asked otherwise, at 322 x 322.
     """
     tokens: Any = AGGREGATORS.make("aggregation-tokens", preset)
     backbone: Any = dataclasses.replace(
@@ -38,4 +38,6 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
         select_by="R@1+R@5",
         patience=20,
     )
-    return with_resizing(config, pixels="floats", round_to_patch=True)
+    return validated_at(
+        with_resizing(config, pixels="floats", round_to_patch=True), preset, (322, 322)
+    )
