@@ -57,7 +57,9 @@ def run(arguments: CompileCheck) -> None:
     """Print the table of what was compiled, write it as JSON, and compare it where asked."""
     from crisalad_jax.experiments.compile_check import compile_check, differences, read_check
     from crisalad_jax.experiments.compile_check.tables import check_tables
+    from crisalad_jax.experiments.compile_check.targets import compile_on_cpu
 
+    compile_on_cpu()
     check_json(arguments.json)
     talk_beside(arguments.json)
     expected = None if arguments.expect is None else read_check(arguments.expect)

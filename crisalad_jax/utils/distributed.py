@@ -84,6 +84,11 @@ def join_processes(
     try:
         jax.distributed.initialize(**given)
     except (ValueError, RuntimeError) as error:
+        if coordinator == "auto":
+            raise InputError(
+                f"--coordinator-address: found auto, and nothing that tells JAX of the others "
+                f"({error}), expected Slurm, Open MPI, Kubernetes or a Cloud TPU; or HOST:PORT"
+            ) from error
         raise InputError(f"processes: cannot meet the others: {error}") from error
 
 

@@ -1,5 +1,6 @@
 """Attention against torch's scaled_dot_product_attention and nn.MultiheadAttention."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -220,7 +221,7 @@ def test_a_tpus_kernel_takes_rotated_heads_and_bfloat16(interpreted: list[None])
     expected, slopes = with_gradient(x, 2, rotation=angles(48, 64))
     with lowering_for(TPU):
         found, gradients = with_gradient(x, 2, rotation=angles(48, 64))
-        half, _ = with_gradient(x.astype(jnp.bfloat16), 2, rotation=angles(48, 64))
+        half, halves = with_gradient(x.astype(jnp.bfloat16), 2, rotation=angles(48, 64))
     assert len(interpreted) == 4
     np.testing.assert_allclose(found, expected, atol=1e-6)
     for ours, theirs in zip(jax.tree.leaves(gradients), jax.tree.leaves(slopes), strict=True):
@@ -228,6 +229,56 @@ def test_a_tpus_kernel_takes_rotated_heads_and_bfloat16(interpreted: list[None])
     assert half.dtype == jnp.bfloat16
     # bfloat16 keeps 8 bits: inputs, weights and outputs of order 1 are each off by up to 2^-9.
     np.testing.assert_allclose(half.astype(jnp.float32), expected, atol=0.02)
+    for ours, theirs in zip(jax.tree.leaves(halves), jax.tree.leaves(slopes), strict=True):
+        # The same numbers of 8 bits, twice: of the forward pass and of the gradient.
+        atol = 0.03 * np.abs(theirs).max()
+        np.testing.assert_allclose(ours.astype(jnp.float32), theirs, atol=atol)
+
+
+def kernels(jaxpr: Any) -> Iterator[Any]:
+    """Find the kernels of a program, and of those that it calls."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "pallas_call":
+            yield equation.params["jaxpr"]
+        for value in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda each: hasattr(each, "eqns")
+        ):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns") and equation.primitive.name != "pallas_call":
+                yield from kernels(inner)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_a_tpus_kernel_multiplies_in_float32_and_sums_in_it(dtype: str) -> None:
+    """Interpret mode computes in float32 whatever is asked for: what is asked for is read here."""
+    x = sample(420, 128).astype(dtype)  # rows of more than one chunk
+    # As `ModelConfig.precision` has it.
+    with lowering_for(TPU), jax.default_matmul_precision("highest"):
+        program = jax.make_jaxpr(lambda x: with_gradient(x, 2))(x)
+    found = list(kernels(program.jaxpr))
+    assert len(found) == 2  # forward, and the gradient
+    precision = jax.lax.Precision.HIGHEST if dtype == "float32" else jax.lax.Precision.DEFAULT
+    for kernel in found:
+        products = [each for each in kernel.eqns if each.primitive.name == "dot_general"]
+        assert len(products) >= 4
+        for product in products:
+            assert set(product.params["precision"]) == {precision}
+            assert product.params["preferred_element_type"] == jnp.float32
+            assert product.outvars[0].aval.dtype == jnp.float32
+    *_, backward = found
+    # Keys' and values' gradients are summed over chunks of queries before they are rounded.
+    sums = [each for each in backward.eqns if each.primitive.name in ("add", "add_any")]
+    assert sums
+    assert all(each.outvars[0].aval.dtype == jnp.float32 for each in sums)
+
+
+def test_a_tpus_kernel_runs_on_the_device_of_its_sequences() -> None:
+    mesh = jax.sharding.AbstractMesh((8,), ("image",))
+    qkv = jax.ShapeDtypeStruct((16, 9, 384), jnp.float32)
+    program = jax.make_jaxpr(lambda qkv: attention_pallas.attend(qkv, 2, 9, "highest", mesh))(qkv)
+    assert "shard_map" in str(program)
+    (kernel,) = [str(each) for each in program.jaxpr.eqns]
+    assert "f32[2,9,384]" in kernel  # two of sixteen sequences on each of eight devices
 
 
 def test_a_tpus_kernel_works_under_vmap(interpreted: list[None]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import jax
 import pytest
 
+from crisalad_jax.training import memory
 from crisalad_jax.training.memory import check_memory, memory_limit, memory_of
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import RECIPE
@@ -114,3 +115,18 @@ def test_memory_is_that_of_the_compiled_program():
 def test_a_limit_is_that_of_the_smallest_device():
     devices = [types.SimpleNamespace(memory_stats=lambda n=n: {"bytes_limit": n}) for n in (7, 5)]
     assert memory_limit(devices) == 5
+
+
+def test_processes_of_different_limits_decide_alike(monkeypatch):
+    """The least memory of all counts: else some would compile another program, and wait."""
+    asked = []
+
+    def all_max(*numbers: int) -> tuple[int, ...]:
+        asked.append(numbers)
+        # Another process has 5 GB, told as what it lacks of the most that there may be.
+        return (max(numbers[0], memory._MOST - 5 * GB // memory._KIB),)
+
+    monkeypatch.setattr(memory.distributed, "all_max", all_max)
+    words, _ = told(lambda size: 4 + size / 10, 100.0, 1)
+    assert "expected at most 5.0 GB; --micro-batch 8 takes 4.8 GB" in words
+    assert len(asked) == 1

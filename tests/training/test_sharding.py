@@ -12,7 +12,7 @@ PROGRAM = """
 import collections, dataclasses, re, sys, warnings
 import jax, numpy as np, optax
 from crisalad_jax.nn.model import describe, extract_tokens, init_crisalad
-from crisalad_jax.training import run
+from crisalad_jax.training import run, step as module
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.utils import devices as sharding
 from tests.conftest import RECIPE
@@ -30,7 +30,7 @@ assert devices.mesh.size == 8
 images, valid = np.asarray(pictures(COUNT)), np.arange(COUNT) != 3
 key = jax.random.key(1)
 
-def step(model, shared=None, told=False, **options):
+def step(model, shared=None, told=False, lowered=False, **options):
     config = StepConfig(model, RECIPE.loss, SGD, 10, **options)
     params = init_crisalad(jax.random.key(0), model)
     state, frozen = init_train_state(params, "adapters+head", config)
@@ -44,6 +44,8 @@ def step(model, shared=None, told=False, **options):
             rows[5] = told
             more = (shared.replicate(np.asarray(True)), shared.shard_batch(rows))
     arguments = state, frozen, *batch, key, config, *more
+    if lowered:
+        return train_step.lower(*arguments).as_text()
     if "count" in sys.argv:
         text = train_step.lower(*arguments).compile().as_text()
         return dict(sorted(collections.Counter(COLLECTIVE.findall(text)).items()))
@@ -60,6 +62,24 @@ assert MODEL.cross_image.dropout > 0 and MODEL.cross_image.layers == 2
 """
 COUNTS = """
 print(step(MODEL, devices, told=(0, 15, 0), micro_batch=8))
+# Whether the loss is computed whole on each device: of few images it is.
+whole, loss = [], module.metric_loss
+
+def metric_loss(*args, **options):
+    whole.append(sharding.image_mesh() is None)
+    return loss(*args, **options)
+
+module.metric_loss = metric_loss
+jax.clear_caches()
+text = step(dataclasses.replace(MODEL, compute_dtype="bfloat16"), devices, lowered=True)
+module.WHOLE_LOSS = COUNT - 1
+jax.clear_caches()
+step(MODEL, devices, lowered=True)
+print(whole)
+# A bfloat16 model's sums over devices are of float32 numbers.
+scatters = text.split("stablehlo.reduce_scatter")[1:]
+operands = [each.split(") -> ")[0].rpartition("tensor<")[2] for each in scatters]
+print([each.rpartition("x")[2] for each in operands])
 params = devices.replicate(init_crisalad(jax.random.key(0), MODEL))
 for function in describe, extract_tokens:
     text = function.lower(params, devices.shard_batch(images), MODEL).compile().as_text()
@@ -119,7 +139,13 @@ def test_a_step_exchanges_what_it_must_and_no_more() -> None:
     each layer's keys and values, and its first half nothing.
     """
     expected = "{'all-gather': 4, 'all-reduce': 1, 'reduce-scatter': 2}"
-    assert on_eight_devices(COUNTS, "count") == [expected, "{'all-gather': 2}", "{}"]
+    assert on_eight_devices(COUNTS, "count") == [
+        expected,
+        "[True, False]",
+        "['f32>', 'f32>']",
+        "{'all-gather': 2}",
+        "{}",
+    ]
 
 
 @pytest.mark.slow

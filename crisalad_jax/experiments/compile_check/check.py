@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from crisalad_jax.config.checks import choose, require
+from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.experiments.compile_check.counts import KERNEL, Counts, Work, count
 from crisalad_jax.experiments.compile_check.hlo import parse_hlo
@@ -228,12 +228,37 @@ def read_check(path: pathlib.Path) -> CompileCheck:
     """
     what = "the JSON of `crisalad compile-check --json`"
     value = read_json(path, what, quiet=True)
-    try:
-        programs = tuple(ProgramCheck(**each) for each in value["programs"])
-        config, versions = value["config"], value["versions"]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: found no {error}, expected {what}") from error
-    return CompileCheck(from_plain(TrainConfig, config, source=str(path)), programs, (), versions)
+    for name, kind in (("programs", list), ("config", dict), ("versions", dict)):
+        if not isinstance(value, dict) or not isinstance(value.get(name), kind):
+            raise InputError(f"{path}: found no {name}, expected {what}")
+    programs = tuple(
+        _program(each, f"{path}: programs[{number}]")
+        for number, each in enumerate(value["programs"])
+    )
+    config = from_plain(TrainConfig, value["config"], source=f"{path} (config)")
+    return CompileCheck(config, programs, (), value["versions"])
+
+
+def _program(value: Any, where: str) -> ProgramCheck:
+    """Make the figures of a program, each of its type."""
+    fields = {field.name: field.type for field in dataclasses.fields(ProgramCheck)}
+    if not isinstance(value, dict) or value.keys() != fields.keys():
+        found = ", ".join(map(str, value)) if isinstance(value, dict) else json.dumps(value)
+        raise InputError(f"{where}: found {found[:200]}, expected {', '.join(fields)}")
+    for name, annotation in fields.items():
+        each = value[name]
+        is_number = isinstance(each, int | float) and not isinstance(each, bool)
+        if name == "collectives":
+            right = isinstance(each, dict) and all(isinstance(n, int) for n in each.values())
+            expected = "an object of numbers"
+        elif annotation is str:
+            right, expected = isinstance(each, str), "a text"
+        else:
+            right = is_number or (each is None and name in ("compiler", "kernels"))
+            expected = "a number"
+        if not right:
+            raise InputError(f"{where}.{name}: found {json.dumps(each)}, expected {expected}")
+    return ProgramCheck(**value)
 
 
 def differences(found: CompileCheck, expected: CompileCheck) -> list[str]:
@@ -277,6 +302,8 @@ def differences(found: CompileCheck, expected: CompileCheck) -> list[str]:
     return lines
 
 
+_OF_PROGRAMS = ("model", "loss", "optimiser", "trainable", "micro_batch", "batch_norm")
+"""Fields of a configuration that compiled programs depend on."""
 _EXACT = ("aliased", "collectives", "bfloat16_sums", "fused_attention", "host_callbacks")
 
 
@@ -285,13 +312,17 @@ def _name(check: ProgramCheck) -> str:
 
 
 def _check_same(config: TrainConfig, expected: TrainConfig) -> None:
-    mine, theirs = _flat(to_plain(config)), _flat(to_plain(expected))
-    names = sorted(name for name in mine | theirs if mine.get(name) != theirs.get(name))
-    require(
-        not names,
-        f"--expect: found figures of another configuration ({', '.join(names[:3])}"
-        f"{', ...' if len(names) > 3 else ''}), expected those of this one",
+    mine, theirs = (
+        _flat({name: to_plain(each)[name] for name in _OF_PROGRAMS}) for each in (config, expected)
     )
+    names = sorted(name for name in mine | theirs if mine.get(name) != theirs.get(name))
+    if names:
+        first = names[0]
+        more = f" and {len(names) - 1} more fields" if len(names) > 1 else ""
+        raise InputError(
+            f"--expect: found figures for {first} {json.dumps(theirs.get(first))}{more}, expected "
+            f"those of this configuration, {json.dumps(mine.get(first))}"
+        )
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

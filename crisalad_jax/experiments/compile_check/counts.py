@@ -60,8 +60,9 @@ class Counts(NamedTuple):
     collectives: dict[str, int]
     """Number of collectives in the program's text, by kind."""
     bfloat16_sums: int
-    """Number of collectives in the text that sum bfloat16 numbers. A float32 sum whose result a TPU
-    rounds as it arrives is none."""
+    """Number of collectives in the text that sum bfloat16 numbers. Two of a TPU's round no sum: of
+    float32 numbers, whose result is rounded as it arrives; and a gather that is written as a sum,
+    in which each number comes from one device and the others add zeros."""
     fused_attention: int
     """Number of calls in the text of cuDNN's attention, and of Pallas kernels on a TPU."""
     host_callbacks: int
@@ -105,7 +106,7 @@ def count(
     return Counts(
         work,
         dict(collections.Counter(str(_collective(each)) for each in collectives)),
-        sum(map(_bfloat16_sums, module.computations.values())),
+        sum(_bfloat16_sums(each, module) for each in module.computations.values()),
         sum(each.target == KERNEL or each.target.startswith(_CUDNN) for each in operations),
         sum(map(_waits_for_host, operations)),
         counter.unknown_loops,
@@ -117,7 +118,7 @@ def _collective(operation: Operation) -> str | None:
     return kind if kind in COLLECTIVES else None
 
 
-def _bfloat16_sums(computation: Computation) -> int:
+def _bfloat16_sums(computation: Computation, module: Module) -> int:
     operations = computation.operations
     sums = [
         each
@@ -125,9 +126,21 @@ def _bfloat16_sums(computation: Computation) -> int:
         if _collective(each) in ("all-reduce", "reduce-scatter")
     ]
     return sum(
-        any(array.dtype == "bf16" for name in each.operands for array in operations[name].arrays)
+        any(
+            array.dtype == "bf16" and not _is_one_devices(operations[name], module)
+            for name in each.operands
+            for array in operations[name].arrays
+        )
         for each in sums
     )
+
+
+def _is_one_devices(operation: Operation, module: Module) -> bool:
+    """Return whether a result is a device's own part in a place of zeros for all."""
+    if operation.kind == "fusion":
+        (body,) = [name for key, name in operation.called if key == "calls"]
+        operation = module.computations[body].root
+    return operation.kind == "dynamic-update-slice"
 
 
 def _waits_for_host(operation: Operation) -> bool:

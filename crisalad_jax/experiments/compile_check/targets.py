@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal
 
+import jax
+
 from crisalad_jax.config.checks import require
 from crisalad_jax.experiments.compile_check.kernels import dump_folder
 from crisalad_jax.utils.errors import InputError
@@ -94,8 +96,9 @@ class Machine:
 
     def check_batch(self, images: int) -> None:
         """Raise InputError where the devices cannot share so many images equally."""
+        require(images > 0, f"batch size: found {images} images, expected at least 1")
         require(
-            images > 0 and images % self.devices == 0,
+            images % self.devices == 0,
             f"batch size: found {images} images for {self.devices} devices, expected a multiple of "
             f"{self.devices}",
         )
@@ -124,6 +127,15 @@ COMPILER_OPTIONS: Mapping[str, dict[str, Any]] = {
 """XLA's options by platform."""
 _COMPILERS = {"tpu": ("libtpu",), "cuda": ("jax_plugins.xla_cuda12", "jax_plugins.xla_cuda13")}
 _PACKAGES = {"tpu": "libtpu", "cuda": "jax_cuda12_plugin"}
+
+
+def compile_on_cpu() -> None:
+    """Let JAX look for no GPU, before it is first used: nothing runs, and the plug-in would fail.
+
+    An environment that names platforms is left as it is.
+    """
+    if not jax.config.jax_platforms:  # pyright: ignore
+        jax.config.update("jax_platforms", "cpu")
 
 
 def check_compiler(machine: Machine, name: str) -> None:
@@ -164,6 +176,7 @@ def devices_of(machine: Machine) -> Sequence[Any]:
     except Exception as error:  # jaxlib's own class, which differs by version
         raise InputError(
             f"{machine.card.name}: found that the installed compiler has no topology "
-            f"{machine.topology} ({error}), expected the versions of crisalad-jax[accelerators]"
+            f"{machine.topology} ({error}), expected the versions of crisalad-jax[accelerators], "
+            "and JAX_PLATFORMS=cpu or not set"
         ) from error
     return topology.devices[: machine.devices]

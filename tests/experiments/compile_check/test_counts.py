@@ -126,6 +126,14 @@ TPU = """HloModule jit_step, is_scheduled=true
   ROOT %sum.2 = f32[] add(%a.2, %b.2)
 }
 
+%placed (part: bf16[800]) -> bf16[6400] {
+  %part.1 = bf16[800]{0:T(1024)} parameter(0)
+  %nothing = bf16[] constant(0)
+  %zeros = bf16[6400]{0:T(1024)} broadcast(%nothing), dimensions={}
+  %place = s32[]{:T(128)} constant(800)
+  ROOT %update = bf16[6400]{0:T(1024)} dynamic-update-slice(%zeros, %part.1, %place)
+}
+
 %usual (given: f32[1024]) -> f32[1024] {
   %given = f32[1024]{0:T(1024)} parameter(0)
   ROOT %same = f32[1024]{0:T(1024)} negate(%given), backend_config={"window_config":{"estimated_cycles":"40"}}
@@ -149,6 +157,8 @@ ENTRY %main (x: bf16[24,257,768], w: bf16[12,768,2304], f: f32[1024], g: bf16[80
   %all-gather = f32[8192]{0:T(1024)} all-gather(%f), channel_id=2, replica_groups=mesh['axis_0'=8,'axis_1'=1] {'axis_0'}, dimensions={0}
   %part = f32[1024]{0:T(1024)} reduce-scatter(%all-gather), channel_id=3, replica_groups={{0,1,2,3,4,5,6,7}}, to_apply=%add
   %rounded = bf16[1024]{0:T(1024)} all-reduce(%f), channel_id=4, replica_groups=[1,8]<=[8], to_apply=%add.2
+  %own = bf16[6400]{0:T(1024)} fusion(%g), kind=kLoop, calls=%placed
+  %gathered = bf16[6400]{0:T(1024)} all-reduce(%own), channel_id=5, replica_groups=[1,8]<=[8], to_apply=%add
   %outfeed = token[] outfeed(%f)
   ROOT %choice = f32[1024]{0:T(1024)} conditional(%zero, %part, %part), branch_computations={%rare, %usual}
 }
@@ -158,8 +168,9 @@ ENTRY %main (x: bf16[24,257,768], w: bf16[12,768,2304], f: f32[1024], g: bf16[80
 def test_a_text_for_tpus_counted_by_hand():
     counts = count(parse_hlo(TPU), devices=8)
     by_name = {each.name: each for each in counts.work}
-    assert counts.collectives == {"all-reduce": 2, "all-gather": 1, "reduce-scatter": 1}
-    # The second sum is of float32 numbers, as a TPU prints it, and rounded as it arrives.
+    assert counts.collectives == {"all-reduce": 3, "all-gather": 1, "reduce-scatter": 1}
+    # The second sum is of float32 numbers, as a TPU prints it, and rounded as it arrives. The third
+    # is a gather: each device adds its own part, and zeros.
     assert (counts.bfloat16_sums, counts.fused_attention, counts.host_callbacks) == (1, 1, 1)
     # The limit of the loop is in its condition.
     assert by_name["kernel"].times == 12
