@@ -73,6 +73,8 @@ def test_a_compiler_that_is_not_installed_is_named(without_compilers, capfd, tar
         (("--preset", "huge"), ("preset: found 'huge'", "tiny")),
         (("--expect", "none.json"), ("none.json",)),
         (("--keep", "nowhere"), ("nowhere: found no folder",)),
+        (("--batch-size", "0"), ("batch size: found 0 images, expected at least 1",)),
+        (("--batch-size", "-3"), ("batch size: found -3 images, expected at least 1",)),
         (("--model.compute-dtype", "int8"), ("compute-dtype", "int8")),
     ],
 )
@@ -95,17 +97,45 @@ def test_figures_of_another_configuration(tmp_path: pathlib.Path, capfd):
         capfd,
         *("compile-check", "--preset", "tiny", "--model.compute-dtype", "bfloat16"),
         *("--targets", "v5e-8", "--expect", file),
-        words=("found figures of another configuration (model.compute_dtype)",),
+        words=(
+            'found figures for model.compute_dtype "float32", expected those of this '
+            'configuration, "bfloat16"',
+        ),
     )
 
 
-def test_a_file_of_something_else(tmp_path: pathlib.Path, capfd):
+PLAIN = json.loads(json.dumps(CHECK.as_json()))
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ({"programs": [{"target": "v5e-8"}]}, "found no config, expected the JSON of"),
+        ([1, 2], "found no programs, expected the JSON of `crisalad compile-check --json`"),
+        (PLAIN | {"programs": [1]}, "programs[0]: found 1, expected target, program, images"),
+        (PLAIN | {"programs": [{"target": "h100"}]}, "programs[0]: found target, expected target,"),
+        (
+            PLAIN | {"programs": [PLAIN["programs"][0] | {"memory": "much"}]},
+            'programs[0].memory: found "much", expected a number',
+        ),
+        (
+            PLAIN | {"programs": [PLAIN["programs"][0] | {"flops": None}]},
+            "programs[0].flops: found null, expected a number",
+        ),
+        (
+            PLAIN | {"programs": [PLAIN["programs"][0] | {"collectives": [1]}]},
+            "programs[0].collectives: found [1], expected an object of numbers",
+        ),
+        (PLAIN | {"config": 5}, "found no config, expected the JSON of"),
+    ],
+)
+def test_a_file_of_something_else(tmp_path: pathlib.Path, capfd, value, words):
     file = tmp_path / "other.json"
-    file.write_text(json.dumps({"programs": [{"target": "v5e-8"}]}))
+    file.write_text(json.dumps(value))
     fails(
         capfd,
         *("compile-check", "--preset", "tiny", "--targets", "v5e-8", "--expect", file),
-        words=(file, "expected the JSON of `crisalad compile-check --json`"),
+        words=(file, words),
     )
 
 
