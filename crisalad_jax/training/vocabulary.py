@@ -149,8 +149,10 @@ def start_vocabulary(
         InputError: no such preset or aggregator, or one without a vocabulary; a field that it does
             not have; or a checkpoint that cannot be read or is of another size.
     """
-    name = aggregator if aggregator in RECIPES else f"crisalad+{aggregator}"
-    config = recipe(preset, name).model
+    # A recipe that mines is over another backbone than the preset's: of NetVLAD the head is meant.
+    mines = aggregator in RECIPES and recipe(preset, aggregator).mining.kind != "none"
+    own = aggregator in RECIPES and not (mines and aggregator in AGGREGATORS)
+    config = recipe(preset, aggregator if own else f"crisalad+{aggregator}").model
     part = config.aggregator
     _check_vocabulary(config, "--aggregator: found")
     known = [field.name for field in dataclasses.fields(part)]

@@ -123,8 +123,12 @@ def parts_for_caches(images: int, at_once: int) -> int:
     """
     if not images or target().platform != "cpu":
         return 1
-    together = images % jax.process_count() == 0
-    share = images // devices_for(images, processes=together).mesh.size
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.axis_names == (IMAGE,) and mesh.axis_types == (AxisType.Manual,):
+        share = images  # within `jax.shard_map` they are a device's own
+    else:
+        together = images % jax.process_count() == 0
+        share = images // devices_for(images, processes=together).mesh.size
     return share // max(n for n in range(1, max(1, at_once) + 1) if share % n == 0)
 
 
