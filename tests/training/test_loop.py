@@ -290,24 +290,23 @@ def test_validations_come_every_so_many_epochs_and_at_the_end(
 
 def test_a_validation_has_its_own_size(shared, places, tmp_path, monkeypatch):
     """Recalls of the model at that size, by hand; the weights keep the size of training."""
-    town = open_benchmark(shared / "town")
+    town, seen = open_benchmark(shared / "town"), []
+
+    def recorded(params, model, *rest, **options):
+        seen.append(model)
+        return evaluate(params, model, *rest, **options)
+
+    monkeypatch.setattr(run_module, "evaluate", recorded)
     config = dataclasses.replace(ENDLESS, epochs=1, validation_size=(56, 84))
-    result = fit(config, places, tmp_path / "run", validation=town, quiet=True)
-    params, model = load_weights(tmp_path / "run" / "best.safetensors")
+    result = fit(config, places, tmp_path, validation=town, quiet=True)
+    params, model = load_weights(tmp_path / "best.safetensors")
     assert model == config.model
     larger = dataclasses.replace(model, image_size=(56, 84))
+    assert seen == [larger]
     (expected,) = evaluate(params, larger, town, groupings=("single",), quiet=True)
     assert result.best_recall == expected.recalls[5]
-    line = metrics_of(tmp_path / "run")[-1]
+    line = metrics_of(tmp_path)[-1]
     assert {f"R@{k}": recall for k, recall in expected.recalls.items()}.items() <= line.items()
-    seen = []
-    monkeypatch.setattr(
-        run_module,
-        "evaluate",
-        lambda params, model, *rest, **options: seen.append(model) or [expected],
-    )
-    fit(config, places, tmp_path / "again", validation=town, quiet=True)
-    assert seen == [larger]
 
 
 def test_a_validation_watches_the_transport_on_the_first_queries(

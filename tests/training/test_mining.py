@@ -405,18 +405,19 @@ def test_query_sets_are_read_by_positions(street):
 
 
 def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
-    """Radii, and the images of a file, reach the reader; what is unreadable is told."""
+    """Radii, and the images of a file, reach the reader."""
     asked = {}
 
     def read(data, **options):
         asked.update(options, data=data)
-        return read_query_set(street)
+        raise InputError("read")
 
     monkeypatch.setattr("crisalad_jax.experiments.train.read_query_set", read)
     mining = dataclasses.replace(CONFIG.mining, positive_radius=4.0, negative_radius=50.0)
     config = dataclasses.replace(CONFIG, mining=mining, epochs=1)
     file = tmp_path / "set.mat"
-    train(config, file, tmp_path / "run", images=street, quiet=True)
+    with pytest.raises(InputError, match="^read$"):
+        train(config, file, tmp_path / "run", images=street, quiet=True)
     assert asked == {
         "data": file,
         "positive_radius": 4.0,
