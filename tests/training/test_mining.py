@@ -416,7 +416,7 @@ def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
     mining = dataclasses.replace(CONFIG.mining, positive_radius=4.0, negative_radius=50.0)
     config = dataclasses.replace(CONFIG, mining=mining, epochs=1)
     file = tmp_path / "set.mat"
-    with pytest.raises(InputError, match="^read$"):
+    with pytest.raises(InputError, match=r"^read$"):
         train(config, file, tmp_path / "run", images=street, quiet=True)
     assert asked == {
         "data": file,
