@@ -18,7 +18,6 @@ from crisalad_jax.utils.errors import InputError
 class QuerySet:
     """Queries that have positives in a database, and these positives."""
 
-    name: str
     root: pathlib.Path
     files: tuple[str, ...]
     """Image -> path, as text: the database, then all queries."""
@@ -71,13 +70,14 @@ def read_query_set(
     split = "train" if root.is_dir() and (has_split(root) or is_msls(root)) else None
     check_radius(positive_radius)
     check_radius(negative_radius)
-    benchmark = open_benchmark(root, split, images=images)
-    radii = positive_radius, negative_radius
     if root.is_dir() and is_msls(root):
         # Images of different cities match in no radius, whatever their positions.
-        positives, near = (read_msls(root, split, each).ground_truth() for each in radii)
+        benchmark = open_benchmark(root, split, negative_radius, images=images)
+        near = benchmark.ground_truth()
+        positives = read_msls(root, split, positive_radius).ground_truth()
     else:
-        positives, near = _matches(benchmark, *radii)
+        benchmark = open_benchmark(root, split, images=images)
+        positives, near = _matches(benchmark, positive_radius, negative_radius)
     kept = [query for query, matches in enumerate(positives) if matches.size]
     if not kept:
         raise InputError(
@@ -91,7 +91,6 @@ def read_query_set(
             "query, expected some farther, as negatives"
         )
     return QuerySet(
-        name=benchmark.name,
         root=benchmark.root,
         files=tuple(map(str, (*benchmark.database, *benchmark.queries))),
         database=count,

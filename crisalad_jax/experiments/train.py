@@ -128,7 +128,7 @@ def train(
 def _read_set(config: TrainConfig, data: Path, images: Path | None) -> Places | QuerySet:
     """Read the training set: places, or queries of which tuples are mined."""
     mining = config.mining
-    if mining.kind == "none":
+    if not config.mines:
         if images is not None:
             raise InputError("--data-images: found for places, expected it for queries alone")
         return read_places(

@@ -230,7 +230,7 @@ class TrainConfig:
             f"TrainConfig.optimiser.accumulate: found {self.optimiser.accumulate}, expected 1 for "
             f"loss {self.loss.kind.part_name}, whose classifiers step with every batch",
         )
-        mined = self.mining.kind != "none"
+        mined = self.mines
         require(
             not mined or self.images_per_place == 2 + self.mining.negatives,
             f"TrainConfig.images_per_place: found {self.images_per_place} with mined tuples, "
@@ -267,6 +267,11 @@ class TrainConfig:
         if self.validation_size is not None:
             self.model.check_image_size(self.validation_size)
         check_seed("TrainConfig.seed", self.seed)
+
+    @property
+    def mines(self) -> bool:
+        """Whether it trains on tuples that are mined, and not on places."""
+        return self.mining.kind != "none"
 
     @property
     def validation_model(self) -> ModelConfig:

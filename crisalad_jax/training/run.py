@@ -25,7 +25,7 @@ from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.model import Crisalad, cast_params, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.describe import group, tokens_in_batches
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.batches import (
     Rounds,
@@ -70,8 +70,8 @@ WATCHED_QUERIES = 16
 """Number of images whose transport statistics every validation logs."""
 SELECTED = {"R@1": (1,), "R@5": (5,), "R@1+R@5": (1, 5)}
 """Ranks whose recalls are added, by `TrainConfig.select_by`."""
-DESCRIBED_AT_ONCE = 1024
-"""Number of images whose tokens are in memory while tuples are mined."""
+DESCRIBED_AT_ONCE = 16
+"""Number of images of a batch while tuples are mined."""
 SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
 
@@ -313,23 +313,21 @@ class Run:
 
         def describe(images: np.ndarray) -> np.ndarray:
             nonlocal unreadable
-            rows = np.empty((len(images), config.model.descriptor_dim), np.float32)
-            for start in range(0, len(images), DESCRIBED_AT_ONCE):
-                part = slice(start, start + DESCRIBED_AT_ONCE)
-                paths = [queries.path(image) for image in images[part]]
-                tokens = read_tokens(
-                    params,
-                    config.model,
-                    paths,
-                    batch_size=16,
-                    label="mining",
-                    on_bad_image=on_bad_image,
-                    cache=self._cache,
-                    quiet=True,
+            rows = np.full((len(images), config.model.descriptor_dim), np.nan, np.float32)
+            batches = tokens_in_batches(
+                params,
+                config.model,
+                [queries.path(image) for image in images],
+                batch_size=DESCRIBED_AT_ONCE,
+                on_bad_image=on_bad_image,
+                cache=self._cache,
+            )
+            for tokens, batch in batches:
+                described = group(
+                    params, config.model, tokens, "single", batch_size=DESCRIBED_AT_ONCE
                 )
-                rows[part] = group(params, config.model, tokens, "single", batch_size=16)
-                rows[part][~tokens.readable] = np.nan
-                unreadable += int((~tokens.readable).sum())
+                rows[batch.indices[batch.valid]] = described[batch.valid]
+                unreadable += int(((batch.indices >= 0) & ~batch.valid).sum())
             return rows
 
         mined = mine_tuples(
@@ -595,9 +593,8 @@ def check_set(config: TrainConfig, places: Places | QuerySet) -> None:
     Raises:
         InputError: it is not.
     """
-    mines = config.mining.kind != "none"
-    if mines != isinstance(places, QuerySet):
-        found, expected = ("places", "a QuerySet") if mines else ("a QuerySet", "places")
+    if config.mines != isinstance(places, QuerySet):
+        found, expected = ("places", "a QuerySet") if config.mines else ("a QuerySet", "places")
         raise InputError(
             f"places: found {found} with mining {config.mining.kind!r}, expected {expected}"
         )

@@ -261,7 +261,7 @@ def step_config(
         micro_batch=config.micro_batch,
         classes=classes,
         batch_norm=config.batch_norm,
-        tuples=config.mining.kind != "none",
+        tuples=config.mines,
     )
 
 

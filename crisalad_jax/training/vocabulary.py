@@ -28,7 +28,7 @@ from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad, unit_fea
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.photographs import photograph_batches
-from crisalad_jax.training.recipes import RECIPES, recipe
+from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target
@@ -150,8 +150,8 @@ def start_vocabulary(
             not have; or a checkpoint that cannot be read or is of another size.
     """
     # A recipe that mines is over another backbone than the preset's: of NetVLAD the head is meant.
-    mines = aggregator in RECIPES and recipe(preset, aggregator).mining.kind != "none"
-    own = aggregator in RECIPES and not (mines and aggregator in AGGREGATORS)
+    is_head = aggregator in AGGREGATORS and mines_tuples(aggregator)
+    own = aggregator in RECIPES and not is_head
     config = recipe(preset, aggregator if own else f"crisalad+{aggregator}").model
     part = config.aggregator
     _check_vocabulary(config, "--aggregator: found")

@@ -161,7 +161,6 @@ def line_set(database: list[float], queries: list[float]) -> QuerySet:
     apart = np.abs(np.subtract.outer(queries, database))
     kept = [q for q, row in enumerate(apart) if (row <= 10).any()]
     return QuerySet(
-        "street",
         pathlib.Path("street"),
         tuple(f"{n}.jpg" for n in range(len(database) + len(queries))),
         len(database),

@@ -11,6 +11,7 @@ from crisalad_jax.training.recipes import (
     RENAMED,
     find_part,
     from_scratch,
+    mines_tuples,
     recipe,
     split_name,
     with_part,
@@ -77,7 +78,7 @@ def method_of(name: str, preset: str) -> ComparedMethod:
     """
     if name in METHODS:
         return METHODS[name]
-    if _mines(name):
+    if mines_tuples(name):
         tell(
             f"--methods: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
             f"{name} here, trained on places as all others are (`crisalad train` has the recipe)"
@@ -104,12 +105,7 @@ def is_method(name: str) -> bool:
         (True, True, False)
     """
     named = name in METHODS or name in RECIPES or name in OLD_NAMES
-    return (named and not _mines(name)) or "+" in name or ":" in name
-
-
-def _mines(name: str) -> bool:
-    """Return whether a name is that of a recipe that mines tuples."""
-    return name in RECIPES and recipe("b14", name).mining.kind != "none"
+    return (named and not mines_tuples(name)) or "+" in name or ":" in name
 
 
 def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> TrainConfig:

@@ -137,6 +137,16 @@ def split_name(name: str) -> tuple[str | None, str]:
     return (base, part) if plus and base in RECIPES else (None, name)
 
 
+def mines_tuples(name: str) -> bool:
+    """Return whether a name is that of a recipe that mines tuples.
+
+    Example:
+        >>> mines_tuples("netvlad"), mines_tuples("salad"), mines_tuples("crisalad+netvlad")
+        (True, False, False)
+    """
+    return name in RECIPES and recipe("b14", name).mines
+
+
 def find_part(
     name: str, preset: str, *, what: str = "recipe", others: Iterable[str] = RECIPES
 ) -> Part:
@@ -282,7 +292,7 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         augmentation=LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6)
         if built_in
         else config.augmentation,
-        **(batches if config.mining.kind == "none" else {}),
+        **({} if config.mines else batches),
         batch_order="shuffled",
         epochs=150,
         validate_every=10,
