@@ -55,6 +55,8 @@ from crisalad_jax.nn.model import self_mask as self_mask
 from crisalad_jax.nn.model import valid_mask as valid_mask
 from crisalad_jax.nn.projection import ProjectionConfig as ProjectionConfig
 from crisalad_jax.nn.tokens import Tokens as Tokens
+from crisalad_jax.retrieval.alone import describe_files as describe_files
+from crisalad_jax.retrieval.alone import describe_images as describe_images
 from crisalad_jax.retrieval.extract import extract as extract
 from crisalad_jax.retrieval.maps.build import index as index
 from crisalad_jax.retrieval.maps.map import Map as Map

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
+from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.notes import tell
@@ -48,7 +49,10 @@ _REDUCED = (
 
 
 def read_image(
-    path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
+    path: str | os.PathLike[str],
+    size: tuple[int, int] | None = None,
+    *,
+    enough: tuple[int, int] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image file as 8-bit RGB, upright.
 
@@ -66,6 +70,8 @@ def read_image(
 
     Args:
         path: the image file.
+        size: height and width in pixels to resize to, by the default of `resize_image`; None keeps
+            the file's. Where a model has another way, `prepare_image` follows it.
         enough: height and width in pixels that the image will be resized to; None for full size.
 
     Returns:
@@ -73,11 +79,14 @@ def read_image(
 
     Raises:
         InputError: the file is missing, a folder, empty, cut short, larger than 2**28 pixels
-            (`opencv.MAX_PIXELS`), or no image of the formats above. Never half a picture.
+            (`opencv.MAX_PIXELS`), or no image of the formats above; never half a picture. Or a
+            `size` without a pixel.
 
     Example:
         >>> read_image(pictures / "0.png").shape
         (60, 80, 3)
+        >>> read_image(pictures / "0.png", (224, 224)).shape
+        (224, 224, 3)
     """
     data = read_bytes(path, "an image file")
     if not data:
@@ -107,7 +116,7 @@ def read_image(
         raise InputError(f"{path}: OpenCV cannot decode this image: {reason}") from error
     if image is None:
         raise InputError(f"{path}: found {len(data)} bytes that do not decode, expected {_FORMATS}")
-    return image
+    return image if size is None else resize_image(image, size)
 
 
 def _jpeg_is_whole(data: bytes) -> bool:

@@ -3,11 +3,10 @@
 import dataclasses
 import os
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int64
 
 from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.preprocessing import PreprocessingConfig
@@ -16,7 +15,8 @@ from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions, read_positions, utm_positions
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
-from crisalad_jax.retrieval.describe import group, tokens_in_batches, useful_batch_size
+from crisalad_jax.retrieval.alone import Described, describe_alone
+from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.manifest import (
     MapDescription,
@@ -33,43 +33,6 @@ from crisalad_jax.utils.progress import progress_bar
 
 SEGMENT = 256
 """Number of images appended together, and so described again at most after a kill."""
-
-
-class Described(NamedTuple):
-    """Descriptors of a few images."""
-
-    indices: Int64[np.ndarray, " n"]
-    """Indices of the readable images in the list of paths."""
-    descriptors: Float32[np.ndarray, "n d"]
-    unreadable: Int64[np.ndarray, " _"]
-    """Indices of the images that could not be read."""
-
-
-def describe_alone(
-    params: Crisalad,
-    config: ModelConfig,
-    paths: Sequence[pathlib.Path],
-    *,
-    batch_size: int,
-    on_bad_image: OnBadImage = "stop",
-) -> Iterator[Described]:
-    """Describe images in order, each as if it were alone, and yield batch by batch.
-
-    The descriptors equal those of the grouping `single` (`retrieval.describe.group`). Two batches
-    are in memory, and the images that are read ahead.
-
-    Raises:
-        InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
-    """
-    stream = tokens_in_batches(
-        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image
-    )
-    for tokens, batch in stream:
-        descriptors = group(params, config, tokens, "single", batch_size=batch_size)
-        unreadable = (batch.indices >= 0) & ~batch.valid
-        yield Described(
-            batch.indices[batch.valid], descriptors[batch.valid], batch.indices[unreadable]
-        )
 
 
 class Indexed(NamedTuple):

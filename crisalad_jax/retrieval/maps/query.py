@@ -10,9 +10,9 @@ import numpy as np
 
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Crisalad, check_params
+from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
-from crisalad_jax.retrieval.maps.build import describe_alone
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours

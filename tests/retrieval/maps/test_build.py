@@ -9,8 +9,9 @@ import pytest
 import crisalad_jax.retrieval.maps.build
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.positions import Positions, utm_positions
+from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.describe import group, read_tokens
-from crisalad_jax.retrieval.maps.build import Indexed, describe_alone, index_images
+from crisalad_jax.retrieval.maps.build import Indexed, index_images
 from crisalad_jax.retrieval.maps.manifest import describe_map
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.utils.errors import InputError

@@ -1,0 +1,157 @@
+"""Descriptors of images that are each described alone: of files, or of pictures in memory."""
+
+import os
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.resize import Pixels
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
+from crisalad_jax.retrieval.describe import group, tokens_in_batches, useful_batch_size
+from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.progress import progress_bar
+
+
+class Described(NamedTuple):
+    """Descriptors of a few images."""
+
+    indices: Int64[np.ndarray, " n"]
+    """Indices of the readable images in the list of paths."""
+    descriptors: Float32[np.ndarray, "n d"]
+    unreadable: Int64[np.ndarray, " _"]
+    """Indices of the images that could not be read."""
+
+
+def describe_alone(
+    params: Crisalad,
+    config: ModelConfig,
+    paths: Sequence[pathlib.Path],
+    *,
+    batch_size: int,
+    on_bad_image: OnBadImage = "stop",
+) -> Iterator[Described]:
+    """Describe images in order, each as if it were alone, and yield batch by batch.
+
+    The descriptors equal those of the grouping `single` (`retrieval.describe.group`). Two batches
+    are in memory, and the images that are read ahead.
+
+    Raises:
+        InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
+    """
+    stream = tokens_in_batches(
+        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image
+    )
+    for tokens, batch in stream:
+        descriptors = group(params, config, tokens, "single", batch_size=batch_size)
+        unreadable = (batch.indices >= 0) & ~batch.valid
+        yield Described(
+            batch.indices[batch.valid], descriptors[batch.valid], batch.indices[unreadable]
+        )
+
+
+def describe_files(
+    params: Crisalad,
+    config: ModelConfig,
+    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    batch_size: int = 16,
+    quiet: bool = True,
+) -> Float32[np.ndarray, "image descriptor"]:
+    """Describe image files, each as if it were alone.
+
+    Files are decoded upright and resized as `config` says, which is all that a descriptor depends
+    on. `extract` does the same for folders, and writes files.
+
+    Args:
+        params: the model's parameters.
+        config: the model.
+        files: an image file, or a list of them.
+        batch_size: number of images described together.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        A descriptor of each file, in order.
+
+    Raises:
+        InputError: no files, one that cannot be read, a batch of none, or parameters that are not
+            of the configuration.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, init_crisalad
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> describe_files(params, config, pictures / "0.png").shape
+        (1, 576)
+    """
+    check_params(params, config)
+    check_grouping((), batch_size, seed=0)
+    given = [files] if isinstance(files, str | os.PathLike) else files
+    paths = [pathlib.Path(file) for file in given]
+    if not paths:
+        raise InputError("files: found none, expected at least one image file")
+    batch_size = useful_batch_size(batch_size, len(paths))
+    parts = []
+    with progress_bar("images", len(paths), "images", quiet=quiet) as bar:
+        for part in describe_alone(params, config, paths, batch_size=batch_size):
+            parts.append(part.descriptors)
+            bar.advance(len(part.indices))
+    return np.concatenate(parts)
+
+
+def describe_images(
+    params: Crisalad,
+    config: ModelConfig,
+    images: Sequence[Pixels],
+    *,
+    batch_size: int = 16,
+) -> Float32[np.ndarray, "image descriptor"]:
+    """Describe pictures in memory, each as if it were alone.
+
+    A batch is padded to a power of two, so that few programs are compiled, and one picture costs
+    one. The values differ from those of `describe_files` by the rounding of other batch sizes.
+
+    Args:
+        params: the model's parameters.
+        config: the model; pictures are resized as it says.
+        images: 8-bit RGB, of any sizes, as `read_image` returns them.
+        batch_size: largest number of images described together.
+
+    Returns:
+        A descriptor of each picture, in order.
+
+    Raises:
+        InputError: no pictures; one that is not 8-bit RGB or that the model cannot describe; a
+            batch of none.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS, init_crisalad
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> describe_images(params, config, [np.zeros((60, 80, 3), np.uint8)]).shape
+        (1, 576)
+    """
+    check_grouping((), batch_size, seed=0)
+    if not len(images):
+        raise InputError("images: found none, expected at least one picture")
+    prepared = [prepare_image(image, config) for image in images]
+    by_shape: dict[tuple[int, ...], list[int]] = {}
+    for number, image in enumerate(prepared):
+        by_shape.setdefault(image.shape, []).append(number)
+    descriptors = np.empty((len(prepared), config.descriptor_dim), np.float32)
+    for numbers in by_shape.values():
+        for start in range(0, len(numbers), batch_size):
+            part = numbers[start : start + batch_size]
+            count = min(batch_size, 1 << (len(part) - 1).bit_length())
+            batch = np.stack([prepared[part[i % len(part)]] for i in range(count)])
+            described = describe(params, batch, config, mask=self_mask(count))
+            descriptors[part] = np.asarray(described)[: len(part)]
+    return descriptors
