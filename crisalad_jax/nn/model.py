@@ -102,7 +102,8 @@ def parameter_shapes(config: ModelConfig) -> Crisalad:
 @functools.lru_cache(maxsize=64)
 def _shapes(config: ModelConfig, default: str) -> Crisalad:
     """Make the tree for JAX's `default` type of floats, which its 64-bit mode changes."""
-    return jax.eval_shape(lambda: init_crisalad(jax.random.key(0), config))
+    with draw.only_shapes():
+        return jax.eval_shape(lambda: init_crisalad(jax.random.key(0), config))
 
 
 def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> None:
