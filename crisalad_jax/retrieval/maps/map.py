@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import os
 import pathlib
+import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, Self
 
@@ -17,8 +18,11 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.weights import load_weights, model_hash
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.images import read_image
 from crisalad_jax.data.positions import Positions
+from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.alone import describe_images
 from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.manifest import (
     DESCRIPTION,
@@ -51,6 +55,17 @@ class MapImage(NamedTuple):
     root: str
 
 
+class Answer(NamedTuple):
+    """One image of a map, as an answer to a query."""
+
+    rank: int
+    """Rank from 1, the most similar."""
+    similarity: float
+    """Cosine of the two descriptors."""
+    image: MapImage
+    """The image: its name, and where it was taken."""
+
+
 class _Segment(NamedTuple):
     first: int
     count: int
@@ -68,9 +83,11 @@ class Map:
         >>> weights = folder / "weights.safetensors"
         >>> save_weights(weights, params, config)
         >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
-        >>> with Map.open(folder / "map") as places:
-        ...     len(places)
+        >>> places = Map.open(folder / "map")
+        >>> len(places)
         4
+        >>> places.locate(pictures / "2.png", k=1)[0].image.name
+        '2.png'
     """
 
     def __init__(self, folder: pathlib.Path, description: MapDescription, store: Store) -> None:
@@ -82,6 +99,7 @@ class Map:
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self._store = store
+        self._close = weakref.finalize(self, store.close)
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
@@ -107,7 +125,8 @@ class Map:
                 are always checked.
 
         Returns:
-            The map, a context manager that lets go of its store.
+            The map. It lets go of its store when it is closed, at the end of a `with`, or when
+            nothing refers to it any more.
 
         Raises:
             InputError: there is no map, it has no images yet, or it or its store is damaged,
@@ -228,6 +247,55 @@ class Map:
             raise InputError(f"{self.folder}: found a map without images, expected at least one")
         self._check_descriptors("queries", queries)
         return self._store.search(queries, min(k, len(self)), len(self))
+
+    def locate(
+        self,
+        image: Pixels | str | os.PathLike[str],
+        k: int = 5,
+        *,
+        params: Crisalad | None = None,
+    ) -> list[Answer]:
+        """Find the images of the map that are most similar to one picture.
+
+        The first call loads the model that made the map, and compiles it; later ones do neither.
+        `query` asks for many images at once.
+
+        Args:
+            image: a picture of 8-bit RGB, as `read_image` returns it, or its file.
+            k: number of answers; all where the map has fewer.
+            params: parameters of the model that made the map; None loads them from where they were.
+
+        Returns:
+            The answers, best first. Positions are in `axes`.
+
+        Raises:
+            InputError: a file that cannot be read, a picture that is not 8-bit RGB, k below 1; what
+                `load_params`, `check_params` and `search` raise.
+
+        Example:
+            >>> import jax
+            >>> from crisalad_jax import PRESETS, index, init_crisalad, read_image, save_weights
+            >>> config = PRESETS["tiny"]
+            >>> params = init_crisalad(jax.random.key(0), config)
+            >>> weights = folder / "weights.safetensors"
+            >>> save_weights(weights, params, config)
+            >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+            >>> answers = Map.open(folder / "map").locate(read_image(pictures / "3.png"), k=2)
+            >>> [(answer.rank, answer.image.name) for answer in answers][0]
+            (1, '3.png')
+        """
+        if k < 1:
+            raise InputError(f"k: found {k}, expected at least 1")
+        picture = read_image(image) if isinstance(image, str | os.PathLike) else image
+        if params is None:
+            params = self._checked or self.load_params()
+        self.check_params(params)
+        found = self.search(describe_images(params, self.description.config, [picture]), k)
+        pairs = zip(found.indices[0], found.similarities[0], strict=True)
+        return [
+            Answer(rank, float(similarity), self.images[number])
+            for rank, (number, similarity) in enumerate(pairs, 1)
+        ]
 
     def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
         length = self.description.descriptor_length
@@ -385,8 +453,8 @@ class Map:
             self._checked = params
 
     def close(self) -> None:
-        """Close the store."""
-        self._store.close()
+        """Close the store; a map that nothing refers to any more closes itself."""
+        self._close()
 
 
 @contextlib.contextmanager

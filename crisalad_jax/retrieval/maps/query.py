@@ -14,7 +14,7 @@ from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
-from crisalad_jax.retrieval.maps.map import Map, MapImage
+from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
@@ -22,17 +22,6 @@ from crisalad_jax.utils.progress import progress_bar
 
 AT_ONCE = 1024
 """Number of queries that are searched for together: the map is read once for so many."""
-
-
-class Answer(NamedTuple):
-    """One image of a map, as an answer to a query."""
-
-    rank: int
-    """Rank from 1, the most similar."""
-    similarity: float
-    """Cosine of the two descriptors."""
-    image: MapImage
-    """The image: its name, and where it was taken."""
 
 
 class Answers(NamedTuple):

@@ -1,5 +1,6 @@
 """Questions to a map in Python: answers that outlive it, in any portions the same."""
 
+import gc
 import json
 import pathlib
 
@@ -11,8 +12,9 @@ from rich.console import Console
 import crisalad_jax.retrieval.maps.query
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.tables import answers_table
-from crisalad_jax.data.images import list_images
+from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import (
     Answers,
@@ -149,3 +151,45 @@ def test_parameters_of_another_model_are_refused(folder, params, sides):
     other = jax.tree.map(lambda x: x + 1, params)
     with pytest.raises(InputError, match=r"found a map made by model \w+ .*, but the given param"):
         ask(folder, other, sides[1])
+
+
+def test_one_picture_is_located_as_by_a_query(folder, params, answers):
+    places = Map.open(folder)
+    for path, ranked in answers.rows():
+        for image in (path, str(path), read_image(path)):
+            found = places.locate(image, k=3)
+            assert [answer.image for answer in found] == [answer.image for answer in ranked]
+            # Batches of one and of many round otherwise: cosines of unit vectors in float32.
+            np.testing.assert_allclose(
+                [answer.similarity for answer in found],
+                [answer.similarity for answer in ranked],
+                atol=5e-6,
+            )
+            assert [answer.rank for answer in found] == [1, 2, 3]
+    assert len(places.locate(answers.queries[0], k=10**6, params=params)) == len(places)
+
+
+def test_what_locate_refuses(folder, params, answers):
+    places = Map.open(folder)
+    with pytest.raises(InputError, match="k: found 0, expected at least 1"):
+        places.locate(answers.queries[0], k=0)
+    with pytest.raises(InputError, match=r"nowhere\.png"):
+        places.locate("nowhere.png")
+    with pytest.raises(InputError, match="image: found float64 of shape"):
+        places.locate(np.zeros((8, 8, 3)))
+    with pytest.raises(InputError, match="found a map made by model"):
+        places.locate(answers.queries[0], params=jax.tree.map(lambda x: x + 1, params))
+
+
+def test_a_map_that_is_forgotten_closes_its_store(folder, monkeypatch):
+    closed = []
+    monkeypatch.setattr(FileStore, "close", lambda store: closed.append(store))
+    places = Map.open(folder)
+    assert not closed
+    del places
+    gc.collect()
+    assert len(closed) == 1
+    places = Map.open(folder)
+    places.close()
+    places.close()
+    assert len(closed) == 2
