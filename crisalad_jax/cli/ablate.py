@@ -5,6 +5,28 @@ import dataclasses
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
 
+COMMON = (
+    "test",
+    "out",
+    "train",
+    "rows",
+    "backbone",
+    "preset",
+    "seeds",
+    "epochs",
+    "image-size",
+    "grouping",
+    "batch-size",
+    "page",
+    "json",
+    "on-bad-image",
+    "quiet",
+)
+EXAMPLE = (
+    "crisalad ablate --test pitts30k_test.mat --train gsv --backbone dinov2-vitb14 --out ablated"
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class Ablate(ComparisonFlags):
     """Train CriSALAD with one part changed at a time; what its adapters cost (Tables 2 and 3)."""

@@ -5,6 +5,28 @@ import dataclasses
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
 
+COMMON = (
+    "test",
+    "out",
+    "train",
+    "methods",
+    "weights",
+    "backbone",
+    "preset",
+    "seeds",
+    "epochs",
+    "image-size",
+    "grouping",
+    "batch-size",
+    "rerank",
+    "page",
+    "json",
+    "on-bad-image",
+    "quiet",
+)
+EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights dinov2-salad megaloc --out compared"
+
+
 @dataclasses.dataclass(frozen=True)
 class Compare(ComparisonFlags):
     """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""

@@ -25,6 +25,9 @@ from crisalad_jax.training.summary import (
 from crisalad_jax.utils.errors import InputError
 
 
+EXAMPLE = "crisalad info --preset b14"
+
+
 @dataclasses.dataclass(frozen=True)
 class Info:
     """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""

@@ -13,6 +13,9 @@ from crisalad_jax.cli.common import check_json, console, say, talk_beside, write
 from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
 
 
+EXAMPLE = "crisalad models dinov2-salad"
+
+
 @dataclasses.dataclass(frozen=True)
 class Models:
     """List the models that others published, which --weights takes by name, or tell of one."""

@@ -44,6 +44,11 @@ from crisalad_jax.training.mining import (
     mine_tuples,
     no_tuples,
 )
+from crisalad_jax.training.optimiser import (
+    count_steps,
+    depends_on_length,
+    learning_rate_schedule,
+)
 from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
@@ -228,6 +233,8 @@ class Run:
                 if saved is not None:
                     self._check_start(saved.record)
                     step, state, record = saved
+                if files.extends is not None and saved is not None:
+                    self._tell_of_extension(files.extends, step, saved.record)
                 files.go_on(step, RunRecord(**record), is_saved=saved is not None)
             except BaseException:
                 files.close()
@@ -252,6 +259,29 @@ class Run:
             raise InputError(
                 f"{self.out}: found another source of {', '.join(changed)} than the run began "
                 "with; expected the same, or another folder"
+            )
+
+    def _tell_of_extension(self, epochs: int, step: int, record: Mapping[str, Any]) -> None:
+        """Tell in a note how a run that is given more epochs differs from one of them at once."""
+        if record["stopped_early"]:
+            tell(
+                f"{self.out}: the run stopped early at step {step}, by patience "
+                f"{self.config.patience}, which more epochs do not change"
+            )
+        elif depends_on_length(self.config.optimiser):
+            before, now = (
+                float(
+                    learning_rate_schedule(self.config.optimiser, steps, self.steps_per_epoch)(
+                        count_steps(self.config.optimiser, step, self.steps_per_epoch)
+                    )
+                )
+                for steps in (epochs * self.steps_per_epoch, self.steps)
+            )
+            tell(
+                f"{self.out}: the learning rate falls over the whole run, so that it jumps from "
+                f"{before:.3g} to {now:.3g} at step {step}: this is not the run of "
+                f"{self.config.epochs} epochs at once; --optimiser.decay-steps keeps a fall's "
+                "length"
             )
 
     def is_done(self) -> bool:
@@ -502,7 +532,7 @@ class Run:
             f"state after step {self.step} is kept in {self.out}"
         )
 
-    def validate(self, signals: SignalState) -> str:
+    def validate(self, on_bad_image: OnBadImage, signals: SignalState) -> str:
         """Log the recalls, keep the best weights, and decide on an early stop.
 
         The primary process evaluates, and the others wait.
@@ -513,7 +543,7 @@ class Run:
         trainable = self._devices.gather(self.state.trainable)
 
         def validated() -> tuple[str, dict[str, Any]]:
-            words = self._validate(self._merged(trainable), signals)
+            words = self._validate(self._merged(trainable), on_bad_image, signals)
             return words, dataclasses.asdict(self.record)
 
         words, record = distributed.run_on_primary(validated)
@@ -521,7 +551,7 @@ class Run:
         self._stepped_at = time.monotonic()
         return words
 
-    def _validate(self, params: Crisalad, signals: SignalState) -> str:
+    def _validate(self, params: Crisalad, on_bad_image: OnBadImage, signals: SignalState) -> str:
         assert self._validation is not None
         assert self._files is not None
         record, benchmark = self.record, self._validation
@@ -532,9 +562,10 @@ class Run:
                 benchmark,
                 groupings=("single",),
                 cache=self._cache,
+                on_bad_image=on_bad_image,
                 quiet=True,
             )
-            watched = self._watch_transport(params, benchmark)
+            watched = self._watch_transport(params, result.skipped.rest_of(benchmark))
         epoch = self.step // self.steps_per_epoch
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
         line = {"step": self.step, "epoch": epoch, **recalls, **watched}
@@ -549,6 +580,9 @@ class Run:
         record.stopped_early = patience is not None and record.without_gain >= patience
         record.validated = self.step
         words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
+        skipped = sum(map(len, result.skipped))
+        if skipped:
+            words += f"; {skipped} unreadable images left out"
         return f"epoch {epoch}, step {self.step}: {words}"
 
     def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:

@@ -178,6 +178,8 @@ class Prepared(NamedTuple):
     variants: list[Variant]
     places: Places | None
     benchmarks: list[Benchmark]
+    on_bad_image: OnBadImage = "stop"
+    """What training does at an unreadable image."""
 
     @property
     def units(self) -> list[tuple[Variant, int]]:
