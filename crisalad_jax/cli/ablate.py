@@ -4,7 +4,6 @@ import dataclasses
 
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
-
 COMMON = (
     "test",
     "out",

@@ -4,7 +4,6 @@ import dataclasses
 
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
-
 COMMON = (
     "test",
     "out",
@@ -24,7 +23,7 @@ COMMON = (
     "on-bad-image",
     "quiet",
 )
-EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights dinov2-salad megaloc --out compared"
+EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
 
 
 @dataclasses.dataclass(frozen=True)

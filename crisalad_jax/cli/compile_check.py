@@ -11,7 +11,6 @@ from crisalad_jax.cli.flags import parse_settings, with_settings
 from crisalad_jax.cli.train import defaults
 from crisalad_jax.utils.errors import InputError
 
-
 COMMON = (
     "targets",
     "programs",

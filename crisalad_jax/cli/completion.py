@@ -60,8 +60,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
     parser = helping.flags_parser(helping.class_of(name, module, ()), f"crisalad {name}")
     for action in parser._actions:
         action.choices = _choices(name, action)
-        # The first sentence; percent signs are argparse's own.
-        action.help = (action.help or "").partition("\n")[0].partition(". ")[0].replace("%", "%%")
+        action.help = " ".join((action.help or "").partition(". ")[0].split())
     return parser
 
 

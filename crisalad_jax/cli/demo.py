@@ -6,7 +6,6 @@ import pathlib
 from crisalad_jax.cli.common import console, give_json, prepare_json, say
 from crisalad_jax.retrieval.grouping import grouping_words
 
-
 EXAMPLE = "crisalad demo --out demo"
 
 
@@ -17,6 +16,7 @@ class Demo:
     out: pathlib.Path = pathlib.Path("demo")
     """Folder for the city, the run, the tables and the pictures."""
     seed: int = 0
+    """Draws the city and the run."""
     json: pathlib.Path | None = None
     """File for the result as JSON; - prints it."""
     quiet: bool = False

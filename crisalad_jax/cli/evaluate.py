@@ -28,7 +28,6 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
 from crisalad_jax.utils.locks import staged_folder
 
-
 COMMON = (
     "data",
     "weights",
@@ -51,7 +50,7 @@ COMMON = (
     "seeds",
     "quiet",
 )
-EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights dinov2-salad --report pitts30k"
+EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights salad --report pitts30k"
 
 
 @dataclasses.dataclass(frozen=True)

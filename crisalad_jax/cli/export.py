@@ -7,8 +7,7 @@ from typing import Literal
 from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
 from crisalad_jax.utils.files import check_new_folder
 
-
-EXAMPLE = "crisalad export --weights dinov2-salad --out exported"
+EXAMPLE = "crisalad export --weights salad --out exported"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,6 @@ from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 
-
 COMMON = (
     "weights",
     "images",
@@ -28,7 +27,7 @@ COMMON = (
     "json",
     "quiet",
 )
-EXAMPLE = "crisalad extract --weights dinov2-salad --images photos --out photos.npy"
+EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +49,7 @@ class Extract:
     """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
     all): a cross-image model's descriptors depend on it."""
     batch_size: int = 16
+    """Images described together."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""

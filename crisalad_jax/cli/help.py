@@ -14,8 +14,13 @@ from typing import Any
 
 SHORT, ALL = "--help", "--help-all"
 _WIDTH = 100
-_COLUMN = 32
+_COLUMN = 28
 """Widest column of flags; what is wider has its text on the next line."""
+_CHOICES = 6
+"""Most choices that stand beside a flag; more stand in its text."""
+_SHORT = 24
+"""Fewest letters of clauses that tell enough without the rest."""
+_ON = {"True": "on"}
 _LINES = 2
 """Most lines of a flag's text."""
 
@@ -76,7 +81,7 @@ def _usage(action: argparse.Action) -> str:
     words = _heading(action)
     return (
         words
-        if action.required or not action.option_strings and action.nargs != "?"
+        if action.required or (not action.option_strings and action.nargs != "?")
         else f"[{words}]"
     )
 
@@ -87,17 +92,23 @@ def _heading(action: argparse.Action) -> str:
     if not action.option_strings:
         return value
     flag = action.option_strings[0]
-    if isinstance(action, argparse.BooleanOptionalAction) and _default(action) == "True":
-        flag = action.option_strings[-1]
+    if _default(action) == "True":
+        flag = flag.replace("--", "--[no-]", 1)
     return f"{flag} {value}".rstrip()
 
 
 def _value(action: argparse.Action) -> str:
     """Return what stands for a flag's value, without what means no value."""
+    if _has_many_choices(action):
+        return "NAME"
     text = action.metavar if isinstance(action.metavar, str) else ""
     text = text.replace("{None}|", "").replace("{None,", "{")
     text = re.sub(r"\[(\w+) \[\1 \.\.\.\]\]|(\w+) \[\2 \.\.\.\]", r"\1\2...", text)
     return re.sub(r"^\{(\w+ \w+)\}$", r"\1", text)
+
+
+def _has_many_choices(action: argparse.Action) -> bool:
+    return action.choices is not None and len(tuple(action.choices)) > _CHOICES
 
 
 _DEFAULT = re.compile(r"\s*\((?:default: (.*?)|required)\)\s*$", re.DOTALL)
@@ -113,24 +124,30 @@ def _entry(action: argparse.Action, column: int, width: int) -> list[str]:
     """Write a flag and its text in one line or two."""
     heading = f"  {_heading(action)}"
     default = _default(action)
-    tail = "" if default in ("", "None", "True", "False") else f" ({default})"
+    tail = "" if default in ("", "None", "False") else f" ({_ON.get(default, default)})"
     if action.required and action.option_strings:
         tail = " (required)"
-    text = " ".join(_DEFAULT.sub("", action.help or "").split())
+    text = " ".join(_DEFAULT.sub("", action.help or "").replace("%%", "%").split())
+    if _has_many_choices(action):
+        text = f"{', '.join(sorted(action.choices or ()))}. {text}"
     beside = len(heading) + 2 <= column
     texts = _fitted(text, tail, width - column, _LINES if beside else _LINES - 1)
     first = heading.ljust(column) + texts.pop(0) if beside else heading
     return [first, *(" " * column + line for line in texts)]
 
 
-_ENDS = re.compile(r"[.;:](?= )|, (?=by default)|$")
+_ENDS = re.compile(r"[.;](?= )|, (?=by default)|$")
 
 
 def _fitted(text: str, tail: str, width: int, most: int) -> list[str]:
-    """Wrap as many whole clauses of a text as fit into so many lines."""
+    """Wrap as many whole clauses of a text as fit into so many lines, or else its beginning."""
     ends = [match.start() for match in _ENDS.finditer(text.rstrip("."))]
     for end in reversed(ends):
-        lines = textwrap.wrap(text[:end] + tail, width)
-        if len(lines) <= most:
+        clauses = text[:end]
+        lines = textwrap.wrap(clauses + tail, width, break_on_hyphens=False)
+        is_whole = clauses.count("(") == clauses.count(")")
+        if len(lines) <= most and is_whole and (end == ends[-1] or end > _SHORT):
             return lines
-    return textwrap.wrap(text + tail, width, max_lines=most, placeholder=" ...")
+    room = width * most - 8 - len(tail)
+    text = textwrap.shorten(text, room, placeholder=" ...", break_on_hyphens=False)
+    return textwrap.wrap(text + tail, width, break_on_hyphens=False)[:most]

@@ -9,8 +9,7 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.retrieval.maps.build import Indexed, index
 
-
-EXAMPLE = "crisalad index --weights dinov2-salad --images photos --positions gps.csv --out map"
+EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,6 @@ from crisalad_jax.training.summary import (
 )
 from crisalad_jax.utils.errors import InputError
 
-
 EXAMPLE = "crisalad info --preset b14"
 
 

@@ -12,8 +12,7 @@ from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_m
 from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
 from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
 
-
-EXAMPLE = "crisalad models dinov2-salad"
+EXAMPLE = "crisalad models salad"
 
 
 @dataclasses.dataclass(frozen=True)

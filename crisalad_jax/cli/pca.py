@@ -11,7 +11,6 @@ from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.files import check_target
 
-
 EXAMPLE = "crisalad pca --descriptors photos.npy --dim 512 --out pca.safetensors"
 
 

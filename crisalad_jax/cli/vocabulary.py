@@ -21,7 +21,6 @@ from crisalad_jax.training.vocabulary import (
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target
 
-
 COMMON = (
     "images",
     "out",
@@ -80,6 +79,7 @@ class Vocabulary:
     max_images: int = IMAGES
     """Read at most so many images, drawn at random."""
     batch_size: int = 16
+    """Images described together."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out."""
     seed: int = 0

@@ -49,6 +49,9 @@ class Skipped(NamedTuple):
         return benchmark.of_readable(queries, database)
 
 
+_NONE = Skipped()
+
+
 class GroupingResult(NamedTuple):
     """The result of a benchmark under one grouping."""
 
@@ -79,7 +82,7 @@ class GroupingResult(NamedTuple):
     rerank: str | None = None
     """The second stage, as `reranking.parse_reranking` reads it; its scores replace the
     similarities of the retrievals that it re-ranked. None is the first stage alone."""
-    skipped: Skipped = Skipped()
+    skipped: Skipped = _NONE
     """The unreadable images that were left out, the same under every grouping."""
 
     @property
@@ -98,7 +101,7 @@ def summarise(
     database_share: float | None,
     is_random: bool,
     rerank: str | None = None,
-    skipped: Skipped = Skipped(),
+    skipped: Skipped = _NONE,
 ) -> GroupingResult:
     """Summarise the rankings of one grouping as its result.
 
