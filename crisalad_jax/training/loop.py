@@ -135,7 +135,7 @@ def _train(run: Run, rest_of_round: _Round, on_bad_image: OnBadImage, quiet: boo
             try:
                 while not run.is_done():
                     if run.validation_is_due():
-                        bar.say(run.validate(on_bad_image, signals))
+                        bar.say(run.validate(signals, on_bad_image))
                         distributed.raise_together(run.save)
                     if run.mining_is_due():
                         bar.say(run.mine(on_bad_image, signals))

@@ -532,7 +532,7 @@ class Run:
             f"state after step {self.step} is kept in {self.out}"
         )
 
-    def validate(self, on_bad_image: OnBadImage, signals: SignalState) -> str:
+    def validate(self, signals: SignalState, on_bad_image: OnBadImage = "stop") -> str:
         """Log the recalls, keep the best weights, and decide on an early stop.
 
         The primary process evaluates, and the others wait.

@@ -80,7 +80,9 @@ def position_map(
     wrong = matched & ~right
     joined = wrong & placed.queries & placed.database[first]
     lines = np.stack([queries[joined], database[first[joined]]], axis=1)
-    axes.add_collection(LineCollection(lines.tolist(), colors=WRONG, linewidths=0.6, alpha=0.45))
+    # Paler where there are many, so that what is below them shows.
+    alpha = float(np.clip(60 / max(len(lines), 1), 0.05, 0.45))
+    axes.add_collection(LineCollection(lines.tolist(), colors=WRONG, linewidths=0.6, alpha=alpha))
     kinds = (
         ("right", right, {"c": RIGHT, "marker": "o", "linewidths": 0}),
         ("wrong", wrong, {"c": WRONG, "marker": "x", "linewidths": 1}),

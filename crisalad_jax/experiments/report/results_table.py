@@ -3,6 +3,7 @@
 import csv
 import os
 import pathlib
+import posixpath
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -91,15 +92,27 @@ def write_results(
 
 
 def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
-    """Return the rows of the page's table, as short as JSON allows; see page.js."""
+    """Return the rows of the page's table, as short as JSON allows; see queries.js.
+
+    Names lack the folder that all of a side's images are in.
+    """
+    benchmark = subject.benchmark
+    asked, places = (_folder(subject, paths) for paths in (benchmark.queries, benchmark.database))
     return [
         [
-            printable(row.query),
+            printable(row.query.removeprefix(asked)),
             OUTCOMES.index(row.outcome),
             row.rank,
-            printable(row.retrieval),
+            printable(row.retrieval.removeprefix(places)),
             round(row.similarity, 4),
             None if row.metres is None else round(row.metres, 1),
         ]
         for row in query_results(subject, grouping)
     ]
+
+
+def _folder(subject: Subject, paths: Sequence[pathlib.Path]) -> str:
+    """Return the folder that all images are in, as it begins their names."""
+    folders = [pathlib.PurePosixPath(subject.name(path)).parent for path in paths]
+    common = posixpath.commonpath([folder.as_posix() for folder in folders])
+    return "" if common in ("", ".") else f"{common}/"

@@ -122,7 +122,17 @@ def page(written: pathlib.Path) -> Page:
 def test_every_section_is_there_and_linked(page: Page):
     names = [e["id"] for e in page.all("section")]
     assert names == [
-        *("recall", "queries", "right", "wrong", "unmatched", "map", "similarities", "transport", "settings"),
+        *(
+            "recall",
+            "queries",
+            "right",
+            "wrong",
+            "unmatched",
+            "map",
+            "similarities",
+            "transport",
+            "settings",
+        ),
     ]
     assert {e["href"] for e in page.all("a")} == {f"#{name}" for name in names}
     assert [e["text"] for e in page.all("h1")] == ["town/test (@UTM, 25 m)"]

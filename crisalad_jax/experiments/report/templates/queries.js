@@ -1,6 +1,7 @@
 (() => {
   "use strict";
-  const AT_ONCE = 100;
+  const isNarrow = matchMedia("(max-width: 40rem)").matches;
+  const AT_ONCE = isNarrow ? 20 : 100;
   const section = document.getElementById("queries");
   const { outcomes, metres, rows } = JSON.parse(document.getElementById("results").textContent);
   const form = section.querySelector("form"), body = section.querySelector("tbody");
@@ -69,6 +70,7 @@
     head.append(button);
     return head;
   });
+  more.textContent = `Show ${AT_ONCE} more`;
   section.querySelector("thead tr").append(...heads);
   more.addEventListener("click", () => {
     shown += AT_ONCE;
