@@ -221,6 +221,23 @@ def test_an_evaluation_that_skips_is_that_of_the_readable_set(
     fails(capfd, *given, words=("found an image cut short",))
 
 
+def test_a_comparison_that_skips(capfd, tmp_path, shared, params, spoilt):
+    town, whole = spoilt
+    given = ("compare", "--test", town, "--weights", f"own={shared / 'weights.safetensors'}")
+    given += ("--out", tmp_path / "out", "--quiet")
+    fails(capfd, *given, words=("found an image cut short",))
+    shutil.rmtree(tmp_path / "out")
+    found, _ = printed(capfd, *given, "--on-bad-image", "skip", "--json", "-")
+    (expected,) = evaluate(params, MODEL, open_benchmark(whole), groupings=["single"], quiet=True)
+    (row,) = found["rows"]
+    recalls = next(iter(row["recalls"].values()))
+    assert {name: each["mean"] for name, each in recalls.items()} == {
+        f"R@{k}": expected.recalls[k] for k in (1, 5, 10)
+    }
+    words = "unreadable and left out: 1 queries and 1 database images."
+    assert any(note.endswith(words) for note in found["notes"])
+
+
 def test_leaving_out_counts_positives_anew(spoilt):
     town, whole = spoilt
     found, expected = leave_out_unreadable(open_benchmark(town), quiet=True), open_benchmark(whole)
