@@ -107,16 +107,6 @@ def learning_rate_schedule(
     )
 
 
-def depends_on_length(config: OptimiserConfig) -> bool:
-    """Return whether the learning rate of a step depends on how many steps the run has.
-
-    Example:
-        >>> depends_on_length(OptimiserConfig()), depends_on_length(OptimiserConfig(decay_steps=9))
-        (True, False)
-    """
-    return config.schedule == "linear" and not config.decay_steps and config.end_lr_fraction != 1
-
-
 def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> OptimiserConfig:
     """Shorten a warm-up to its largest share of a run.
 

@@ -46,7 +46,6 @@ from crisalad_jax.training.mining import (
 )
 from crisalad_jax.training.optimiser import (
     count_steps,
-    depends_on_length,
     learning_rate_schedule,
 )
 from crisalad_jax.training.run_files import (
@@ -268,21 +267,24 @@ class Run:
                 f"{self.out}: the run stopped early at step {step}, by patience "
                 f"{self.config.patience}, which more epochs do not change"
             )
-        elif depends_on_length(self.config.optimiser):
-            before, now = (
-                float(
-                    learning_rate_schedule(self.config.optimiser, steps, self.steps_per_epoch)(
-                        count_steps(self.config.optimiser, step, self.steps_per_epoch)
-                    )
-                )
-                for steps in (epochs * self.steps_per_epoch, self.steps)
-            )
+            return
+        lengths = epochs * self.steps_per_epoch, self.steps
+        before, now = (self._learning_rate(step, length) for length in lengths)
+        # Up to the end of a warm-up the steps that were taken are those of any length.
+        taken = {self._learning_rate(step - 1, length) for length in lengths}
+        if step and len(taken) > 1:
             tell(
                 f"{self.out}: the learning rate falls over the whole run, so that it jumps from "
                 f"{before:.3g} to {now:.3g} at step {step}: this is not the run of "
                 f"{self.config.epochs} epochs at once; --optimiser.decay-steps keeps a fall's "
                 "length"
             )
+
+    def _learning_rate(self, step: int, steps: int) -> float:
+        """Return the learning rate after so many steps of a run of `steps`."""
+        optimiser = self.config.optimiser
+        rate = learning_rate_schedule(optimiser, steps, self.steps_per_epoch)
+        return float(rate(jnp.asarray(count_steps(optimiser, step, self.steps_per_epoch))))
 
     def is_done(self) -> bool:
         """Return whether no step and no validation is left."""

@@ -102,6 +102,7 @@ def spoil(path: pathlib.Path, how: str) -> None:
 
 
 POSITIONAL = {
+    ("completion", "shell"): "{bash,zsh,fish}",
     ("convert", "source"): "SRC",
     ("convert", "target"): "DST",
     ("models", "name"): "NAME",
