@@ -46,7 +46,8 @@ def flags_parser(kind: type, program: str) -> argparse.ArgumentParser:
     with warnings.catch_warnings():
         # Tyro has no other function that tells of the flags.
         warnings.simplefilter("ignore", DeprecationWarning)
-        return tyro.extras.get_parser(kind, prog=program, add_help=False)
+        parser: Any = tyro.extras.get_parser(kind, prog=program, add_help=False)
+    return parser
 
 
 def short_help(name: str, module: Any, kind: type) -> str:

@@ -284,7 +284,8 @@ class Run:
         """Return the learning rate after so many steps of a run of `steps`."""
         optimiser = self.config.optimiser
         rate = learning_rate_schedule(optimiser, steps, self.steps_per_epoch)
-        return float(rate(jnp.asarray(count_steps(optimiser, step, self.steps_per_epoch))))
+        taken = count_steps(optimiser, step, self.steps_per_epoch)
+        return np.asarray(rate(jnp.asarray(taken))).item()
 
     def is_done(self) -> bool:
         """Return whether no step and no validation is left."""
