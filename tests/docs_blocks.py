@@ -60,7 +60,7 @@ def load(file: str, code: str, page: str, line: int) -> dict:
 def parse(command: str) -> None:
     """Parse one command as the command line would."""
     _, verb, *given = shlex.split(command, comments=True)
-    given = [argument for argument in given if argument != "--help"]
+    given = [argument for argument in given if argument not in ("--help", "--help-all")]
     cli._load_plugins(given)
 
     def refuse(line: str) -> None:

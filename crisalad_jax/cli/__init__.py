@@ -39,6 +39,7 @@ _COMMANDS = {
     "pca": "Fit principal components to descriptors, for shorter ones.",
     "compile-check": "Compile for GPUs and TPUs that need not be here, and table memory and work.",
     "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
+    "completion": "Print a script that lets bash, zsh or fish complete what is typed.",
 }
 """Summaries of the commands in the order of the help; each command is a module here."""
 
@@ -47,13 +48,20 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
     """Parse the flags into an instance of a command's class; tyro's complaints become one line."""
     import tyro
 
+    from crisalad_jax.cli import help as helping
+
     program = f"crisalad {name}"
     complaint = io.StringIO()
     try:
+        if helping.asked_for(given) == helping.SHORT:
+            kind = helping.class_of(name, module, given)
+            print(helping.short_help(name, module, kind))
+            raise SystemExit(0)
+        given = [helping.SHORT if each == helping.ALL else each for each in given]
         with contextlib.redirect_stderr(complaint):
             if hasattr(module, "parse"):
                 return module.parse(program, given)
-            return tyro.cli(_class_of(name, module), prog=program, args=given)
+            return tyro.cli(helping.class_of(name, module, given), prog=program, args=given)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -64,10 +72,6 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
         raise InputError(f"{reason} (see {program} --help)") from stop
     except InputError as error:
         raise InputError(f"{error} (see {program} --help)") from error
-
-
-def _class_of(name: str, module: Any) -> type:
-    return getattr(module, "".join(map(str.capitalize, name.split("-"))))
 
 
 # Beginnings of the parts of tyro's boxes that repeat the first one.
@@ -89,7 +93,8 @@ def _unboxed(box: str) -> str:
 
 
 def _usage() -> str:
-    lines = ["usage: crisalad COMMAND [--help] ... | --version", "", "commands:"]
+    usage = "usage: crisalad COMMAND [--help | --help-all] ... | --version"
+    lines = [usage, "", "commands:"]
     lines += [f"  {name:<15}{summary}" for name, summary in _COMMANDS.items()]
     return "\n".join(lines)
 

@@ -4,6 +4,27 @@ import dataclasses
 
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
+COMMON = (
+    "test",
+    "out",
+    "train",
+    "rows",
+    "backbone",
+    "preset",
+    "seeds",
+    "epochs",
+    "image-size",
+    "grouping",
+    "batch-size",
+    "page",
+    "json",
+    "on-bad-image",
+    "quiet",
+)
+EXAMPLE = (
+    "crisalad ablate --test pitts30k_test.mat --train gsv --backbone dinov2-vitb14 --out ablated"
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class Ablate(ComparisonFlags):

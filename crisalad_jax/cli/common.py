@@ -63,6 +63,26 @@ def check_json(path: pathlib.Path | None) -> None:
         check_target(path)
 
 
+def prepare_json(file: pathlib.Path | None) -> None:
+    """Check a flag --json before any work, and keep standard output for it where it is `STDOUT`.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    check_json(file)
+    talk_beside(file)
+
+
+def give_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
+    """Write or print a command's result, where --json asks for it.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    if file is not None:
+        write_or_print_json(file, value)
+
+
 def find_given(weights: pathlib.Path | None, *, quiet: bool = False) -> pathlib.Path | None:
     """Return the file that an optional flag means, as `find_weights` does; None where not given."""
     return None if weights is None else find_weights(weights, quiet=quiet)

@@ -4,6 +4,27 @@ import dataclasses
 
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
+COMMON = (
+    "test",
+    "out",
+    "train",
+    "methods",
+    "weights",
+    "backbone",
+    "preset",
+    "seeds",
+    "epochs",
+    "image-size",
+    "grouping",
+    "batch-size",
+    "rerank",
+    "page",
+    "json",
+    "on-bad-image",
+    "quiet",
+)
+EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
+
 
 @dataclasses.dataclass(frozen=True)
 class Compare(ComparisonFlags):

@@ -2,11 +2,11 @@
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import rich.console
 
-from crisalad_jax.cli.common import console, find_given, say
+from crisalad_jax.cli.common import console, find_given, give_json, prepare_json, say
 
 if TYPE_CHECKING:
     from crisalad_jax.experiments.comparison import ComparisonConfig
@@ -44,6 +44,10 @@ class ComparisonFlags:
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or leave it out of training and of the sets, and say so."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()
@@ -80,13 +84,15 @@ def names_of(text: str) -> tuple[str, ...]:
 def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
     """Carry out a comparison, and print its tables."""
     from crisalad_jax.experiments.comparison import compare
-    from crisalad_jax.experiments.comparison.tables import terminal_tables
+    from crisalad_jax.experiments.comparison.tables import as_json, terminal_tables
 
+    prepare_json(flags.json)
     notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=flags.quiet)
     summary = compare(
         config,
         flags.out,
         page=flags.page,
+        on_bad_image=flags.on_bad_image,
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
         quiet=flags.quiet,
     )
@@ -95,3 +101,4 @@ def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
     for note in summary.notes:
         say(note)
     say(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")
+    give_json(flags.json, as_json(summary))

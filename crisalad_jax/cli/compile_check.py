@@ -7,9 +7,26 @@ from collections.abc import Sequence
 from typing import Any
 
 from crisalad_jax.cli.common import check_json, console, talk_beside, write_or_print_json
-from crisalad_jax.cli.flags import parse_settings
+from crisalad_jax.cli.flags import parse_settings, with_settings
 from crisalad_jax.cli.train import defaults
 from crisalad_jax.utils.errors import InputError
+
+COMMON = (
+    "targets",
+    "programs",
+    "preset",
+    "recipe",
+    "config",
+    "image-size",
+    "batch-size",
+    "model.aggregator",
+    "micro-batch",
+    "expect",
+    "keep",
+    "json",
+    "quiet",
+)
+EXAMPLE = "crisalad compile-check --targets h100 --preset b14"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +68,11 @@ class CompileCheck:
 def parse(program: str, arguments: Sequence[str]) -> CompileCheck:
     """Parse the flags, with one for every field of the configuration and of its parts."""
     return parse_settings(CompileCheck, program, arguments, defaults(arguments), ())
+
+
+def command(arguments: Sequence[str]) -> type:
+    """Return the class that these arguments are parsed into, for help and completion."""
+    return with_settings(CompileCheck, arguments, defaults(arguments), ())[0]
 
 
 def run(arguments: CompileCheck) -> None:

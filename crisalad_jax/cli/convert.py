@@ -11,7 +11,7 @@ from crisalad_jax.checkpoints.layouts import LAYOUTS
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.checkpoints.torch_io import convert
-from crisalad_jax.cli.common import say
+from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.training.summary import model_words
 from crisalad_jax.utils.errors import InputError
 
@@ -26,6 +26,16 @@ def _layouts() -> str:
         f"{', '.join(LAYOUTS)}, for a source of this package; by default the one its parts came "
         "from (huggingface if the target is a .safetensors)."
     )
+
+
+COMMON = (
+    "source",
+    "target",
+    "layout",
+    "backbone",
+    "json",
+)
+EXAMPLE = "crisalad convert dino_salad.ckpt salad.safetensors"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,12 +58,15 @@ class Convert:
     """With --backbone: query, key, value or token; by default value."""
     assignment: str | None = None
     """With --backbone: cosine, as published, or euclidean."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
 
 
 def run(arguments: Convert) -> None:
     """Convert the file, and print both layouts and the model."""
+    prepare_json(arguments.json)
     names = ("layer", "facet", "assignment")
     fields = {name: getattr(arguments, name) for name in names}
     fields = {name: value for name, value in fields.items() if value is not None}
@@ -73,6 +86,14 @@ def run(arguments: Convert) -> None:
     say(
         f"{arguments.source} ({source}) -> {arguments.target} ({target}): "
         + model_words(done.config)
+    )
+    give_json(
+        arguments.json,
+        {
+            "source": {"file": str(arguments.source), "layout": source},
+            "target": {"file": str(arguments.target), "layout": target},
+            "model": model_words(done.config),
+        },
     )
 
 

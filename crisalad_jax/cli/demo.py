@@ -3,8 +3,10 @@
 import dataclasses
 import pathlib
 
-from crisalad_jax.cli.common import console, say
+from crisalad_jax.cli.common import console, give_json, prepare_json, say
 from crisalad_jax.retrieval.grouping import grouping_words
+
+EXAMPLE = "crisalad demo --out demo"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,6 +16,9 @@ class Demo:
     out: pathlib.Path = pathlib.Path("demo")
     """Folder for the city, the run, the tables and the pictures."""
     seed: int = 0
+    """Draws the city and the run."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     quiet: bool = False
     """No progress bars."""
 
@@ -23,10 +28,24 @@ def run(arguments: Demo) -> None:
     from crisalad_jax.experiments.demo import GROUPINGS, DemoConfig, run_demo
     from crisalad_jax.experiments.report import recall_table
 
+    prepare_json(arguments.json)
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
     console.print(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
     say(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
     say(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "
         f"Pictures: {', '.join(str(p) for p in summary.pictures)}"
+    )
+    give_json(
+        arguments.json,
+        {
+            "out": str(arguments.out),
+            "rows": [
+                row._asdict() | {"recalls": {f"R@{k}": v for k, v in row.recalls.items()}}
+                for row in summary.rows
+            ],
+            "seconds": summary.seconds,
+            "training_seconds": summary.training_seconds,
+            "pictures": [str(picture) for picture in summary.pictures],
+        },
     )

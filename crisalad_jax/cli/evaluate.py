@@ -28,6 +28,30 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
 from crisalad_jax.utils.locks import staged_folder
 
+COMMON = (
+    "data",
+    "weights",
+    "preset",
+    "image-size",
+    "resize",
+    "grouping",
+    "batch-size",
+    "split",
+    "images",
+    "queries",
+    "radius",
+    "frames",
+    "pca",
+    "rerank",
+    "report",
+    "out",
+    "json",
+    "on-bad-image",
+    "seeds",
+    "quiet",
+)
+EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights salad --report pitts30k"
+
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
@@ -89,7 +113,9 @@ class Evaluate:
     """Folder for a page of all results, index.html, that needs no other file and no network; and
     its pictures."""
     json: pathlib.Path | None = None
-    """File for the table as JSON."""
+    """File for the table as JSON; - prints it."""
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or leave it out and say so: recalls are then of the rest."""
     verify: bool = True
     """Check weights and components against their checksums; --no-verify skips that, where files are
     huge."""
@@ -150,6 +176,7 @@ def run(arguments: Evaluate) -> None:
         pca=pca,
         observe=None if arguments.report is None else similarities,
         rerank=rerank,
+        on_bad_image=arguments.on_bad_image,
         quiet=arguments.quiet,
     )
     settings = evaluation_settings(
@@ -166,19 +193,20 @@ def run(arguments: Evaluate) -> None:
     console.print(grouping_table(results))
     for note in table_notes(results, settings):
         say(note)
+    readable = results[0].skipped.rest_of(benchmark)
     with contextlib.ExitStack() as staged:  # so that all files appear, or none
         if arguments.out is not None:
             from crisalad_jax.experiments.report import write_galleries
 
             folder = staged.enter_context(staged_folder(arguments.out))
-            write_galleries(folder, benchmark, results, model_name=model_name)
+            write_galleries(folder, readable, results, model_name=model_name)
             write_json(folder / "config.json", settings)
         if arguments.report is not None:
             from crisalad_jax.experiments.report import write_report
 
             write_report(
                 staged.enter_context(staged_folder(arguments.report)),
-                benchmark,
+                readable,
                 results,
                 params=params,
                 config=config,
@@ -187,7 +215,7 @@ def run(arguments: Evaluate) -> None:
                 similarities=similarities.map,
             )
         if arguments.json is not None:
-            values = results_json(results, settings, model_name=model_name)
+            values = results_json(results, settings, model_name=model_name, benchmark=benchmark)
             write_or_print_json(arguments.json, values)
     if arguments.report is not None:
         say(f"report: {arguments.report / 'index.html'}")

@@ -4,8 +4,10 @@ import dataclasses
 import pathlib
 from typing import Literal
 
-from crisalad_jax.cli.common import load_model, say
+from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
 from crisalad_jax.utils.files import check_new_folder
+
+EXAMPLE = "crisalad export --weights salad --out exported"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Export:
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
 
@@ -40,6 +44,7 @@ def run(arguments: Export) -> None:
     """Export the model, and print what was written."""
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
 
+    prepare_json(arguments.json)
     check_new_folder(arguments.out)
     how = ExportConfig(
         grouping=arguments.grouping,
@@ -63,3 +68,4 @@ def run(arguments: Export) -> None:
         f"{manifest['grouping_means']}; weights {'inside' if how.weights_inside else 'beside'}; "
         f"for {', '.join(manifest['platforms'])}"
     )
+    give_json(arguments.json, {"out": str(arguments.out), "manifest": manifest})

@@ -5,9 +5,29 @@ import pathlib
 from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import load_model, say
+from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
+
+COMMON = (
+    "weights",
+    "images",
+    "out",
+    "image-size",
+    "resize",
+    "grouping",
+    "batch-size",
+    "compute-dtype",
+    "root",
+    "pairs",
+    "database",
+    "k",
+    "pca",
+    "on-bad-image",
+    "json",
+    "quiet",
+)
+EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +49,7 @@ class Extract:
     """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
     all): a cross-image model's descriptors depend on it."""
     batch_size: int = 16
+    """Images described together."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -51,6 +72,8 @@ class Extract:
     where files are huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
@@ -59,6 +82,7 @@ class Extract:
 
 def run(arguments: Extract) -> None:
     """Describe the images, and print what was written."""
+    prepare_json(arguments.json)
     check_extraction(
         arguments.out,
         grouping=arguments.grouping,
@@ -101,4 +125,17 @@ def run(arguments: Extract) -> None:
         f"{arguments.out}: {len(result.names)} descriptors of {result.descriptors.shape[1]} "
         f"numbers, grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]}), images at "
         f"{config.images_in_words}{skipped}"
+    )
+    pairs = {"file": str(arguments.pairs), "count": len(result.pairs or ())}
+    give_json(
+        arguments.json,
+        {
+            "out": str(arguments.out),
+            "descriptors": len(result.names),
+            "length": result.descriptors.shape[1],
+            "grouping": arguments.grouping,
+            "images": config.images_in_words,
+            "skipped": result.skipped,
+            "pairs": None if result.pairs is None else pairs,
+        },
     )

@@ -124,6 +124,24 @@ def parse_settings(
     Raises:
         InputError: no such part, or what the configuration's checks raise.
     """
+    made, flags = with_settings(kind, arguments, defaults, required)
+    parsed: Any = tyro.cli(made, prog=program, args=arguments)
+    given = parsed.settings
+    if parsed.image_size is not None:
+        # Before the checks: the preset's own size may not fit another backbone.
+        model = dataclasses.replace(given.model, image_size=parsed.image_size)
+        given = dataclasses.replace(given, model=model)
+    return dataclasses.replace(parsed, settings=config_of(flags, given))
+
+
+def with_settings(
+    kind: type, arguments: Sequence[str], defaults: Any, required: Sequence[str]
+) -> tuple[type, Flags]:
+    """Make a command's class with a flag for every field of a configuration; see `parse_settings`.
+
+    Raises:
+        InputError: no such part.
+    """
     preset = find_flag(arguments, "--preset") or "b14"
     flags = choose_parts(flags_of(defaults), arguments, preset)
     settings, default = type_of(flags)
@@ -141,13 +159,7 @@ def parse_settings(
     fields.sort(key=lambda field: field[0] not in required)
     made = dataclasses.make_dataclass(kind.__name__, fields, frozen=True, bases=(kind,))
     made.__doc__ = kind.__doc__
-    parsed: Any = tyro.cli(made, prog=program, args=arguments)
-    given = parsed.settings
-    if parsed.image_size is not None:
-        # Before the checks: the preset's own size may not fit another backbone.
-        model = dataclasses.replace(given.model, image_size=parsed.image_size)
-        given = dataclasses.replace(given, model=model)
-    return dataclasses.replace(parsed, settings=config_of(flags, given))
+    return made, flags
 
 
 def config_of(flags: Flags, parsed: Any) -> Any:

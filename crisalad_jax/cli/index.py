@@ -6,8 +6,10 @@ from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import say
+from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.retrieval.maps.build import Indexed, index
+
+EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +45,8 @@ class Index:
     """Stop at an unreadable image, or leave it out and say so."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
@@ -51,6 +55,7 @@ class Index:
 
 def run(arguments: Index) -> None:
     """Index the images, and print what became of them."""
+    prepare_json(arguments.json)
     weights = find_weights(arguments.weights, quiet=arguments.quiet)
     params, config = load_weights(weights)
     result = index(
@@ -70,6 +75,18 @@ def run(arguments: Index) -> None:
         quiet=arguments.quiet,
     )
     say(f"{arguments.out}: {'; '.join(_words(result))}")
+    description = result.description
+    counts = {name: value for name, value in result._asdict().items() if name != "description"}
+    give_json(
+        arguments.json,
+        {"out": str(arguments.out)}
+        | counts
+        | {
+            "length": description.descriptor_length,
+            "store": description.store,
+            "resized": description.config.images_in_words,
+        },
+    )
 
 
 def _words(result: Indexed) -> list[str]:

@@ -24,6 +24,8 @@ from crisalad_jax.training.summary import (
 )
 from crisalad_jax.utils.errors import InputError
 
+EXAMPLE = "crisalad info --preset b14"
+
 
 @dataclasses.dataclass(frozen=True)
 class Info:

@@ -12,6 +12,8 @@ from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_m
 from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
 from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
 
+EXAMPLE = "crisalad models salad"
+
 
 @dataclasses.dataclass(frozen=True)
 class Models:

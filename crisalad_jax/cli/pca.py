@@ -5,11 +5,13 @@ import pathlib
 
 from crisalad_jax.checkpoints.load import Model, find_weights, load
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.cli.common import say
+from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.config.checks import require
 from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.files import check_target
+
+EXAMPLE = "crisalad pca --descriptors photos.npy --dim 512 --out pca.safetensors"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Pca:
     """Draws them."""
     verify: bool = True
     """Check descriptors against their checksums; --no-verify skips that, where files are huge."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     quiet: bool = False
     """No progress bar."""
 
@@ -56,6 +60,7 @@ def _model(arguments: Pca) -> Model:
 
 def run(arguments: Pca) -> None:
     """Fit components, write them, and print their share of the variance."""
+    prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
     model = None if arguments.weights is None else _model(arguments)
     descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
@@ -76,8 +81,18 @@ def run(arguments: Pca) -> None:
         params = dataclasses.replace(model.params, projection=layer)
         config = dataclasses.replace(model.config, projection=projection)
         save_weights(arguments.out, params, config)
+    fitted = min(arguments.samples, len(descriptors))
     say(
         f"{arguments.out}: {arguments.dim} of {descriptors.shape[1]} components, "
-        f"{100 * pca.kept:.1f} % of the variance of "
-        f"{min(arguments.samples, len(descriptors))} descriptors"
+        f"{100 * pca.kept:.1f} % of the variance of {fitted} descriptors"
+    )
+    give_json(
+        arguments.json,
+        {
+            "out": str(arguments.out),
+            "components": arguments.dim,
+            "of": descriptors.shape[1],
+            "variance": float(pca.kept),
+            "descriptors": fitted,
+        },
     )

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import pathlib
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -18,6 +18,21 @@ _ROWS = 24
 """Largest number of queries in a gallery."""
 _COLUMNS = 8
 """Largest number of answers to each query in a gallery."""
+
+
+COMMON = (
+    "images",
+    "map",
+    "weights",
+    "k",
+    "json",
+    "gallery",
+    "map-images",
+    "batch-size",
+    "on-bad-image",
+    "quiet",
+)
+EXAMPLE = "crisalad query new.jpg --map map --json -"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +57,8 @@ class Query:
     """Folder of the map's images, for the gallery, if they are not where they were."""
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or leave it out and say so."""
     verify: bool = True
     """Check the map's descriptors against their checksums; --no-verify skips that, where files are
     huge."""
@@ -65,8 +82,11 @@ def run(arguments: Query) -> None:
             arguments.images,
             k=arguments.k,
             batch_size=arguments.batch_size,
+            on_bad_image=arguments.on_bad_image,
             quiet=arguments.quiet,
         )
+    if answers.unreadable:
+        say(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
     of = f"in a map of {len(answers.images)} images"
     if arguments.json is None and arguments.gallery is None:
         title = f"{arguments.map}, {len(answers.images)} images"

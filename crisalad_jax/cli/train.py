@@ -3,14 +3,42 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from crisalad_jax.cli.common import console
-from crisalad_jax.cli.flags import find_flag, parse_settings
+from crisalad_jax.cli.common import console, give_json, prepare_json
+from crisalad_jax.cli.flags import find_flag, parse_settings, with_settings
 from crisalad_jax.config.io import read_config
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from crisalad_jax.training.loop import FitResult
+
+
+COMMON = (
+    "data",
+    "out",
+    "val",
+    "weights",
+    "backbone",
+    "preset",
+    "recipe",
+    "config",
+    "image-size",
+    "epochs",
+    "seed",
+    "places-per-batch",
+    "images-per-place",
+    "optimiser.learning-rate",
+    "trainable",
+    "model.aggregator",
+    "micro-batch",
+    "patience",
+    "on-bad-image",
+    "json",
+)
+EXAMPLE = "crisalad train --data gsv --out runs/a --val pitts30k_val.mat --backbone dinov2-vitb14"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,12 +77,15 @@ class Train:
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; replaces --model.image-size."""
     on_bad_image: Literal["stop", "skip"] = "stop"
-    """Stop at an unreadable image, or skip it (masked out of attention and loss, and counted)."""
+    """Stop at an unreadable image, or skip it (masked out of attention and loss, left out of
+    validations, and counted)."""
     coordinator_address: str | None = None
     """In several processes, of one host or many, which each run this command: HOST:PORT of process
     0, or auto under Slurm, Open MPI or Kubernetes, with a process for each GPU. Process 0 alone
@@ -82,6 +113,11 @@ class Train:
 def parse(program: str, arguments: Sequence[str]) -> Train:
     """Parse the flags, with one for every field of the configuration and of its parts."""
     return parse_settings(Train, program, arguments, defaults(arguments), ("data", "out"))
+
+
+def command(arguments: Sequence[str]) -> type:
+    """Return the class that these arguments are parsed into, for help and completion."""
+    return with_settings(Train, arguments, defaults(arguments), ("data", "out"))[0]
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
@@ -120,6 +156,7 @@ def run(arguments: Train) -> None:
             "expected it beside them"
         )
     console.quiet = not distributed.is_primary()
+    prepare_json(arguments.json)
     config: TrainConfig = arguments.settings
     result = train(
         config,
@@ -147,3 +184,23 @@ def run(arguments: Train) -> None:
         words += f", {result.skipped_images} unreadable images skipped"
     picture = arguments.out / "curves.png"
     console.print(f"{arguments.out}: {words}; curves in {picture}", soft_wrap=True)
+    if distributed.is_primary():
+        give_json(arguments.json, _as_json(arguments.out, config, result))
+
+
+def _as_json(out: pathlib.Path, config: TrainConfig, result: "FitResult") -> dict[str, Any]:
+    """Put what the last line says into JSON values."""
+    best = None
+    if result.best_recall is not None:
+        file = str(out / "best.safetensors")
+        best = {"name": config.select_by, "recall": result.best_recall, "file": file}
+    return {
+        "out": str(out),
+        "epochs": config.epochs,
+        "steps": result.steps,
+        "stopped_early": result.stopped_early,
+        "best": best,
+        "skipped_images": result.skipped_images,
+        "last": str(out / "last.safetensors"),
+        "curves": str(out / "curves.png"),
+    }

@@ -6,7 +6,7 @@ from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import find_given, say
+from crisalad_jax.cli.common import find_given, give_json, prepare_json, say
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
@@ -20,6 +20,27 @@ from crisalad_jax.training.vocabulary import (
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target
+
+COMMON = (
+    "images",
+    "out",
+    "weights",
+    "backbone",
+    "preset",
+    "aggregator",
+    "clusters",
+    "image-size",
+    "max-images",
+    "batch-size",
+    "on-bad-image",
+    "seed",
+    "json",
+    "quiet",
+)
+EXAMPLE = (
+    "crisalad vocabulary --images photos --backbone dinov2-vitg14 --preset "
+    "g14 --out anyloc.safetensors"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,12 +79,15 @@ class Vocabulary:
     max_images: int = IMAGES
     """Read at most so many images, drawn at random."""
     batch_size: int = 16
+    """Images described together."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out."""
     seed: int = 0
     """Draws the images, patches of each, the first centroids, and a random backbone."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
@@ -72,6 +96,7 @@ class Vocabulary:
 
 def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
+    prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
     list_images(arguments.images)  # first: drawing parameters takes seconds
     params, config = _model(arguments)
@@ -89,6 +114,17 @@ def run(arguments: Vocabulary) -> None:
     say(
         f"{arguments.out}: {vocabulary_words(config)}, {built.words} words from {built.images} "
         f"images at {config.images_in_words}, descriptors of {config.descriptor_dim} numbers"
+    )
+    give_json(
+        arguments.json,
+        {
+            "out": str(arguments.out),
+            "vocabulary": vocabulary_words(config),
+            "words": built.words,
+            "images": built.images,
+            "length": config.descriptor_dim,
+            "resized": config.images_in_words,
+        },
     )
 
 

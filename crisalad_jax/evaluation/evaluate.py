@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
-from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise
+from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens, useful_batch_size
@@ -51,6 +51,7 @@ def evaluate(
     cache: ImageCache | None = None,
     observe: Observe | None = None,
     rerank: Reranking | None = None,
+    on_bad_image: OnBadImage = "stop",
     quiet: bool = False,
 ) -> list[GroupingResult]:
     r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
@@ -73,13 +74,16 @@ def evaluate(
         cache: of decoded images.
         observe: is given the descriptors of each grouping, of its first seed, while they are there.
         rerank: a second stage; each grouping has a result without and then one with it.
+        on_bad_image: "stop" at an unreadable image, or "skip" it: the results are then of the set
+            without it (`GroupingResult.skipped`).
         quiet: no progress bars.
 
     Returns:
         A result for each grouping, and with `rerank` a second one.
 
     Raises:
-        InputError: parameters of another configuration, no ground truth, an image cannot be read,
+        InputError: parameters of another configuration, no ground truth, an image cannot be read
+            or none of a side,
             components that are not for this model or make no unit vectors, or what
             `parse_groupings`, `check_grouping`, `Reranking.check` and `Reranker` raise.
 
@@ -105,19 +109,30 @@ def evaluate(
         rerank.check(config, len(benchmark.database))
     check_params(params, config)
     unit = config.unit_length if pca is None else pca.config.renormalise
-    positives = benchmark.ground_truth()
+    benchmark.ground_truth()
     images = max(len(benchmark.database), len(benchmark.queries))
     batch_size = useful_batch_size(batch_size, images)
 
-    def side(name: str, paths: Sequence[pathlib.Path], same: SamePlace, offset: int) -> _Side:
-        tokens = read_tokens(
-            params, config, paths, batch_size=batch_size, label=name, cache=cache, quiet=quiet
+    def read(name: str, paths: Sequence[pathlib.Path]) -> FolderTokens:
+        return read_tokens(
+            params,
+            config,
+            paths,
+            batch_size=batch_size,
+            label=name,
+            on_bad_image=on_bad_image,
+            cache=cache,
+            quiet=quiet,
         )
-        return _Side(name, tokens, same, offset)
 
+    tokens_there = read("database", benchmark.database)
+    tokens_asked = read("queries", benchmark.queries)
+    skipped = Skipped(*map(_unreadable, (tokens_asked, tokens_there)))
+    benchmark = skipped.rest_of(benchmark)
+    positives = benchmark.ground_truth()
     same_queries, same_database = _same_place(benchmark, positives)
-    database = side("database", benchmark.database, same_database, 0)
-    queries = side("queries", benchmark.queries, same_queries, 1)
+    database = _Side("database", _readable(tokens_there), same_database, 0)
+    queries = _Side("queries", _readable(tokens_asked), same_queries, 1)
 
     def describe(*side: Any, **options: Any) -> Float[np.ndarray, "image descriptor"]:
         full = group(params, config, *side, batch_size=batch_size, quiet=quiet, **options)
@@ -160,9 +175,21 @@ def evaluate(
                         database_share=database_share,
                         is_random=is_random,
                         rerank=label,
+                        skipped=skipped,
                     )
                 )
     return results
+
+
+def _unreadable(tokens: FolderTokens) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(~tokens.readable).tolist())
+
+
+def _readable(tokens: FolderTokens) -> FolderTokens:
+    """Return the tokens of the images that could be read."""
+    if tokens.readable.all():
+        return tokens
+    return FolderTokens(*(leaf[tokens.readable] for leaf in tokens))
 
 
 def _first(neighbours: Neighbours, count: int) -> Neighbours:

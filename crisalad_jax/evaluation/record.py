@@ -7,7 +7,7 @@ from typing import Any
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.evaluate import same_place_rule
-from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
+from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, to_json
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import Grouping, grouping_words
 
@@ -65,7 +65,11 @@ def evaluation_settings(
 
 
 def results_json(
-    results: Sequence[GroupingResult], settings: dict[str, Any], *, model_name: str
+    results: Sequence[GroupingResult],
+    settings: dict[str, Any],
+    *,
+    model_name: str,
+    benchmark: Benchmark | None = None,
 ) -> dict[str, Any]:
     """Put what an evaluation found into JSON values, with its settings.
 
@@ -73,12 +77,24 @@ def results_json(
         results: what `evaluate` returned.
         settings: what `evaluation_settings` returned.
         model_name: which weights, for each row.
+        benchmark: what was evaluated on, for the names of unreadable images that were left out.
 
     Returns:
         The values by name.
     """
+    skipped = {}
+    if benchmark is not None:
+        skipped = {"skipped": _skipped_names(results[0].skipped, benchmark)}
     names = {"benchmark": settings["benchmark"], "model": model_name}
-    return settings | {"results": [names | to_json(result) for result in results]}
+    return settings | skipped | {"results": [names | to_json(result) for result in results]}
+
+
+def _skipped_names(skipped: Skipped, benchmark: Benchmark) -> dict[str, list[str]]:
+    sides = {"queries": benchmark.queries, "database": benchmark.database}
+    return {
+        side: [str(paths[index]) for index in getattr(skipped, side)]
+        for side, paths in sides.items()
+    }
 
 
 def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> list[str]:
@@ -92,6 +108,13 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
         The paragraphs.
     """
     notes = [_RECALLS]
+    skipped = results[0].skipped
+    if any(skipped):
+        notes.append(
+            f"Unreadable and left out: {len(skipped.queries)} queries and {len(skipped.database)} "
+            "database images. All numbers are of the rest; a query whose positives were all left "
+            "out counts as a miss."
+        )
     parsed = [Grouping.parse(each.grouping) for each in results if each.grouping != ANY]
     kinds = dict.fromkeys(kind for each in parsed for kind in (each.queries, each.database))
     if kinds:

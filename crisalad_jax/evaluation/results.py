@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import (
     Interval,
     PrecisionRecall,
@@ -34,6 +35,23 @@ class Scores(NamedTuple):
     """See `PrecisionRecall`; None where no query has a positive."""
 
 
+class Skipped(NamedTuple):
+    """The unreadable images that an evaluation left out, by their indices in the benchmark."""
+
+    queries: tuple[int, ...] = ()
+    database: tuple[int, ...] = ()
+
+    def rest_of(self, benchmark: Benchmark) -> Benchmark:
+        """Return the benchmark without these images, which the results are of."""
+        queries = np.ones(len(benchmark.queries), bool)
+        database = np.ones(len(benchmark.database), bool)
+        queries[list(self.queries)] = database[list(self.database)] = False
+        return benchmark.of_readable(queries, database)
+
+
+_NONE = Skipped()
+
+
 class GroupingResult(NamedTuple):
     """The result of a benchmark under one grouping."""
 
@@ -42,7 +60,8 @@ class GroupingResult(NamedTuple):
     recalls: Mapping[int, float]
     """Recall@K as a fraction, by K: the mean over the seeds."""
     neighbours: Neighbours
-    """The nearest database images of every query, best first: those of the first seed."""
+    """The nearest database images of every query, best first: those of the first seed. Where images
+    were `skipped`, both count in the benchmark without them, `skipped.rest_of(benchmark)`."""
     intervals: Mapping[int, Interval] = MappingProxyType({})
     """95 % intervals of Recall@K over the queries, by K: see `metrics.bootstrap_interval`."""
     query_share: float | None = None
@@ -63,6 +82,8 @@ class GroupingResult(NamedTuple):
     rerank: str | None = None
     """The second stage, as `reranking.parse_reranking` reads it; its scores replace the
     similarities of the retrievals that it re-ranked. None is the first stage alone."""
+    skipped: Skipped = _NONE
+    """The unreadable images that were left out, the same under every grouping."""
 
     @property
     def label(self) -> str:
@@ -80,6 +101,7 @@ def summarise(
     database_share: float | None,
     is_random: bool,
     rerank: str | None = None,
+    skipped: Skipped = _NONE,
 ) -> GroupingResult:
     """Summarise the rankings of one grouping as its result.
 
@@ -92,6 +114,7 @@ def summarise(
         database_share: likewise.
         is_random: whether the rankings differ by their seeds.
         rerank: as in `GroupingResult`.
+        skipped: likewise.
 
     Raises:
         InputError: what `recalls` raises.
@@ -122,6 +145,7 @@ def summarise(
         spread=_over(scores, statistics.stdev) if len(scores) > 1 else None,
         by_seed=dict(zip(rankings, scores, strict=True)) if is_random else {},
         rerank=rerank,
+        skipped=skipped,
     )
 
 

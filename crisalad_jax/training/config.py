@@ -31,6 +31,7 @@ class OptimiserConfig:
     kind: Literal["adamw", "adam", "sgd"] = "adamw"
     """In Adam and SGD the weight decay is part of the gradient."""
     learning_rate: float = 6e-5
+    """Learning rate at its highest: after the warm-up, before it falls."""
     schedule: Literal["linear", "step", "milestones"] = "linear"
     """Linear decay step by step, or a step down: one every few epochs, or one after each of
     `milestones`."""
@@ -180,6 +181,7 @@ class TrainConfig:
     places_per_batch: int = 48
     """Number of places in a batch; where the loss classifies, of classes."""
     images_per_place: int = 4
+    """Number of images of each of them."""
     micro_batch: int | None = None
     """So many images' activations are in memory at a time: a step takes less of it and a forward
     pass longer, and is the same. None is the whole batch. Batch norms that follow the batch take
@@ -194,7 +196,8 @@ class TrainConfig:
     cities: tuple[str, ...] | None = None
     """Which cities; None takes all."""
     epochs: int = 8
-    """The paper converged within five, and stopped after three without gain."""
+    """Passes over the training set; more than a run in the folder has extend it. The paper
+    converged within five, and stopped after three without gain."""
     validate_every: int = 1
     """Epochs from one validation to the next."""
     validation_size: tuple[int, int] | None = None
@@ -207,6 +210,7 @@ class TrainConfig:
     keep_best: int = 1
     """So many validations' weights are kept, those of the best recall."""
     seed: int = 0
+    """Draws weights, batches and augmentations."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""

@@ -52,6 +52,9 @@ def fit(
     and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best recall by
     `config.select_by` (grouping `single`), and the best `config.keep_best` weights in `best/`.
 
+    A run in `out` of fewer epochs is extended: it goes on to those of `config`, which may differ in
+    nothing else. If the learning rate depends on the run's length, a note says how it jumps.
+
     A run that is killed at any moment and resumed ends with the same bits as an uninterrupted one
     (on a CPU; see docs/reliability.md for a GPU).
 
@@ -61,7 +64,8 @@ def fit(
         out: folder of the run.
         validation: evaluated every `config.validate_every` epochs, for early stopping.
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
-        on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
+        on_bad_image: "stop", or "skip" to mask out unreadable images and count them; validations
+            leave them out.
         num_workers: processes that read the training images; 0 reads them by threads of this one.
         num_threads: number of those threads; None is one for each core that this process may use.
         shard_state: keep what trains and its moments in shards, one a device, not whole on each.
@@ -131,7 +135,7 @@ def _train(run: Run, rest_of_round: _Round, on_bad_image: OnBadImage, quiet: boo
             try:
                 while not run.is_done():
                     if run.validation_is_due():
-                        bar.say(run.validate(signals))
+                        bar.say(run.validate(signals, on_bad_image))
                         distributed.raise_together(run.save)
                     if run.mining_is_due():
                         bar.say(run.mine(on_bad_image, signals))

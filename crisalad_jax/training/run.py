@@ -44,6 +44,10 @@ from crisalad_jax.training.mining import (
     mine_tuples,
     no_tuples,
 )
+from crisalad_jax.training.optimiser import (
+    count_steps,
+    learning_rate_schedule,
+)
 from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
@@ -228,6 +232,8 @@ class Run:
                 if saved is not None:
                     self._check_start(saved.record)
                     step, state, record = saved
+                if files.extends is not None and saved is not None:
+                    self._tell_of_extension(files.extends, step, saved.record)
                 files.go_on(step, RunRecord(**record), is_saved=saved is not None)
             except BaseException:
                 files.close()
@@ -253,6 +259,33 @@ class Run:
                 f"{self.out}: found another source of {', '.join(changed)} than the run began "
                 "with; expected the same, or another folder"
             )
+
+    def _tell_of_extension(self, epochs: int, step: int, record: Mapping[str, Any]) -> None:
+        """Tell in a note how a run that is given more epochs differs from one of them at once."""
+        if record["stopped_early"]:
+            tell(
+                f"{self.out}: the run stopped early at step {step}, by patience "
+                f"{self.config.patience}, which more epochs do not change"
+            )
+            return
+        lengths = epochs * self.steps_per_epoch, self.steps
+        before, now = (self._learning_rate(step, length) for length in lengths)
+        # Up to the end of a warm-up the steps that were taken are those of any length.
+        taken = {self._learning_rate(step - 1, length) for length in lengths}
+        if step and len(taken) > 1:
+            tell(
+                f"{self.out}: the learning rate falls over the whole run, so that it jumps from "
+                f"{before:.3g} to {now:.3g} at step {step}: this is not the run of "
+                f"{self.config.epochs} epochs at once; --optimiser.decay-steps keeps a fall's "
+                "length"
+            )
+
+    def _learning_rate(self, step: int, steps: int) -> float:
+        """Return the learning rate after so many steps of a run of `steps`."""
+        optimiser = self.config.optimiser
+        rate = learning_rate_schedule(optimiser, steps, self.steps_per_epoch)
+        taken = count_steps(optimiser, step, self.steps_per_epoch)
+        return np.asarray(rate(jnp.asarray(taken))).item()
 
     def is_done(self) -> bool:
         """Return whether no step and no validation is left."""
@@ -502,7 +535,7 @@ class Run:
             f"state after step {self.step} is kept in {self.out}"
         )
 
-    def validate(self, signals: SignalState) -> str:
+    def validate(self, signals: SignalState, on_bad_image: OnBadImage = "stop") -> str:
         """Log the recalls, keep the best weights, and decide on an early stop.
 
         The primary process evaluates, and the others wait.
@@ -513,7 +546,7 @@ class Run:
         trainable = self._devices.gather(self.state.trainable)
 
         def validated() -> tuple[str, dict[str, Any]]:
-            words = self._validate(self._merged(trainable), signals)
+            words = self._validate(self._merged(trainable), on_bad_image, signals)
             return words, dataclasses.asdict(self.record)
 
         words, record = distributed.run_on_primary(validated)
@@ -521,7 +554,7 @@ class Run:
         self._stepped_at = time.monotonic()
         return words
 
-    def _validate(self, params: Crisalad, signals: SignalState) -> str:
+    def _validate(self, params: Crisalad, on_bad_image: OnBadImage, signals: SignalState) -> str:
         assert self._validation is not None
         assert self._files is not None
         record, benchmark = self.record, self._validation
@@ -532,9 +565,10 @@ class Run:
                 benchmark,
                 groupings=("single",),
                 cache=self._cache,
+                on_bad_image=on_bad_image,
                 quiet=True,
             )
-            watched = self._watch_transport(params, benchmark)
+            watched = self._watch_transport(params, result.skipped.rest_of(benchmark))
         epoch = self.step // self.steps_per_epoch
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
         line = {"step": self.step, "epoch": epoch, **recalls, **watched}
@@ -549,6 +583,9 @@ class Run:
         record.stopped_early = patience is not None and record.without_gain >= patience
         record.validated = self.step
         words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
+        skipped = sum(map(len, result.skipped))
+        if skipped:
+            words += f"; {skipped} unreadable images left out"
         return f"epoch {epoch}, step {self.step}: {words}"
 
     def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:

@@ -22,7 +22,7 @@ from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.locks import one_writer
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
 
@@ -82,7 +82,8 @@ class RunFiles:
         check_run(out, config)
         with contextlib.ExitStack() as opened:
             opened.enter_context(one_writer(out))
-            claim_run(out, config)
+            self.extends = claim_run(out, config)
+            """Epochs of the run before `config` gave it more; None where it gives none."""
             for folder in (out, out / "best"):
                 remove_temporaries(folder)
             self._out, self._config = out, config
@@ -101,6 +102,8 @@ class RunFiles:
         """Resume the files at this step; `is_saved` tells whether they hold its state."""
         self._saved = (step, record) if is_saved else None
         with self._writing():
+            if self.extends is not None:
+                extend_run(self._out, self._config, step)
             self._drop_old_best(record)
             # A validation after the saved state will be repeated, so its line is dropped.
             self._log = MetricsLog(self._out, keep_up_to=step, validated=record.validated)
@@ -162,8 +165,11 @@ class RunFiles:
             path.unlink()
 
 
-def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
+def claim_run(out: pathlib.Path, config: TrainConfig) -> int | None:
     """Make `out` the folder of a run with this configuration, or check that it is.
+
+    Returns:
+        The epochs of the run there where the configuration has more; else None.
 
     Raises:
         InputError: what `check_run` raises.
@@ -172,17 +178,43 @@ def claim_run(out: pathlib.Path, config: TrainConfig) -> None:
     path = out / "config.json"
     if not path.exists():
         write_json(path, to_plain(config))
+        return None
+    epochs = read_config(TrainConfig, path, quiet=True).epochs
+    return epochs if epochs < config.epochs else None
+
+
+def extend_run(out: pathlib.Path, config: TrainConfig, step: int) -> None:
+    """Write the configuration of a run that goes on for more epochs, and how it came to them.
+
+    `epochs.json` lists the epochs that the run had before, each with the step that it had come to.
+
+    Args:
+        out: the run's folder.
+        config: its configuration, with more epochs than the one there.
+        step: the step that it goes on from.
+    """
+    path, history = out / "config.json", out / "epochs.json"
+    before = read_config(TrainConfig, path, quiet=True).epochs
+    known = read_json(history, "the epochs of a run")["before"] if history.exists() else []
+    # After a kill between the two files, the last entry is there already.
+    known = [each for each in known if each["epochs"] != before]
+    write_json(history, {"before": [*known, {"epochs": before, "step": step}]})
+    write_json(path, to_plain(config))
 
 
 def check_run(out: pathlib.Path, config: TrainConfig) -> None:
     """Check that `out` is the folder of a run with this configuration, or can become one.
+
+    A run there may have fewer epochs, which it is then extended by.
 
     Raises:
         InputError: it is a file, or holds a run of another configuration, or files but no run.
     """
     path = out / "config.json"
     if path.exists():
-        wrong = differences(config, read_config(TrainConfig, path))
+        there = read_config(TrainConfig, path)
+        epochs = max(there.epochs, config.epochs)
+        wrong = differences(config, dataclasses.replace(there, epochs=epochs))
         if wrong:
             raise InputError(
                 f"{out}: holds a run of another configuration: {'; '.join(wrong)}; give the same "

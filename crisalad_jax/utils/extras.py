@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-_CLI = ("tyro", "rich")
+_CLI = ("tyro", "rich", "shtab")
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
     "maps": ("faiss", "h5py", *_CLI),

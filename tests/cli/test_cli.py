@@ -102,6 +102,7 @@ def spoil(path: pathlib.Path, how: str) -> None:
 
 
 POSITIONAL = {
+    ("completion", "shell"): "{bash,zsh,fish}",
     ("convert", "source"): "SRC",
     ("convert", "target"): "DST",
     ("models", "name"): "NAME",
@@ -117,7 +118,7 @@ def test_help_lists_every_command_and_flag(capfd):
     out = succeeds(capfd, "--help")
     for command, summary in crisalad_jax.cli._COMMANDS.items():
         assert f"{command} {summary}" in out
-        help_text = succeeds(capfd, command, "--help")
+        help_text = succeeds(capfd, command, "--help-all")
         module = importlib.import_module(f"crisalad_jax.cli.{command.replace('-', '_')}")
         arguments = "".join(word.capitalize() for word in command.split("-"))
         for field in dataclasses.fields(getattr(module, arguments)):
@@ -130,7 +131,7 @@ def test_help_lists_every_command_and_flag(capfd):
         "--optimiser.learning-rate",
         "--places-per-batch",
     ):
-        assert flag in succeeds(capfd, "train", "--help")
+        assert flag in succeeds(capfd, "train", "--help-all")
 
 
 def test_no_command_prints_the_usage(capfd):
@@ -607,6 +608,7 @@ def test_evaluate_prints_and_writes_the_table(
     }
     written = json.loads((tmp_path / "pictures" / "config.json").read_text())
     assert len(written.pop("checksum")) == len(table.pop("checksum")) == 64
+    assert table.pop("skipped") == {"queries": [], "database": []}
     assert written == {key: value for key, value in table.items() if key != "results"}
 
 

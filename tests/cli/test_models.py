@@ -168,7 +168,7 @@ def test_a_run_starts_from_a_backbone_by_name():
 
 
 def test_the_help_of_convert_names_every_layout(capfd):
-    out, _ = runs(capfd, "convert", "--help")
+    out, _ = runs(capfd, "convert", "--help-all")
     words = " ".join(out.replace("│", " ").split())
     for name, layout in LAYOUTS.items():
         assert f"{name}," in words

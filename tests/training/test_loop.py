@@ -34,6 +34,7 @@ from crisalad_jax.training.step import train_step
 from crisalad_jax.training.trainable import merge_params
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.signals import SignalState
 from crisalad_jax.utils.temporaries import temporary_beside
@@ -237,7 +238,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch, recalls_at_5: list[float]) -> list
     """Validations that find these recalls; returned: the parameters that each was asked about."""
     seen = []
 
-    def fake(params, config, benchmark, *, groupings, cache, quiet):
+    def fake(params, config, benchmark, *, groupings, cache, on_bad_image, quiet):
         assert groupings == ("single",)
         seen.append(jax.device_get(params))
         recall = recalls_at_5[len(seen) - 1]
@@ -274,6 +275,10 @@ def test_early_stop_ends_training_and_stays_so(tmp_path, places, params, benchma
     result = fit(impatient, places, tmp_path, validation=benchmark, initial=params, quiet=True)
     assert (result.steps, result.stopped_early) == (4, True)
     again = fit(impatient, places, tmp_path, validation=benchmark, initial=params, quiet=True)
+    assert (again.steps, again.stopped_early) == (4, True)
+    longer = dataclasses.replace(impatient, epochs=9)
+    with pytest.warns(Note, match="stopped early at step 4, by patience 1, which more epochs do"):
+        again = fit(longer, places, tmp_path, validation=benchmark, initial=params, quiet=True)
     assert (again.steps, again.stopped_early) == (4, True)
     assert [line["step"] for line in metrics_of(tmp_path) if "loss" in line] == [1, 2, 3, 4]
 

@@ -69,7 +69,7 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
     names = ", ".join(sorted(state)[:3]) or "none"
     raise InputError(
         f"{source}: found no checkpoint that we know (its first names: {names}), expected one of "
-        f"the {len(LAYOUTS)} kinds that `crisalad convert --help` lists"
+        f"the {len(LAYOUTS)} kinds that `crisalad convert --help-all` lists"
     )
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from crisalad_jax.utils.errors import InputError
 
@@ -40,3 +40,47 @@ class Benchmark:
                 f"{self.root}: {self.name}: no ground truth, nothing to score; see `crisalad query`"
             )
         return self.positives
+
+    def of_readable(
+        self, queries: Bool[np.ndarray, " q"], database: Bool[np.ndarray, " database"]
+    ) -> "Benchmark":
+        """Return the set without the images that are marked as unreadable.
+
+        A query keeps its positives that are left. One without any is a miss, as in other sets.
+
+        Args:
+            queries: whether each query could be read.
+            database: whether each database image could be read.
+
+        Raises:
+            InputError: none of the queries, or of the database, could be read.
+        """
+        if queries.all() and database.all():
+            return self
+        for name, kept in (("queries", queries), ("database", database)):
+            if not kept.any():
+                raise InputError(
+                    f"{self.root}: {name}: found {len(kept)} images, none of them readable, "
+                    "expected at least one"
+                )
+        number = np.cumsum(database) - 1
+        positives = self.positives and tuple(
+            number[wanted[database[wanted]]]
+            for wanted, kept in zip(self.positives, queries, strict=True)
+            if kept
+        )
+        places, asked = self.database_positions, self.query_positions
+        return dataclasses.replace(
+            self,
+            database=_kept(self.database, database),
+            queries=_kept(self.queries, queries),
+            positives=positives,
+            database_positions=None if places is None else places[database],
+            query_positions=None if asked is None else asked[queries],
+        )
+
+
+def _kept(
+    paths: tuple[pathlib.Path, ...], kept: Bool[np.ndarray, " image"]
+) -> tuple[pathlib.Path, ...]:
+    return tuple(path for path, keep in zip(paths, kept, strict=True) if keep)

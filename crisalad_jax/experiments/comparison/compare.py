@@ -4,6 +4,8 @@ import os
 import pathlib
 from collections.abc import Callable
 
+from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
+from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.experiments.comparison.ablation import adapter_costs_once
 from crisalad_jax.experiments.comparison.page import write_page
 from crisalad_jax.experiments.comparison.plan import ComparisonConfig, prepare
@@ -18,6 +20,7 @@ def compare(
     out: str | os.PathLike[str],
     *,
     page: str | os.PathLike[str] | None = None,
+    on_bad_image: OnBadImage = "stop",
     say: Callable[[str], None] = lambda line: None,
     quiet: bool = False,
 ) -> Summary:
@@ -31,6 +34,8 @@ def compare(
             index.html.
         page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and
             <!-- end of NAME -->, where NAME is the name of the folder.
+        on_bad_image: "stop" at an unreadable image, or "skip" it: training masks it out, and the
+            sets are compared on without it. Each call reads all images of the sets to find them.
         say: is given a line at the start and before each run.
         quiet: whether to show no progress bars.
 
@@ -48,9 +53,22 @@ def compare(
     if page is not None:
         around(pathlib.Path(page), place)
     prepared = prepare(config)
+    left_out: list[str] = []
+    if on_bad_image == "skip":
+        readable = [leave_out_unreadable(each, quiet=quiet) for each in prepared.benchmarks]
+        for before, after in zip(prepared.benchmarks, readable, strict=True):
+            queries = len(before.queries) - len(after.queries)
+            database = len(before.database) - len(after.database)
+            if queries or database:
+                left_out.append(
+                    f"{before.name}: unreadable and left out: {queries} queries and {database} "
+                    "database images."
+                )
+        prepared = prepared._replace(benchmarks=readable, on_bad_image=on_bad_image)
     carry_out(prepared, out, say=say, quiet=quiet)
     adapters = adapter_costs_once(out) if config.kind == "ablate" else []
     summary = summarise(prepared, out, adapters)
+    summary.notes.extend(left_out)
     write_tables(summary, out)
     write_page(summary, out)
     if page is not None:

@@ -114,7 +114,7 @@ def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawi
     axes.xaxis.set_major_formatter("{x:.0f} %")
     axes.set_xlabel(f"R@1 on {name}", fontsize=10, color=INK)
     path = out / f"recall_{number}.png"
-    save(figure, path, NARROW_DPI)
+    save(figure, path, NARROW_DPI, dark=True)
     means = "; ".join(
         f"{title} {percent(row.recalls[name][1].mean)} %"
         for title, row in zip(titles, rows, strict=True)

@@ -14,6 +14,7 @@ from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.experiments.comparison.ablation import (
     ABLATIONS,
@@ -178,6 +179,8 @@ class Prepared(NamedTuple):
     variants: list[Variant]
     places: Places | None
     benchmarks: list[Benchmark]
+    on_bad_image: OnBadImage = "stop"
+    """What training does at an unreadable image."""
 
     @property
     def units(self) -> list[tuple[Variant, int]]:

@@ -247,7 +247,14 @@ def _model(
     training = dataclasses.replace(variant.training, seed=seed)
     assert variant.places is not None
     _count_sitting(folder)
-    result = fit(training, variant.places, folder / "run", initial=start, quiet=quiet)
+    result = fit(
+        training,
+        variant.places,
+        folder / "run",
+        initial=start,
+        on_bad_image=prepared.on_bad_image,
+        quiet=quiet,
+    )
     write_json(trained, _training_record(folder, training, result.steps))
     return result.params
 
@@ -277,7 +284,15 @@ def _with_vocabulary(
     places = prepared.places
     paths = [places.path(image) for image in range(len(places.files))]
     images = model.aggregator.centroid_images
-    return with_vocabulary(params, model, paths, images=images, seed=seed, quiet=quiet)
+    return with_vocabulary(
+        params,
+        model,
+        paths,
+        images=images,
+        seed=seed,
+        on_bad_image=prepared.on_bad_image,
+        quiet=quiet,
+    )
 
 
 def _count_sitting(folder: pathlib.Path) -> None:

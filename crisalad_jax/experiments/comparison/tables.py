@@ -13,6 +13,7 @@ from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.ablation import AdapterCost
 from crisalad_jax.experiments.comparison.summary import KS, Recall, Row, Summary
 from crisalad_jax.experiments.report.page import ESCAPED
+from crisalad_jax.experiments.report.tables import no_formula
 from crisalad_jax.utils.files import around, atomic_path, write_json
 
 NOTHING = "-"
@@ -171,14 +172,9 @@ def comma_separated(summary: Summary) -> str:
         for name, recalls in row.recalls.items():
             for k, recall in recalls.items():
                 values = (recall.mean, recall.spread, *recall.interval, len(recall.by_seed))
-                texts = map(_no_formula, (*row.labels, row.name, row.grouping, name))
+                texts = map(no_formula, (*row.labels, row.name, row.grouping, name))
                 writer.writerow([*texts, k, *values, *costs])
     return text.getvalue()
-
-
-def _no_formula(text: str) -> str:
-    """Put a quote before a text that a spreadsheet would take for a formula."""
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 def _absolute(row: Row) -> float | None:

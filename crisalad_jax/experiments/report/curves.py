@@ -58,7 +58,8 @@ def recall_curves(
         path: the picture to write.
         curves: name -> K -> fraction of the queries, 0 to 1.
         title: stands above the picture.
-        narrow: whether it is for pages that telephones show too.
+        narrow: whether it is for pages that telephones show too. A second picture, for pages on a
+            dark ground, is then written beside it.
 
     Raises:
         InputError: no curves, a curve without values, or a recall outside 0 to 1.
@@ -73,11 +74,11 @@ def recall_curves(
     axes.set_xticks(sorted({k for curve in curves.values() for k in curve}))
     axes.set_xlabel("K, database images retrieved", fontsize=10, color=INK)
     axes.set_ylabel("Recall@K", fontsize=10, color=INK)
-    save(figure, path, NARROW_DPI if narrow else DPI)
+    save(figure, path, NARROW_DPI if narrow else DPI, dark=narrow)
 
 
 def precision_curves(path: str | os.PathLike[str], curves: Mapping[str, PrecisionCurve]) -> None:
-    """Write a narrow PNG of precision against recall in percent, one line per curve.
+    """Write narrow PNGs of precision against recall in percent, one line per curve.
 
     Raises:
         InputError: no curves, a curve of no points or of two lengths, or a value outside 0 to 1.
@@ -111,7 +112,7 @@ def precision_curves(path: str | os.PathLike[str], curves: Mapping[str, Precisio
     axes.set_xlabel("recall", fontsize=10, color=INK)
     axes.set_ylabel("precision", fontsize=10, color=INK)
     figure.legend(loc="outside upper left", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
-    save(figure, path, NARROW_DPI)
+    save(figure, path, NARROW_DPI, dark=True)
 
 
 def training_curves(

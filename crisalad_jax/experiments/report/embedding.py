@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from crisalad_jax.experiments.report.style import dark_path
+
 _WEBP_QUALITY = 78
 
 
@@ -19,13 +21,17 @@ class Drawing(NamedTuple):
     width: int
     height: int
     alt: str
+    dark: str | None = None
+    """The data URI of its variant for a dark ground; None where there is none."""
 
 
 def drawing(path: pathlib.Path, alt: str) -> Drawing:
     """Read a PNG for a page; its sides are in its first chunk (W3C PNG specification, 11.2.2)."""
     data = path.read_bytes()
     width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-    return Drawing(path.name, _uri("png", data), width, height, alt)
+    dark = dark_path(path)
+    other = _uri("png", dark.read_bytes()) if dark.exists() else None
+    return Drawing(path.name, _uri("png", data), width, height, alt, other)
 
 
 def webp(image: UInt8[np.ndarray, "h w 3"]) -> str:

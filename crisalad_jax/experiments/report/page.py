@@ -12,7 +12,13 @@ from jaxtyping import Float
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.results import ANY, GroupingResult, percent
 from crisalad_jax.experiments.report import sections
-from crisalad_jax.experiments.report.query_selection import Verdicts, choose_shown, judge
+from crisalad_jax.experiments.report.query_selection import Verdicts, choose_shown
+from crisalad_jax.experiments.report.results_table import (
+    OUTCOMES,
+    RESULTS,
+    page_rows,
+    write_results,
+)
 from crisalad_jax.experiments.report.sections import Subject
 from crisalad_jax.experiments.report.tables import check_fractions
 from crisalad_jax.experiments.report.transport_section import transport_section
@@ -38,9 +44,10 @@ def write_report(
     settings: Mapping[str, Any],
     similarities: Float[np.ndarray, "rows columns"] | None = None,
 ) -> pathlib.Path:
-    """Write index.html and its PNGs into the folder `out`; return the page's path.
+    """Write index.html, its PNGs and results.csv into the folder `out`; return the page's path.
 
-    Retrievals, map and matrix are those of the first grouping.
+    Retrievals, map and matrix are those of the first grouping; results.csv has a row for every
+    query under every grouping.
 
     Args:
         out: the folder, made where it is missing. Files of the same names are replaced.
@@ -76,9 +83,10 @@ def _write(
     similarities: Float[np.ndarray, "rows columns"] | None,
 ) -> None:
     neighbours = groupings[0].neighbours
-    verdicts = judge(neighbours, benchmark.ground_truth())
+    subject = Subject.of(folder, benchmark, neighbours)
+    verdicts = subject.verdicts
     shown = choose_shown(neighbours.similarities[:, 0], verdicts)
-    subject = Subject(folder, benchmark, neighbours, verdicts)
+    write_results(folder / RESULTS, subject, groupings)
     context = {
         "title": benchmark.name,
         "model_name": model_name,
@@ -90,6 +98,9 @@ def _write(
         "depends": params.cross_image is not None,
         "curves": sections.curves(subject, groupings),
         "galleries": list(sections.galleries(subject, shown)),
+        "results": page_rows(subject, groupings[0]),
+        "outcomes": OUTCOMES,
+        "kept": neighbours.indices.shape[1],
         "metres": subject.has_positions,
         "map": sections.positions_map(subject),
         "transport": transport_section(subject, shown, params, config),

@@ -9,20 +9,20 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
+from crisalad_jax.experiments.report.placeholders import Placed
 from crisalad_jax.experiments.report.style import (
     GREY,
     INK,
     NARROW,
     NARROW_DPI,
     PALE,
+    PLAIN,
     RIGHT,
+    UNMATCHED,
     WRONG,
     save,
 )
 from crisalad_jax.utils.errors import InputError
-
-_UNMATCHED = "#7b1fa2"
-_DATABASE = "#c4c4c4"
 
 
 def position_map(
@@ -32,6 +32,7 @@ def position_map(
     first: Int[np.ndarray, " q"],
     right: Bool[np.ndarray, " q"],
     matched: Bool[np.ndarray, " q"],
+    placed: Placed | None = None,
 ) -> None:
     """Write a narrow PNG of a map in metres, with the same scale on both axes.
 
@@ -46,6 +47,7 @@ def position_map(
         first: the first retrieval of each query, an index of the database.
         right: whether it is right.
         matched: whether any database image is right for the query.
+        placed: the images that are drawn; None draws all.
 
     Raises:
         InputError: numbers of queries that differ, or a position that is not finite.
@@ -56,7 +58,9 @@ def position_map(
     for name, array in (("first", first), ("right", right), ("matched", matched)):
         if len(array) != len(queries):
             raise InputError(f"{name}: found {len(array)}, expected {len(queries)} as of queries")
-    points = np.concatenate([database, queries])
+    if placed is None:
+        placed = Placed(np.ones(len(database), bool), np.ones(len(queries), bool), np.inf)
+    points = np.concatenate([database[placed.database], queries[placed.queries]])
     low, span = points.min(axis=0), np.ptp(points, axis=0)
     # A narrow place gets room around it, so that nothing is squeezed into a line.
     widened = np.maximum(span, max(span.max() / 2.5, 1))
@@ -70,20 +74,26 @@ def position_map(
 
     database, queries = database - low, queries - low
     size = float(np.clip(4000 / len(points), 2, 18))
-    axes.scatter(*database.T, s=2.5 * size, c=_DATABASE, linewidths=0, label="database")
+    axes.scatter(
+        *database[placed.database].T, s=2.5 * size, c=PLAIN, linewidths=0, label="database"
+    )
     wrong = matched & ~right
-    lines = np.stack([queries[wrong], database[first[wrong]]], axis=1)
-    axes.add_collection(LineCollection(lines.tolist(), colors=WRONG, linewidths=0.6, alpha=0.45))
+    joined = wrong & placed.queries & placed.database[first]
+    lines = np.stack([queries[joined], database[first[joined]]], axis=1)
+    # Paler where there are many, so that what is below them shows.
+    alpha = float(np.clip(60 / max(len(lines), 1), 0.05, 0.45))
+    axes.add_collection(LineCollection(lines.tolist(), colors=WRONG, linewidths=0.6, alpha=alpha))
     kinds = (
         ("right", right, {"c": RIGHT, "marker": "o", "linewidths": 0}),
         ("wrong", wrong, {"c": WRONG, "marker": "x", "linewidths": 1}),
         (
             "no positive exists",
             ~matched & ~right,
-            {"facecolors": "none", "edgecolors": _UNMATCHED, "marker": "^", "linewidths": 0.8},
+            {"facecolors": "none", "edgecolors": UNMATCHED, "marker": "^", "linewidths": 0.8},
         ),
     )
-    for label, mask, marks in kinds:
+    for label, of_kind, marks in kinds:
+        mask = of_kind & placed.queries
         if mask.any():
             axes.scatter(*queries[mask].T, s=1.4 * size, label=f"{label} ({mask.sum()})", **marks)
     axes.set_xlabel("metres east of the westernmost image", fontsize=10, color=INK)
@@ -96,4 +106,4 @@ def position_map(
     axes.spines[:].set_color(PALE)
     where = {"loc": "outside upper left", "ncols": 2, "markerscale": 1.3}
     figure.legend(frameon=False, fontsize=9, labelcolor=INK, **where)
-    save(figure, path, NARROW_DPI)
+    save(figure, path, NARROW_DPI, dark=True)

@@ -13,8 +13,9 @@ from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report.curves import PrecisionCurve, precision_curves, recall_curves
 from crisalad_jax.experiments.report.embedding import Drawing, drawing, webp
 from crisalad_jax.experiments.report.gallery import prediction_gallery, thumbnail
+from crisalad_jax.experiments.report.placeholders import Placed, find_placed
 from crisalad_jax.experiments.report.positions import position_map
-from crisalad_jax.experiments.report.query_selection import Shown, Verdicts
+from crisalad_jax.experiments.report.query_selection import Shown, Verdicts, judge
 from crisalad_jax.experiments.report.similarity import similarity_matrix
 from crisalad_jax.retrieval.search import Neighbours
 
@@ -30,12 +31,21 @@ class Subject(NamedTuple):
     benchmark: Benchmark
     neighbours: Neighbours
     verdicts: Verdicts
+    placed: Placed | None = None
+    """Which images have a likely position; None where none has one."""
+
+    @classmethod
+    def of(cls, out: pathlib.Path, benchmark: Benchmark, neighbours: Neighbours) -> "Subject":
+        """Judge an evaluation's retrievals and positions."""
+        places, asked = benchmark.database_positions, benchmark.query_positions
+        placed = None if places is None or asked is None else find_placed(places, asked)
+        verdicts = judge(neighbours, benchmark.ground_truth())
+        return cls(out, benchmark, neighbours, verdicts, placed)
 
     @property
     def has_positions(self) -> bool:
         """Whether the positions of both sides' images are known."""
-        benchmark = self.benchmark
-        return benchmark.database_positions is not None and benchmark.query_positions is not None
+        return self.placed is not None
 
     def name(self, path: pathlib.Path) -> str:
         """Name a file of the benchmark by its path in the benchmark's folder."""
@@ -43,9 +53,11 @@ class Subject(NamedTuple):
         return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
     def metres(self, query: int, index: int) -> float | None:
-        """Measure the metres from a query to a database image; None without positions."""
+        """Measure the metres from a query to a database image; None without likely positions."""
         places, asked = self.benchmark.database_positions, self.benchmark.query_positions
-        if places is None or asked is None:
+        if places is None or asked is None or self.placed is None:
+            return None
+        if not (self.placed.queries[query] and self.placed.database[index]):
             return None
         change = asked[query] - places[index]
         return float(np.hypot(*change))
@@ -186,20 +198,36 @@ def _photograph(
     return Photograph(webp(image), width, height, alt, kind, lines)
 
 
-def positions_map(subject: Subject) -> Drawing | None:
+class PositionsMap(NamedTuple):
+    """The map, and what is not on it."""
+
+    drawing: Drawing
+    note: str
+    """Empty where all images are on it."""
+
+
+def positions_map(subject: Subject) -> PositionsMap | None:
     """Draw the map of all images; None where the benchmark has no positions."""
     places, asked = subject.benchmark.database_positions, subject.benchmark.query_positions
-    if places is None or asked is None:
+    placed = subject.placed
+    if places is None or asked is None or placed is None:
         return None
     path = subject.out / "positions.png"
     verdicts, first = subject.verdicts, subject.neighbours.indices[:, 0]
-    position_map(path, places, asked, first, verdicts.right, verdicts.matched)
+    position_map(path, places, asked, first, verdicts.right, verdicts.matched, placed)
     words = (
         f"Map of {len(places)} database images and "
         f"{len(asked)} queries, of which {verdicts.right.sum()} are right and "
         f"{verdicts.wrong.sum()} wrong"
     )
-    return drawing(path, words)
+    queries, database = int((~placed.queries).sum()), int((~placed.database).sum())
+    note = ""
+    if queries or database:
+        note = (
+            f"Left out: {queries:,} queries and {database:,} database images, whose positions are "
+            f"placeholders or over {placed.limit / 1000:,.0f} km from the rest."
+        )
+    return PositionsMap(drawing(path, words), note)
 
 
 def matrix(

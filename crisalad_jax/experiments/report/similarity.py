@@ -90,7 +90,7 @@ def similarity_matrix(
     bar.set_label("similarity", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=8, labelcolor=INK, color=GREY)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    save(figure, path, NARROW_DPI)
+    save(figure, path, NARROW_DPI, dark=True)
 
 
 def _outlines(cells: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "line 2 2"]:

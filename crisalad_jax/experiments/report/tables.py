@@ -41,6 +41,11 @@ def recall_table(rows: Sequence[RecallRow], title: str | None = None) -> Table:
     return table
 
 
+def no_formula(text: str) -> str:
+    """Put a quote before a text that a spreadsheet would take for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
 def recall_markdown(rows: Sequence[RecallRow]) -> str:
     """Write the same table as Markdown, one line per row, ending in a newline.
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.data.images import list_images
+from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.describe import useful_batch_size
@@ -35,6 +36,8 @@ class Answers(NamedTuple):
     """All images of the map, by number."""
     axes: tuple[str, str] | None
     """Axes of a position's two numbers; None where no image has a position."""
+    unreadable: Sequence[pathlib.Path] = ()
+    """Image files that could not be read, which have no answers."""
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
@@ -62,6 +65,7 @@ def query(
     *,
     k: int = 5,
     batch_size: int = 16,
+    on_bad_image: OnBadImage = "stop",
     quiet: bool = False,
 ) -> Answers:
     """Find the images of a map that are most similar to others.
@@ -72,14 +76,15 @@ def query(
         images: an image file, a folder, or a list of these.
         k: number of answers to each query.
         batch_size: number of queries described at once, each as if it were alone.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
         quiet: whether to show no progress bar.
 
     Returns:
         The answers, of use after the map is closed too.
 
     Raises:
-        InputError: parameters of another model; no image, or one that cannot be read; a number
-            out of range; or what `Map.search` raises.
+        InputError: parameters of another model; no image, one that cannot be read, or none
+            that can; a number out of range; or what `Map.search` raises.
 
     Example:
         >>> import jax
@@ -107,17 +112,27 @@ def query(
         raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
     parts: list[Neighbours] = []
     waiting: list[np.ndarray] = []
+    unreadable: list[pathlib.Path] = []
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
-        for part in describe_alone(params, config, paths, batch_size=batch_size):
+        for part in describe_alone(
+            params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image
+        ):
             waiting.append(part.descriptors)
-            described += len(part.indices)
-            bar.advance(len(part.indices))
-            if sum(map(len, waiting)) >= AT_ONCE or described == len(paths):
+            unreadable += (paths[index] for index in part.unreadable)
+            tried = len(part.indices) + len(part.unreadable)
+            described += tried
+            bar.advance(tried)
+            if len(unreadable) == len(paths):
+                raise InputError(f"images: found {len(paths)}, none of them readable")
+            count = sum(map(len, waiting))
+            if count >= AT_ONCE or (count and described == len(paths)):
                 parts.append(places.search(np.concatenate(waiting), k))
                 waiting.clear()
     neighbours = Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
-    return Answers(paths, neighbours, places.images, places.axes)
+    lost = set(unreadable)
+    readable = [path for path in paths if path not in lost]
+    return Answers(readable, neighbours, places.images, places.axes, unreadable)
 
 
 def _listed(images: Any) -> list[pathlib.Path]:

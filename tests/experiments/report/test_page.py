@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import html.parser
+import json
 import pathlib
 import re
 import shutil
@@ -23,7 +24,7 @@ from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL
 
 DASH = "\N{EN DASH}"
-VOID = {"meta", "link", "img", "br", "hr", "input"}
+VOID = {"meta", "link", "img", "br", "hr", "input", "source"}
 EAST = [np.array([[e, 5e6] for e in side]) for side in ([0.0, 40, 80], [3.0, 45, 9000])]
 
 
@@ -121,7 +122,17 @@ def page(written: pathlib.Path) -> Page:
 def test_every_section_is_there_and_linked(page: Page):
     names = [e["id"] for e in page.all("section")]
     assert names == [
-        *("recall", "right", "wrong", "unmatched", "map", "similarities", "transport", "settings"),
+        *(
+            "recall",
+            "queries",
+            "right",
+            "wrong",
+            "unmatched",
+            "map",
+            "similarities",
+            "transport",
+            "settings",
+        ),
     ]
     assert {e["href"] for e in page.all("a")} == {f"#{name}" for name in names}
     assert [e["text"] for e in page.all("h1")] == ["town/test (@UTM, 25 m)"]
@@ -131,13 +142,15 @@ def test_every_section_is_there_and_linked(page: Page):
 
 def test_nothing_is_asked_for_outside_of_the_page(written: pathlib.Path, page: Page):
     for element in page.elements:
-        for name in ("src", "href"):
+        for name in ("src", "srcset", "href"):
             if element.get(name) is not None:
                 assert re.match("data:|#", element[name])
     style = page.all("style")[0]["text"]
     assert "url(" not in style
     assert "@import" not in style
-    assert not page.all("script")
+    data, program = page.all("script")
+    assert data["type"] == "application/json"
+    assert not re.search(r"https?:|fetch|import|XMLHttp|innerHTML", program["text"])
 
 
 def test_drawings_are_the_files_beside_the_page(written: pathlib.Path, page: Page):
@@ -156,9 +169,15 @@ def test_drawings_are_the_files_beside_the_page(written: pathlib.Path, page: Pag
             assert kind == "data:image/webp"
     galleries = {"gallery_right.png", "gallery_wrong.png", "gallery_unmatched.png"}
     # Galleries are in the page as photographs, one by one. Two images are shown twice.
-    assert set(files) - set(held) <= galleries | {f for f in files if f.startswith("transport")}
+    beside = {f for f in files if f.startswith("transport") or f.endswith("_dark.png")}
+    assert set(files) - set(held) <= galleries | beside
     assert {"recall_curves.png", "precision_recall.png", "positions.png"} <= set(held)
     assert "similarities.png" in held
+    dark = {e["srcset"] for e in page.all("source", media="(prefers-color-scheme: dark)")}
+    assert {base64.b64decode(uri.partition(",")[2]) for uri in dark} == {
+        content for name, content in files.items() if name.endswith("_dark.png")
+    }
+    assert len(dark) == 4
     assert galleries <= set(files)
 
 
@@ -192,7 +211,7 @@ def test_galleries_show_what_was_retrieved_with_distances(page: Page):
         *("query", "wrong", "wrong", "right", "expected"),
         *("query", "wrong", "wrong", "wrong"),
     ]
-    assert [e["text"] for e in page.all("h2")][1:4] == [
+    assert [e["text"] for e in page.all("h2")][2:5] == [
         *("Right 1 of 1", "Wrong 1 of 1", "Nothing to find 1 of 1"),
     ]
 
@@ -225,13 +244,15 @@ def test_names_of_files_are_no_markup(
         settings={},
     )
     page = Page(path.read_text(encoding="utf-8"))
-    assert not page.all("script")
+    assert len(page.all("script")) == 2
+    (data,) = page.all("script", id="results")
+    assert json.loads(data["text"])["rows"][0][0] == name
     assert not any("onerror" in key for element in page.elements for key in element)
     assert [e["text"] for e in page.all("span", title=name)] == [name]
     assert any(e["alt"] == f"query 0: {name}" for e in page.all("img"))
     # Of what this model and set lack there is no section, nor a word.
     names = [e["id"] for e in page.all("section")]
-    assert names == ["recall", "right", "wrong", "unmatched", "settings"]
+    assert names == ["recall", "queries", "right", "wrong", "unmatched", "settings"]
     assert "No descriptor of this model" in " ".join(page.all("main")[0]["text"].split())
     assert [e["text"] for e in page.all("figcaption")][1].split() == ["✓", "1", "0.910"]
 

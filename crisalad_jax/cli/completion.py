@@ -1,0 +1,79 @@
+"""`crisalad completion`."""
+
+import argparse
+import dataclasses
+import importlib
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from crisalad_jax.cli import help as helping
+from crisalad_jax.config.plugins import load_entry_points
+
+EXAMPLE = "crisalad completion bash > ~/.local/share/bash-completion/completions/crisalad"
+
+Shell = Literal["bash", "zsh", "fish"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Completion:
+    """Print a script that lets a shell complete commands, flags and choices."""
+
+    shell: Annotated[tyro.conf.Positional[Shell], tyro.conf.arg(metavar="{bash,zsh,fish}")]
+    """The shell that reads it (docs/command-line.md)."""
+
+
+def run(arguments: Completion) -> None:
+    """Print the script."""
+    print(completion_script(arguments.shell))
+
+
+def completion_script(shell: Shell) -> str:
+    """Write the script, which starts no Python: all that it completes stands in it.
+
+    Of a configuration it knows the flags of the default parts. A command whose extra is not
+    installed is completed by its name alone.
+    """
+    import shtab
+
+    from crisalad_jax.cli import _COMMANDS
+
+    load_entry_points()
+    root = argparse.ArgumentParser("crisalad", add_help=False)
+    root.add_argument("-h", "--help", action="help", help="list the commands")
+    root.add_argument("--version", action="version", version="", help="print the version")
+    commands = root.add_subparsers()
+    for name, summary in _COMMANDS.items():
+        try:
+            parents = [_parser(name)]
+        except ModuleNotFoundError:
+            parents = []
+        parser = commands.add_parser(name, help=summary, parents=parents, add_help=False)
+        parser.add_argument("-h", helping.SHORT, action="help", help="show the common flags")
+        parser.add_argument(helping.ALL, action="help", help="show all flags")
+    return shtab.complete(root, shell)
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    """Make a command's parser, with the choices that its flags take by name."""
+    module = importlib.import_module(f"crisalad_jax.cli.{name.replace('-', '_')}")
+    parser = helping.flags_parser(helping.class_of(name, module, ()), f"crisalad {name}")
+    for action in parser._actions:
+        action.choices = _choices(name, action)
+        action.help = " ".join((action.help or "").partition(". ")[0].split())
+    return parser
+
+
+def _choices(command: str, action: argparse.Action) -> Any:
+    """Return the values that a flag takes, or None where they are not a few names."""
+    from crisalad_jax.checkpoints.published import PUBLISHED
+    from crisalad_jax.nn.config import PRESETS
+    from crisalad_jax.training.recipes import RECIPES
+
+    if action.dest == "preset":
+        return tuple(PRESETS)
+    if action.dest == "recipe":
+        return tuple(RECIPES)
+    if (command, action.dest) == ("models", "name"):
+        return tuple(PUBLISHED)
+    return action.choices and tuple(each for each in action.choices if each != "None")

@@ -1,0 +1,284 @@
+"""Short help, completion, --json and --on-bad-image of every command."""
+
+import csv
+import dataclasses
+import importlib
+import json
+import pathlib
+import re
+import shlex
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import crisalad_jax.cli
+from crisalad_jax.cli import help as helping
+from crisalad_jax.cli import main
+from crisalad_jax.cli.completion import completion_script
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
+from crisalad_jax.data.places import read_places
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.results import to_json
+from crisalad_jax.training.loop import fit
+from crisalad_jax.utils.errors import InputError
+from tests.cli.test_cli import fails, spoil, succeeds, train
+from tests.conftest import BATCH, MODEL, RECIPE, STEPS
+
+COMMANDS = list(crisalad_jax.cli._COMMANDS)
+
+
+def module_of(command):
+    return importlib.import_module(f"crisalad_jax.cli.{command.replace('-', '_')}")
+
+
+# Help
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_short_and_tells_of_an_example_that_parses(capfd, command):
+    assert main([command, "--help"]) == 0
+    out = capfd.readouterr().out
+    usage, *lines = out.splitlines()
+    assert usage.startswith(f"usage: crisalad {command} ")
+    entries = re.split(r"\n  (?=\S)", out.partition("\n\nexample: ")[0])[1:]
+    assert 1 <= len(entries) <= 20
+    assert all(len(entry.splitlines()) <= 2 for entry in entries)
+    assert all("  " in entry or "\n" in entry for entry in entries), "a flag without a text"
+    assert max(map(len, lines[:-3])) <= 100
+    assert lines[-1] == f"all flags: crisalad {command} --help-all"
+    module = module_of(command)
+    _, verb, *given = shlex.split(module.EXAMPLE.partition(" >")[0])
+    assert verb == command
+    assert crisalad_jax.cli._parse(command, module, given) is not None
+
+
+def test_a_flag_that_is_not_common_still_parses_and_stands_in_the_whole_help(capfd):
+    assert "--max-heading-difference" not in succeeds(capfd, "evaluate", "--help")
+    assert "--max-heading-difference" in succeeds(capfd, "evaluate", "--help-all")
+    module = module_of("evaluate")
+    given = ["--data", "d", "--max-heading-difference", "40"]
+    assert crisalad_jax.cli._parse("evaluate", module, given).max_heading_difference == 40
+    part = "--model.aggregator", "netvlad"
+    assert "--model.aggregator.clusters" in succeeds(capfd, "train", *part, "--help-all")
+    assert "--model.aggregator.sinkhorn" not in succeeds(capfd, "train", *part, "--help-all")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("One. Two.", ["One. Two (5)"]),
+        ("A first clause that is long enough; and one that does not fit", None),
+    ],
+)
+def test_a_text_is_cut_after_a_clause(text, expected):
+    lines = helping._fitted(text, " (5)", 44, 1)
+    assert lines == (expected or ["A first clause that is long enough (5)"])
+
+
+# Completion
+
+
+@pytest.fixture(scope="module")
+def bash(tmp_path_factory):
+    """A function that completes the last of some words in a real bash."""
+    script = tmp_path_factory.mktemp("completion") / "crisalad.bash"
+    script.write_text(completion_script("bash"))
+    program = f"""source {script}
+        COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMP_LINE="$*"; COMP_POINT=${{#COMP_LINE}}
+        eval "$(complete -p crisalad | sed 's/.*-F \\([^ ]*\\).*/\\1/')" 2>/dev/null
+        printf '%s\\n' "${{COMPREPLY[@]}}\""""
+
+    def complete(*words: str) -> set[str]:
+        command = ["bash", "-c", program, "bash", "crisalad", *words]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+        assert done.returncode == 0, done.stderr
+        return set(done.stdout.split())
+
+    return complete
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+def test_bash_completes_commands_flags_and_choices(bash):
+    assert bash("") == {*COMMANDS}
+    assert bash("comp") == {"compare", "compile-check", "completion"}
+    assert bash("evaluate", "--ra") == {"--radius"}
+    assert bash("evaluate", "--on-bad-image", "") == {"stop", "skip"}
+    assert bash("train", "--data", "x", "--preset", "") == {"tiny", "s14", "b14", "l14", "g14"}
+    assert {"salad", "selavpr"} <= bash("train", "--model.aggregator", "s")
+    assert "--optimiser.learning-rate" in bash("train", "--optimiser.l")
+    assert {"--help", "--help-all"} <= bash("info", "--he")
+    assert {"megaloc", "megaloc-v1"} == bash("models", "mega")
+
+
+@pytest.mark.parametrize(("shell", "first"), [("zsh", "#compdef crisalad"), ("fish", "")])
+def test_other_shells_have_a_script_of_every_command(capfd, shell, first):
+    assert main(["completion", shell]) == 0
+    out = capfd.readouterr().out
+    assert out.startswith(first)
+    assert all(command in out for command in COMMANDS)
+    assert "help-all" in out
+
+
+# JSON
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_that_prints_results_takes_json(command):
+    kind = helping.class_of(command, module_of(command), ())
+    has_json = "json" in {field.name for field in dataclasses.fields(kind)}
+    assert has_json == (command != "completion")
+
+
+def printed(capfd, *arguments):
+    """The JSON on stdout, and the words on stderr."""
+    assert main([str(each) for each in arguments]) == 0
+    out, err = capfd.readouterr()
+    return json.loads(out), err
+
+
+def test_json_on_stdout_is_what_the_last_line_says(capfd, tmp_path, shared):
+    weights = shared / "weights.safetensors"
+    images = shared / "town" / "images" / "test" / "database"
+    common = ("--images", images, "--weights", weights, "--batch-size", BATCH, "--quiet")
+    found, words = printed(capfd, "extract", *common, "--out", tmp_path / "d.npy", "--json", "-")
+    assert (found["descriptors"], found["length"], found["skipped"]) == (7, 48, [])
+    assert f"{tmp_path / 'd.npy'}: 7 descriptors of 48 numbers" in words
+    found, words = printed(capfd, "index", *common, "--out", tmp_path / "map", "--json", "-")
+    assert (found["added"], found["positions"], found["images"], found["length"]) == (7, 7, 7, 48)
+    assert "7 images added" in words
+    pca = ("pca", "--descriptors", tmp_path / "d.npy", "--dim", 3, "--quiet")
+    found, _ = printed(capfd, *pca, "--out", tmp_path / "p.safetensors", "--json", "-")
+    assert (found["components"], found["of"], found["descriptors"]) == (3, 48, 7)
+    assert 0 < found["variance"] < 1
+    # A file that cannot be made is found before the work.
+    (tmp_path / "file").write_text("")
+    bad = tmp_path / "file" / "x.json"
+    fails(
+        capfd, *pca, "--out", tmp_path / "q.safetensors", "--json", bad, words=("cannot be made",)
+    )
+    assert not (tmp_path / "q.safetensors").exists()
+
+
+def test_a_run_prints_json(capfd, tmp_path, shared, run):
+    out = shutil.copytree(run, tmp_path / "run")
+    given = train(shared, shared / "city", out, "--val", shared / "town", "--patience", "None")
+    found, words = printed(capfd, *given, "--json", "-")
+    assert f"{STEPS} steps, best R@5" in words
+    assert (found["steps"], found["epochs"], found["stopped_early"]) == (STEPS, 3, False)
+    best = json.loads((run / "config.json").read_text())["select_by"]
+    assert found["best"]["name"] == best
+    assert f"best R@5 {100 * found['best']['recall']:.1f}" in words
+
+
+# Bad images
+
+
+@pytest.fixture
+def spoilt(town):
+    """The town with an unreadable query and database image, and the same town without them."""
+    whole = town.parent / "whole"
+    shutil.copytree(town, whole)
+    for side, number in (("queries", 1), ("database", 3)):
+        name = sorted((town / "images" / "test" / side).iterdir())[number].name
+        spoil(town / "images" / "test" / side / name, "cut")
+        (whole / "images" / "test" / side / name).unlink()
+    return town, whole
+
+
+def test_an_evaluation_that_skips_is_that_of_the_readable_set(
+    capfd, tmp_path, shared, params, spoilt
+):
+    town, whole = spoilt
+    given = ("evaluate", "--data", town, "--weights", shared / "weights.safetensors", "--quiet")
+    given += ("--batch-size", BATCH, "--grouping", "single,window")
+    found, words = printed(
+        capfd, *given, "--on-bad-image", "skip", "--json", "-", "--report", tmp_path / "page"
+    )
+    expected = evaluate(
+        params,
+        MODEL,
+        open_benchmark(whole),
+        groupings=["single", "window"],
+        batch_size=BATCH,
+        quiet=True,
+    )
+    for row, result in zip(found["results"], expected, strict=True):
+        values = json.loads(json.dumps(to_json(result)))
+        curves = row.pop("precision_recall"), values.pop("precision_recall")
+        # Batches differ by the images left out: float32's rounding, as in test_evaluate.
+        np.testing.assert_allclose(curves[0]["thresholds"], curves[1]["thresholds"], atol=2e-6)
+        assert {name: row[name] for name in values} == values
+    names = {side: [pathlib.Path(n).name for n in each] for side, each in found["skipped"].items()}
+    assert [len(names["queries"]), len(names["database"])] == [1, 1]
+    assert "left out: 1 queries and 1 database images" in " ".join(words.split())
+    with (tmp_path / "page" / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * len(open_benchmark(whole).queries)
+    assert not any(names["queries"][0] in row["query"] for row in rows)
+    fails(capfd, *given, words=("found an image cut short",))
+
+
+def test_a_comparison_that_skips(capfd, tmp_path, shared, params, spoilt):
+    town, whole = spoilt
+    given = ("compare", "--test", town, "--weights", f"own={shared / 'weights.safetensors'}")
+    given += ("--out", tmp_path / "out", "--quiet")
+    fails(capfd, *given, words=("found an image cut short",))
+    shutil.rmtree(tmp_path / "out")
+    found, _ = printed(capfd, *given, "--on-bad-image", "skip", "--json", "-")
+    (expected,) = evaluate(params, MODEL, open_benchmark(whole), groupings=["single"], quiet=True)
+    (row,) = found["rows"]
+    recalls = next(iter(row["recalls"].values()))
+    assert {name: each["mean"] for name, each in recalls.items()} == {
+        f"R@{k}": expected.recalls[k] for k in (1, 5, 10)
+    }
+    words = "unreadable and left out: 1 queries and 1 database images."
+    assert any(note.endswith(words) for note in found["notes"])
+
+
+def test_leaving_out_counts_positives_anew(spoilt):
+    town, whole = spoilt
+    found, expected = leave_out_unreadable(open_benchmark(town), quiet=True), open_benchmark(whole)
+    assert [p.name for p in found.database] == [p.name for p in expected.database]
+    for ours, theirs in zip(found.ground_truth(), expected.ground_truth(), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(found.query_positions, expected.query_positions)
+    for path in found.queries:
+        path.write_text("no image")
+    with pytest.raises(InputError, match="queries: found 5 images, none of them readable"):
+        leave_out_unreadable(open_benchmark(town), quiet=True)
+
+
+def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, shared, spoilt):
+    town, _ = spoilt
+    weights = shared / "weights.safetensors"
+    images = shared / "town" / "images" / "test" / "database"
+    common = ("--weights", weights, "--batch-size", BATCH, "--quiet")
+    succeeds(capfd, "index", "--images", images, "--out", tmp_path / "map", *common)
+    asked = sorted((town / "images" / "test" / "queries").iterdir())
+    given = ("query", *asked, "--map", tmp_path / "map", *common, "--json", "-", "--k", 1)
+    assert main([*map(str, given), "--on-bad-image", "skip"]) == 0
+    out, err = capfd.readouterr()
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert [line["query"] for line in lines] == [p.as_posix() for p in asked if p != asked[1]]
+    assert f"1 unreadable left out, {asked[1]} the first" in " ".join(err.split())
+    fails(capfd, *given, words=("found an image cut short",))
+    fails(
+        capfd,
+        *("query", asked[1], "--map", tmp_path / "map", *common, "--on-bad-image", "skip"),
+        words=("images: found 1, none of them readable",),
+    )
+
+
+def test_a_validation_that_skips(tmp_path, shared, params, spoilt):
+    places = read_places(shared / "city", min_images=2)
+    recipe = dataclasses.replace(RECIPE, patience=None)
+    given = {"initial": params, "on_bad_image": "skip", "quiet": True}
+    fit(recipe, places, tmp_path / "a", validation=open_benchmark(spoilt[0]), **given)
+    fit(recipe, places, tmp_path / "b", validation=open_benchmark(spoilt[1]), **given)
+    logs = [(tmp_path / name / "metrics.jsonl").read_text().splitlines() for name in "ab"]
+    a, b = ([json.loads(x)["R@1"] for x in log if "R@1" in x] for log in logs)
+    assert a == b
+    assert len(a) == 3
