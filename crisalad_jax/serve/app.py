@@ -170,7 +170,7 @@ def make_app(
     )
     room = _Room(most_waiting)
     _handle_errors(app)
-    page = importlib.resources.files(__package__).joinpath("page.html").read_bytes()
+    page = importlib.resources.files("crisalad_jax.serve").joinpath("page.html").read_bytes()
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     async def show_page() -> Response:

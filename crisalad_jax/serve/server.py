@@ -136,9 +136,7 @@ class _Server(uvicorn.Server):
 
 
 @contextlib.contextmanager
-def _opened(
-    folder: str | os.PathLike[str], *, append: bool, verify: bool
-) -> Iterator[Map]:
+def _opened(folder: str | os.PathLike[str], *, append: bool, verify: bool) -> Iterator[Map]:
     """Open a map that is there, to search it, or to append too."""
     with Map.open(folder, verify=verify) as places:
         if not append:

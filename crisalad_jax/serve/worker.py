@@ -154,9 +154,7 @@ class MapWorker:
         config = self.places.description.config
         return describe_prepared(self._params, config, pictures, batch_size=self._batch_size)
 
-    def _append(
-        self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]
-    ) -> None:
+    def _append(self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]) -> None:
         """Append the additions of a batch together, without those that the map does not take."""
         axes, names, rows = self.places.axes, set[str](), list[int]()
         for row, (work, result) in enumerate(batch):
@@ -192,9 +190,7 @@ class MapWorker:
         for number, row in enumerate(rows, first):
             batch[row].result.set_result(number)
 
-    def _search(
-        self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]
-    ) -> None:
+    def _search(self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]) -> None:
         """Search for the questions of a batch at once."""
         rows = [row for row, each in enumerate(batch) if isinstance(each.work, Question)]
         if not rows:
@@ -218,7 +214,9 @@ def _is_crossed(root: pathlib.Path, name: str, others: Iterable[str]) -> bool:
     return (
         path.is_dir()
         or any(parent.exists() and not parent.is_dir() for parent in above)
-        or any(f"{one}/".startswith(f"{two}/") for o in others for one, two in ((o, name), (name, o)))
+        or any(
+            f"{one}/".startswith(f"{two}/") for o in others for one, two in ((o, name), (name, o))
+        )
     )
 
 

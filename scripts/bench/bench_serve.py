@@ -56,7 +56,8 @@ def expected_answers(folder: pathlib.Path, images: pathlib.Path) -> dict[pathlib
     with Map.open(folder) as places:
         answers = query(places, places.load_params(), images, k=K, quiet=True)
     return {
-        path: [answer_fields(answer, answers.axes) for answer in row] for path, row in answers.rows()
+        path: [answer_fields(answer, answers.axes) for answer in row]
+        for path, row in answers.rows()
     }
 
 
@@ -147,7 +148,7 @@ def table(loads: list[Load], folder: pathlib.Path) -> Table:
 
 
 def main() -> None:
-    parser = flags(__doc__.splitlines()[0], "docs/serve")
+    parser = flags("crisalad serve under load, and what is lost", "docs/serve")
     parser.add_argument("map", type=pathlib.Path)
     parser.add_argument("images", type=pathlib.Path)
     parser.add_argument("--clients", type=count, nargs="+", default=[1, 8, 32])

@@ -4,12 +4,14 @@ import base64
 import concurrent.futures
 import hashlib
 import importlib.resources
+import json
 import re
 import signal
 import subprocess
 import sys
 import threading
 import time
+import urllib.request
 
 import cv2
 import numpy as np
@@ -47,15 +49,15 @@ def assert_answers(found, expected):
 
 def form(data: bytes, field: str = "image") -> tuple[bytes, dict[str, str]]:
     head = f'--b\r\nContent-Disposition: form-data; name="{field}"; filename="a b.jpg"\r\n\r\n'
-    return head.encode() + data + b"\r\n--b--\r\n", {"Content_Type": "multipart/form-data; boundary=b"}
+    return head.encode() + data + b"\r\n--b--\r\n", {
+        "Content_Type": "multipart/form-data; boundary=b"
+    }
 
 
 def test_many_clients_get_the_answers_of_query(service, pictures, expected):
     def client(number):
         mine = [pictures[(number + i) % len(pictures)] for i in range(EACH)]
-        return [
-            (path.name, service.ask("POST", "/locate?k=3", path.read_bytes())) for path in mine
-        ]
+        return [(path.name, service.ask("POST", "/locate?k=3", path.read_bytes())) for path in mine]
 
     with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
         replies = [each for got in pool.map(client, range(CLIENTS)) for each in got]
@@ -144,9 +146,10 @@ def test_health_and_interface(service, folder):
 def test_the_page_holds_all_it_shows(service):
     reply = service.ask("GET", "/")
     page = reply.data.decode()
-    assert reply.data == importlib.resources.files("crisalad_jax.serve").joinpath(
-        "page.html"
-    ).read_bytes()
+    assert (
+        reply.data
+        == importlib.resources.files("crisalad_jax.serve").joinpath("page.html").read_bytes()
+    )
     assert not re.findall(r"""(?:src|href)=["']?(?!data:)\w""", page)
     policy = reply.headers["content-security-policy"]
     for tag in ("script", "style"):
@@ -317,26 +320,27 @@ def test_requests_in_flight_are_answered_at_the_end(folder, params, pictures, mo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_the_command_says_where_it_is_and_ends_at_a_signal(folder, pictures, number, code):
-    command = [sys.executable, "-m", "crisalad_jax", "serve", str(folder), "--port", "0", "--append"]
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [(signal.SIGTERM, 143, "ended by SIGTERM"), (signal.SIGINT, 130, "interrupted")],
+)
+def test_the_command_says_where_it_is_and_ends_at_a_signal(own_map, pictures, number, code, words):
+    command = [sys.executable, "-m", "crisalad_jax", "serve", str(own_map), "--port", "0"]
     with subprocess.Popen(
-        [*command, "--batch-size", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--append", "--batch-size", "1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         assert process.stdout
+        assert process.stderr
         line = process.stdout.readline()
-        found = re.match(r"http://127\.0\.0\.1:(\d+): answers for ", line)
+        found = re.match(r"http://127\.0\.0\.1:(\d+): answers for .*, and adds images to it", line)
         assert found, line
-        done = subprocess.run(
-            ["curl", "-sf", "--data-binary", f"@{pictures[0]}", f"{found[0].split(': ')[0]}/locate"],
-            capture_output=True,
-            timeout=60,
-        )
-        assert done.returncode == 0
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{found[1]}/locate", pictures[0].read_bytes(), timeout=60
+        ) as answer:
+            assert len(json.load(answer)["neighbours"]) == 5
         process.send_signal(number)
         assert process.wait(60) == code
-        assert process.stderr
-        assert process.stderr.read().splitlines()[-1] in (
-            "crisalad: ended by SIGTERM",
-            "crisalad: interrupted",
-        )
+        assert process.stderr.read().splitlines()[-1] == f"crisalad: {words}"
