@@ -32,7 +32,7 @@ MOST_ANSWERS = 100
 """Largest k."""
 MOST_WAITING = 128
 """Number of requests with pictures that are read, decoded or described at once."""
-_PATIENCE = 30.0
+_PATIENCE = 60.0
 """Seconds in which a picture has to arrive."""
 _RETRY = {"Retry-After": "1"}
 
