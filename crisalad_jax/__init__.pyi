@@ -65,6 +65,7 @@ from crisalad_jax.retrieval.pca import fit_pca as fit_pca
 from crisalad_jax.retrieval.pca import load_pca as load_pca
 from crisalad_jax.retrieval.photographs import prepare_image as prepare_image
 from crisalad_jax.retrieval.search import search as search
+from crisalad_jax.serve import serve_map as serve_map
 from crisalad_jax.sinkhorn import SinkhornConfig as SinkhornConfig
 from crisalad_jax.sinkhorn import register_dustbin as register_dustbin
 from crisalad_jax.sinkhorn import register_gradient as register_gradient

@@ -34,6 +34,7 @@ _COMMANDS = {
     "extract": "Write the descriptors of a folder of images.",
     "index": "Make a map of a folder of images, or append to it those that it lacks.",
     "query": "Ask a map where images were taken.",
+    "serve": "Answer over HTTP, and in a browser, where photographs were taken.",
     "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
     "export": "Write a model as a StableHLO program that needs nothing of this package.",
     "pca": "Fit principal components to descriptors, for shorter ones.",

@@ -88,7 +88,26 @@ def read_image(
         >>> read_image(pictures / "0.png", (224, 224)).shape
         (224, 224, 3)
     """
-    data = read_bytes(path, "an image file")
+    image = decode_image(read_bytes(path, "an image file"), path, enough=enough)
+    return image if size is None else resize_image(image, size)
+
+
+def decode_image(
+    data: bytes, path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode the bytes of an image file as `read_image` does.
+
+    Args:
+        data: all bytes of the file.
+        path: the file's name, for messages.
+        enough: as of `read_image`.
+
+    Returns:
+        The image, in red, green and blue.
+
+    Raises:
+        InputError: as `read_image`.
+    """
     if not data:
         raise InputError(f"{path}: found an empty file, expected {_FORMATS}")
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
@@ -116,7 +135,7 @@ def read_image(
         raise InputError(f"{path}: OpenCV cannot decode this image: {reason}") from error
     if image is None:
         raise InputError(f"{path}: found {len(data)} bytes that do not decode, expected {_FORMATS}")
-    return image if size is None else resize_image(image, size)
+    return image
 
 
 def _jpeg_is_whole(data: bytes) -> bool:

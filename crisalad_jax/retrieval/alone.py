@@ -143,6 +143,13 @@ def describe_images(
     if not len(images):
         raise InputError("images: found none, expected at least one picture")
     prepared = [prepare_image(image, config) for image in images]
+    return describe_prepared(params, config, prepared, batch_size=batch_size)
+
+
+def describe_prepared(
+    params: Crisalad, config: ModelConfig, prepared: Sequence[Pixels], *, batch_size: int
+) -> Float32[np.ndarray, "image descriptor"]:
+    """Describe pictures of `prepare_image`, each as if it were alone; see `describe_images`."""
     by_shape: dict[tuple[int, ...], list[int]] = {}
     for number, image in enumerate(prepared):
         by_shape.setdefault(image.shape, []).append(number)

@@ -8,6 +8,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "maps": ("faiss", "h5py", *_CLI),
     "report": ("jinja2", "matplotlib", *_CLI),
     "export": ("flatbuffers", *_CLI),
+    "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
     "accelerators": ("libtpu", "jax_cuda12_plugin", *_CLI),

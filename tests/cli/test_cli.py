@@ -107,6 +107,7 @@ POSITIONAL = {
     ("convert", "target"): "DST",
     ("models", "name"): "NAME",
     ("query", "images"): "IMAGE",
+    ("serve", "map"): "MAP",
 }
 SPOILT = pytest.mark.parametrize("how", ["empty", "cut", "text"])
 

@@ -53,9 +53,7 @@ class Answers(NamedTuple):
 
     def position(self, image: MapImage) -> dict[str, float] | None:
         """Return where an image was taken, by the names of the axes; None where unknown."""
-        if image.position is None or self.axes is None:
-            return None
-        return dict(zip(self.axes, image.position, strict=True))
+        return position_fields(image, self.axes)
 
 
 def query(
@@ -143,21 +141,30 @@ def _listed(images: Any) -> list[pathlib.Path]:
     return [image for path in paths for image in (list_images(path) if path.is_dir() else [path])]
 
 
+def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, float] | None:
+    """Return where an image was taken, by the names of the axes; None where unknown."""
+    if image.position is None or axes is None:
+        return None
+    return dict(zip(axes, image.position, strict=True))
+
+
+def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any]:
+    """Return an answer's rank, name, similarity and position, as JSON has them."""
+    return {
+        "rank": answer.rank,
+        "name": answer.image.name,
+        "similarity": round(answer.similarity, 6),
+        "position": position_fields(answer.image, axes),
+    }
+
+
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
     Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
     """
     for path, ranked in answers.rows():
-        neighbours = [
-            {
-                "rank": answer.rank,
-                "name": answer.image.name,
-                "similarity": round(answer.similarity, 6),
-                "position": answers.position(answer.image),
-            }
-            for answer in ranked
-        ]
+        neighbours = [answer_fields(answer, answers.axes) for answer in ranked]
         line = {"query": path.as_posix(), "neighbours": neighbours}
         text = json.dumps(line, ensure_ascii=False)
         yield text if text.isprintable() else json.dumps(line)

@@ -1,0 +1,72 @@
+"""`crisalad serve`."""
+
+import dataclasses
+import pathlib
+from typing import Annotated
+
+import tyro
+
+from crisalad_jax.cli.common import find_given, say
+from crisalad_jax.serve import serve_map
+from crisalad_jax.serve.access import read_token
+
+
+@dataclasses.dataclass(frozen=True)
+class Serve:
+    """Answer over HTTP, and in a browser, where photographs were taken."""
+
+    map: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
+    """Folder that `crisalad index` wrote."""
+    weights: pathlib.Path | None = None
+    """The model that made the map, as a file or a published name; by default where it was then."""
+    host: str = "127.0.0.1"
+    """Name or address to listen at; others than this machine's own need a token."""
+    port: int = 8000
+    """Port to listen at; 0 is any that is free."""
+    token_file: pathlib.Path | None = None
+    """File of the token that requests have to bring; by default the variable CRISALAD_TOKEN."""
+    append: bool = False
+    """Let requests add images to the map; no other process can append meanwhile."""
+    map_images: pathlib.Path | None = None
+    """Folder of the map's pictures, if they are not where they were."""
+    k: int = 5
+    """Answers to a picture, where the request names no number."""
+    max_bytes: int = 20 * 2**20
+    """Bytes that a request may have."""
+    batch_size: int = 16
+    """Pictures described at once, each as if it were alone."""
+    verify: bool = True
+    """Check the map's descriptors against their checksums; --no-verify skips that, where files are
+    huge."""
+    max_pixels: int = 2**28
+    """Pixels that a picture may have; larger ones are not decoded."""
+    plugin: tuple[str, ...] = ()
+    """Files FILE.py or modules that register parts of your own; their code is run."""
+    quiet: bool = False
+    """No progress bar."""
+
+
+def run(arguments: Serve) -> None:
+    """Serve the map until a signal ends it."""
+    token = read_token(arguments.token_file)
+
+    def ready(address: str) -> None:
+        needs = " with the token" if token else ""
+        appends = ", and adds images to it" if arguments.append else ""
+        say(f"{address}{needs}: answers for {arguments.map}{appends}; Ctrl-C ends it")
+
+    serve_map(
+        arguments.map,
+        weights=find_given(arguments.weights, quiet=arguments.quiet),
+        host=arguments.host,
+        port=arguments.port,
+        token=token,
+        k=arguments.k,
+        append=arguments.append,
+        map_images=arguments.map_images,
+        max_bytes=arguments.max_bytes,
+        batch_size=arguments.batch_size,
+        verify=arguments.verify,
+        quiet=arguments.quiet,
+        ready=ready,
+    )

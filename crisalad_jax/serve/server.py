@@ -1,0 +1,174 @@
+"""The server: opens a map, compiles its model, and answers until a signal ends it."""
+
+import contextlib
+import os
+import pathlib
+import socket
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import uvicorn
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.serve.access import Access, check_host, check_token
+from crisalad_jax.serve.app import MOST_ANSWERS, make_app
+from crisalad_jax.serve.service import MapService
+from crisalad_jax.serve.worker import MapWorker
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.signals import SignalState, defer_signals
+
+_GRACE = 30
+"""Seconds that requests in flight have, after a signal, until they are dropped."""
+
+
+def serve_map(
+    folder: str | os.PathLike[str],
+    *,
+    weights: str | os.PathLike[str] | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    token: str | None = None,
+    k: int = 5,
+    append: bool = False,
+    map_images: str | os.PathLike[str] | None = None,
+    max_bytes: int = 20 * 2**20,
+    batch_size: int = 16,
+    verify: bool = True,
+    quiet: bool = False,
+    ready: Callable[[str], object] = lambda _: None,
+) -> None:
+    """Serve a map over HTTP, with a page for browsers, until a signal ends it.
+
+    Requests in flight are answered before it ends; then the signal has its usual effect.
+
+    Args:
+        folder: the map.
+        weights: the model that made it; None is where it was then.
+        host: name or address to listen at. Others than this machine's own need a token.
+        port: port to listen at; 0 is any that is free.
+        token: what requests have to bring as `Authorization: Bearer ...`; None is nothing.
+        k: answers to a picture where the request names no number.
+        append: whether requests may add images to the map, which no other process can then.
+        map_images: folder of the map's pictures; None is where they were.
+        max_bytes: largest body of a request.
+        batch_size: largest number of pictures described together, each as if it were alone.
+        verify: whether to compare the map's descriptors with their checksums.
+        quiet: whether to show no progress bar.
+        ready: called with the service's address once it answers.
+
+    Raises:
+        InputError: a number out of range; an address that is not this machine's or in use; one that
+            others can reach without a token; no such folder; or what `Map.open`,
+            `Map.load_params` and `open_for_appending` raise.
+
+    Example:
+        >>> serve_map("city.map", host="0.0.0.0")
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: host: found '0.0.0.0', which other machines ...
+    """
+    check_grouping((), batch_size, seed=0)
+    require(1 <= k <= MOST_ANSWERS, f"k: found {k}, expected 1 to {MOST_ANSWERS}")
+    require(0 <= port < 2**16, f"port: found {port}, expected 0 to 65535")
+    require(max_bytes >= 1, f"max_bytes: found {max_bytes}, expected at least 1")
+    if map_images is not None and not pathlib.Path(map_images).is_dir():
+        raise InputError(f"map_images: found no folder {map_images}, expected one")
+    if token is not None:
+        check_token(token)
+    check_host(host, token)
+    with contextlib.ExitStack() as stack:
+        # The outermost, so that the map is closed before a signal ends the process.
+        stop = stack.enter_context(defer_signals())
+        listener = stack.enter_context(contextlib.closing(_bound(host, port)))
+        places = stack.enter_context(_opened(folder, append=append, verify=verify))
+        worker = MapWorker(places, places.load_params(weights), batch_size=batch_size)
+        worker.compile(quiet=quiet)
+        stop.check()
+        stop.has_work = True
+        stack.enter_context(worker)
+        service = MapService(
+            worker, appends=append, images=None if map_images is None else pathlib.Path(map_images)
+        )
+        stack.enter_context(contextlib.closing(service))
+        app = make_app(service, Access(token), k=k, max_bytes=max_bytes)
+        config = uvicorn.Config(
+            app,
+            loop="asyncio",  # uvloop would take the signals that `defer_signals` handles
+            http="h11",
+            ws="none",
+            lifespan="off",
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            timeout_graceful_shutdown=_GRACE,
+        )
+        address = _address(host, listener.getsockname()[1])
+        _Server(config, stop, lambda: ready(address)).run([listener])
+
+
+class _Server(uvicorn.Server):
+    """A server that ends at the signals of the house."""
+
+    def __init__(
+        self, config: uvicorn.Config, stop: SignalState, ready: Callable[[], object]
+    ) -> None:
+        super().__init__(config)
+        self._stop, self._ready = stop, ready
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leave the signals to `defer_signals`."""
+        yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and tell so."""
+        await super().startup(sockets)
+        self._ready()
+
+    async def on_tick(self, counter: int) -> bool:
+        """Look for a signal, ten times a second."""
+        if self._stop.number:
+            self.should_exit = True
+        return await super().on_tick(counter)
+
+
+@contextlib.contextmanager
+def _opened(folder: str | os.PathLike[str], *, append: bool, verify: bool) -> Iterator[Map]:
+    """Open a map that is there, to search it, or to append too."""
+    with Map.open(folder, verify=verify) as places:
+        if not append:
+            yield places
+            return
+        description = places.description
+    with open_for_appending(folder, description) as places:
+        yield places
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """Bind a socket, which does not listen yet.
+
+    Raises:
+        InputError: the address is not this machine's, or in use.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"host: found {host!r}, expected a name or address: {error}") from error
+    bound: Any = socket.socket(family, kind, protocol)
+    try:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+    except OSError as error:
+        bound.close()
+        reason = error.strerror or error
+        raise InputError(f"host and port: cannot listen at {host}:{port}: {reason}") from error
+    return bound
+
+
+def _address(host: str, port: int) -> str:
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"

@@ -1,0 +1,121 @@
+"""A map that is served on a free port, by threads of the test's process."""
+
+import contextlib
+import http.client
+import json
+import pathlib
+import shutil
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+import uvicorn
+
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.serve.access import Access
+from crisalad_jax.serve.app import make_app
+from crisalad_jax.serve.server import _bound, _Server
+from crisalad_jax.serve.service import MapService
+from crisalad_jax.serve.worker import MapWorker
+from crisalad_jax.utils.signals import SignalState
+from tests.conftest import BATCH, MODEL
+
+LIMIT = 50_000
+"""Largest body in bytes: the town's pictures have a tenth of it."""
+
+
+TOGETHER = 2
+"""Pictures described at once: few programs to compile, and the clients are many more."""
+
+
+class Reply(NamedTuple):
+    status: int
+    headers: dict[str, str]
+    data: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.data)
+
+
+class Service(NamedTuple):
+    """A running service."""
+
+    port: int
+    worker: MapWorker
+    stop: SignalState
+    thread: threading.Thread
+
+    def ask(self, method: str, path: str, body: Any = None, **headers: str) -> Reply:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        with contextlib.closing(connection):
+            named = {name.replace("_", "-"): value for name, value in headers.items()}
+            connection.request(method, path, body, named)
+            answer = connection.getresponse()
+            found = {name.lower(): value for name, value in answer.getheaders()}
+            return Reply(answer.status, found, answer.read())
+
+
+@contextlib.contextmanager
+def serving(
+    folder: pathlib.Path, params: Any, *, appends: bool = False, **options: Any
+) -> Iterator[Service]:
+    token = options.pop("token", None)
+    with contextlib.ExitStack() as stack:
+        places = stack.enter_context(Map.open(folder))
+        if appends:
+            places = stack.enter_context(open_for_appending(folder, places.description))
+        worker = stack.enter_context(MapWorker(places, params, batch_size=TOGETHER))
+        service = MapService(worker, appends=appends, images=options.pop("images", None))
+        stack.enter_context(contextlib.closing(service))
+        app = make_app(service, Access(token), max_bytes=LIMIT, **options)
+        config = uvicorn.Config(
+            app, loop="asyncio", http="h11", lifespan="off", log_level="critical"
+        )
+        stop, up = SignalState(), threading.Event()
+        server = _Server(config, stop, up.set)
+        listener = stack.enter_context(contextlib.closing(_bound("127.0.0.1", 0)))
+        thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
+        thread.start()
+        assert up.wait(60)
+        yield Service(listener.getsockname()[1], worker, stop, thread)
+        stop.number = signal.SIGTERM
+        thread.join(60)
+        assert not thread.is_alive()
+
+
+@pytest.fixture(scope="session")
+def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
+    """The town's database and queries."""
+    images = shared / "town" / "images" / "test"
+    return images / "database", images / "queries"
+
+
+@pytest.fixture(scope="session")
+def folder(shared, params, sides, tmp_path_factory) -> pathlib.Path:
+    out = tmp_path_factory.mktemp("serve") / "town.map"
+    weights = shared / "weights.safetensors"
+    index(params, MODEL, sides[0], out, weights=weights, batch_size=BATCH, quiet=True)
+    return out
+
+
+@pytest.fixture(scope="session")
+def service(folder, params) -> Iterator[Service]:
+    """A service that is only read."""
+    with serving(folder, params) as running:
+        yield running
+
+
+@pytest.fixture
+def own_map(folder, tmp_path) -> pathlib.Path:
+    """A map that a test may change."""
+    return shutil.copytree(folder, tmp_path / "own.map")
+
+
+@pytest.fixture(scope="session")
+def pictures(sides) -> list[pathlib.Path]:
+    """The town's queries."""
+    return sorted(sides[1].iterdir())

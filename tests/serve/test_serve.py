@@ -1,0 +1,346 @@
+"""The service over HTTP, beside `crisalad query`'s answers."""
+
+import base64
+import concurrent.futures
+import hashlib
+import importlib.resources
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+
+import cv2
+import numpy as np
+import pytest
+
+from crisalad_jax.data.images import read_image
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.query import answer_fields, query
+from crisalad_jax.serve.worker import ADDED
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import BATCH
+from tests.serve.conftest import LIMIT, serving
+
+# Batches of other sizes round otherwise; similarities are printed with six digits.
+ROUNDING = 5e-6
+CLIENTS, EACH = 32, 3
+
+
+@pytest.fixture(scope="module")
+def expected(folder, params, pictures):
+    """What `crisalad query --json` prints of each picture, by its name."""
+    with Map.open(folder) as places:
+        answers = query(places, params, pictures, k=3, batch_size=BATCH, quiet=True)
+    rows = [(path.name, [answer_fields(a, answers.axes) for a in r]) for path, r in answers.rows()]
+    return dict(rows)
+
+
+def assert_answers(found, expected):
+    assert [set(one) - {"number"} for one in found] == [set(other) for other in expected]
+    for one, other in zip(found, expected, strict=True):
+        assert one["similarity"] == pytest.approx(other["similarity"], abs=ROUNDING)
+        for field in ("rank", "name", "position"):
+            assert one[field] == other[field]
+
+
+def form(data: bytes, field: str = "image") -> tuple[bytes, dict[str, str]]:
+    head = f'--b\r\nContent-Disposition: form-data; name="{field}"; filename="a b.jpg"\r\n\r\n'
+    return head.encode() + data + b"\r\n--b--\r\n", {
+        "Content_Type": "multipart/form-data; boundary=b"
+    }
+
+
+def test_many_clients_get_the_answers_of_query(service, pictures, expected):
+    def client(number):
+        mine = [pictures[(number + i) % len(pictures)] for i in range(EACH)]
+        return [(path.name, service.ask("POST", "/locate?k=3", path.read_bytes())) for path in mine]
+
+    with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
+        replies = [each for got in pool.map(client, range(CLIENTS)) for each in got]
+    assert len(replies) == CLIENTS * EACH
+    for name, reply in replies:
+        assert reply.status == 200
+        assert_answers(reply.json["neighbours"], expected[name])
+        assert reply.json["latency_ms"] > 0
+
+
+def test_a_form_is_as_good_as_a_body(service, pictures, expected):
+    data, headers = form(pictures[0].read_bytes())
+    reply = service.ask("POST", "/locate?k=3", data, **headers)
+    assert_answers(reply.json["neighbours"], expected[pictures[0].name])
+    # The number of answers is the service's where the request names none, at most the map's size.
+    assert len(service.ask("POST", "/locate", data, **headers).json["neighbours"]) == 5
+    assert len(service.ask("POST", "/locate?k=99", data, **headers).json["neighbours"]) == 7
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "status", "words"),
+    [
+        ("POST", "/locate", b"", 400, "image: found an empty file, expected a JPEG"),
+        ("POST", "/locate", b"hello", 400, "image: found 5 bytes that do not decode"),
+        ("POST", "/locate", b"\xff\xd8\xff\xe0 cut", 400, "image: found an image cut short"),
+        ("POST", "/locate?k=0", b"", 400, "k: found '0'"),
+        ("POST", "/locate?k=101", b"", 400, "k: found '101'"),
+        ("POST", "/locate?k=x", b"", 400, "k: found 'x'"),
+        ("POST", "/locate", bytes(LIMIT + 1), 413, f"found more than {LIMIT} bytes"),
+        ("POST", "/locate", iter([bytes(LIMIT)] * 2), 413, f"found more than {LIMIT} bytes"),
+        ("POST", "/images?name=a.jpg", b"", 403, "a map that is only read"),
+        ("GET", "/locate", None, 405, "method not allowed"),
+        ("GET", "/images/7", None, 404, "number: found 7, expected 0 to 6"),
+        ("GET", "/images/-1", None, 404, "number: found -1"),
+        ("GET", "/images/..%2f..%2fmap.json", None, 404, "not found"),
+        ("GET", "/docs", None, 404, "not found"),
+    ],
+)
+def test_what_is_not_answered_is_told_in_one_line(service, method, path, body, status, words):
+    reply = service.ask(method, path, body)
+    assert reply.status == status
+    assert reply.headers["content-type"] == "application/json"
+    assert set(reply.json) == {"error"}
+    assert words.lower() in reply.json["error"].lower()
+    assert reply.headers["x-content-type-options"] == "nosniff"
+
+
+def test_a_form_without_a_picture(service, pictures):
+    data, headers = form(pictures[0].read_bytes(), field="other")
+    reply = service.ask("POST", "/locate", data, **headers)
+    assert (reply.status, reply.json["error"][:5]) == (400, "image")
+    data, headers = form(b"hello")
+    reply = service.ask("POST", "/locate", data, **headers)
+    assert reply.status == 400
+    assert reply.json["error"].startswith("a b.jpg: found 5 bytes")
+
+
+def test_other_sites_are_refused(service, pictures):
+    data = pictures[0].read_bytes()
+    own = f"http://127.0.0.1:{service.port}"
+    assert service.ask("POST", "/locate", data, Origin=own).status == 200
+    assert service.ask("POST", "/locate", data, Origin="https://evil.example").status == 403
+    assert service.ask("POST", "/locate", data, Origin="null").status == 403
+    assert service.ask("GET", "/map", Host="evil.example").status == 421
+
+
+def test_health_and_interface(service, folder):
+    health = service.ask("GET", "/health").json
+    with Map.open(folder) as places:
+        assert (health["status"], health["images"], health["model"]) == (
+            "ok",
+            7,
+            places.description.model,
+        )
+        described = service.ask("GET", "/map").json
+        assert described["axes"] == ["east", "north"]
+        assert described["positions"] == [
+            [number, *image.position] for number, image in enumerate(places.images)
+        ]
+    assert health["uptime_s"] >= 0
+    interface = service.ask("GET", "/openapi.json").json
+    assert set(interface["paths"]) == {"/health", "/map", "/locate", "/images", "/images/{number}"}
+    assert "image/*" in interface["paths"]["/locate"]["post"]["requestBody"]["content"]
+
+
+def test_the_page_holds_all_it_shows(service):
+    reply = service.ask("GET", "/")
+    page = reply.data.decode()
+    assert (
+        reply.data
+        == importlib.resources.files("crisalad_jax.serve").joinpath("page.html").read_bytes()
+    )
+    assert not re.findall(r"""(?:src|href)=["']?(?!data:)\w""", page)
+    policy = reply.headers["content-security-policy"]
+    for tag in ("script", "style"):
+        (text,) = re.findall(rf"<{tag}>(.*)</{tag}>", page, re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}'" in policy
+    assert "frame-ancestors 'none'" in policy
+    # Names are text: nothing is parsed as HTML.
+    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write", page)
+
+
+def test_pictures_of_the_map(service, sides, own_map, params):
+    reply = service.ask("GET", "/images/2")
+    assert reply.headers["content-type"] == "image/jpeg"
+    shown = cv2.imdecode(np.frombuffer(reply.data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    original = read_image(sorted(sides[0].iterdir())[2])
+    assert shown.shape == original.shape  # 70 x 50 pixels are small enough
+    # A JPEG of a JPEG with noise: a few levels of 256 on average.
+    assert np.abs(shown.astype(int) - original).mean() < 12
+    # In another folder, whose picture 3 is another one, and 4 is gone.
+    moved = own_map.parent / "moved"
+    moved.mkdir()
+    for number, path in enumerate(sorted(sides[0].iterdir())):
+        data = path.read_bytes()
+        (moved / path.name).write_bytes(data + b"more" if number == 3 else data)
+    with serving(own_map, params, images=moved) as own:
+        assert own.ask("GET", "/images/2").status == 200
+        own.worker.places.images[:] = [
+            image._replace(root="/nowhere") for image in own.worker.places.images
+        ]
+        assert own.ask("GET", "/images/3").status == 404
+        assert own.ask("GET", "/images/4").status == 200
+
+
+def test_a_token(folder, params, pictures):
+    token = "0123456789abcdef"
+    with serving(folder, params, token=token) as own:
+        for path in ("/", "/health", "/openapi.json"):
+            assert own.ask("GET", path).status == 200
+        for given in ({}, {"Authorization": "Bearer other"}, {"Authorization": f"Basic {token}"}):
+            for method, path in (("GET", "/map"), ("GET", "/images/0"), ("POST", "/locate")):
+                reply = own.ask(method, path, **given)
+                assert (reply.status, reply.headers["www-authenticate"]) == (401, "Bearer")
+        # Who has the token may ask by any name, from any page.
+        right = {"Authorization": f"Bearer {token}", "Host": "a.example", "Origin": "https://b"}
+        assert own.ask("POST", "/locate", pictures[0].read_bytes(), **right).status == 200
+
+
+def test_images_are_added_for_good(own_map, params, pictures):
+    data = pictures[4].read_bytes()  # of a place that the map does not have
+    with serving(own_map, params, appends=True) as own:
+        add = "/images?name=new/%C3%A9.jpg&east=12.5&north=5000001"
+        before = own.ask("POST", "/locate?k=1", data).json["neighbours"][0]
+        assert before["similarity"] < 1 - 10 * ROUNDING
+        reply = own.ask("POST", add, data)
+        assert reply.status == 201
+        position = {"east": 12.5, "north": 5000001.0}
+        wanted = {"number": 7, "name": "new/é.jpg", "position": position, "images": 8}
+        assert wanted.items() <= reply.json.items()
+        best = own.ask("POST", "/locate?k=1", data).json["neighbours"][0]
+        assert (best["name"], best["position"], best["number"]) == ("new/é.jpg", position, 7)
+        assert best["similarity"] == pytest.approx(1, abs=ROUNDING)
+        assert own.ask("GET", "/images/7").status == 200
+        for path, status, words in (
+            (add, 409, "which the map has already"),
+            ("/images?name=new", 409, "a folder or below a file"),
+            ("/images?name=new/%C3%A9.jpg/b", 409, "a folder or below a file"),
+            ("/images?name=../b.jpg", 400, "name: found"),
+            ("/images?name=/b.jpg", 400, "name: found"),
+            ("/images?name=.b", 400, "begins with a dot"),
+            ("/images?name=a%0Ab", 400, "line break"),
+            ("/images?name=a%1Bb", 400, "control characters"),
+            ("/images?name=a%5Cb", 400, "name: found"),
+            ("/images?name=", 400, "found an empty one"),
+            ("/images?name=" + 300 * "a", 400, "found 300 letters"),
+            ("/images", 400, "name: field required"),
+            ("/images?name=b.jpg&lat=1&lon=2", 400, "found lat, lon, expected east, north"),
+            ("/images?name=b.jpg&lat=91&lon=2", 400, "lat: found '91'"),
+            ("/images?name=b.jpg&east=1", 400, "expected east and north, or lat and lon"),
+            ("/images?name=b.jpg&east=nan&north=1", 400, "east: found 'nan'"),
+        ):
+            reply = own.ask("POST", path, data)
+            assert (reply.status, words in reply.json["error"]) == (status, True), reply
+        # As `crisalad index` reads positions from names.
+        named = own.ask("POST", "/images?name=@000033.00@5000000.00@.jpg", data).json
+        assert named["position"] == {"east": 33.0, "north": 5e6}
+    with Map.open(own_map) as places:
+        assert [image.name for image in places.images[7:]] == [
+            "new/é.jpg",
+            "@000033.00@5000000.00@.jpg",
+        ]
+        assert places.images[7].bytes == len(data)
+    assert (own_map / ADDED / "new" / "é.jpg").read_bytes() == data
+    assert not (own_map.parent / "b.jpg").exists()
+
+
+def test_adding_while_others_ask(own_map, params, pictures):
+    data = pictures[1].read_bytes()
+    with serving(own_map, params, appends=True) as own:
+
+        def one(number):
+            if number % 4:
+                return own.ask("POST", "/locate?k=99", data)
+            # Two of each name: one of them is told that it is too late.
+            return own.ask("POST", f"/images?name={number // 8}.jpg", data)
+
+        with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
+            replies = list(pool.map(one, range(64)))
+    added = [reply.status for reply in replies[::4]]
+    assert sorted(added) == [201] * 8 + [409] * 8
+    for number, reply in enumerate(replies):
+        if number % 4:
+            found = reply.json["neighbours"]
+            assert 7 <= len(found) <= 15
+            assert sorted(each["number"] for each in found) == list(range(len(found)))
+    with Map.open(own_map) as places:
+        assert len(places) == 15
+
+
+def test_too_many_are_told_to_come_again(folder, params, pictures):
+    with serving(folder, params, most_waiting=0) as own:
+        reply = own.ask("POST", "/locate", pictures[0].read_bytes())
+    assert (reply.status, reply.headers["retry-after"]) == (503, "1")
+    assert "try again" in reply.json["error"]
+
+
+def test_a_map_that_fails_tells_the_client_nothing_of_the_machine(
+    folder, params, pictures, capfd, monkeypatch
+):
+    def fail(*_):
+        raise InputError(f"{folder}: damaged")
+
+    with serving(folder, params) as own:
+        monkeypatch.setattr(own.worker.places, "search", fail)
+        reply = own.ask("POST", "/locate", pictures[0].read_bytes())
+        assert reply.status == 500
+        assert str(folder) not in reply.data.decode()
+        assert f"{folder}: damaged" in capfd.readouterr().err
+        monkeypatch.undo()
+        assert own.ask("POST", "/locate", pictures[0].read_bytes()).status == 200
+
+
+def test_requests_in_flight_are_answered_at_the_end(folder, params, pictures, monkeypatch):
+    inside, go_on = threading.Event(), threading.Event()
+    with serving(folder, params) as own:
+        search = own.worker.places.search
+
+        def slow(*arguments):
+            inside.set()
+            assert go_on.wait(60)
+            return search(*arguments)
+
+        monkeypatch.setattr(own.worker.places, "search", slow)
+        with concurrent.futures.ThreadPoolExecutor(1) as pool:
+            reply = pool.submit(own.ask, "POST", "/locate", pictures[0].read_bytes())
+            assert inside.wait(60)
+            own.stop.number = signal.SIGTERM
+            for _ in range(600):  # until nobody is let in any more
+                try:
+                    own.ask("GET", "/health")
+                except ConnectionError:
+                    break
+                time.sleep(0.1)
+            else:
+                pytest.fail("the service still takes requests")
+            go_on.set()
+            assert reply.result().status == 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [(signal.SIGTERM, 143, "ended by SIGTERM"), (signal.SIGINT, 130, "interrupted")],
+)
+def test_the_command_says_where_it_is_and_ends_at_a_signal(own_map, pictures, number, code, words):
+    command = [sys.executable, "-m", "crisalad_jax", "serve", str(own_map), "--port", "0"]
+    with subprocess.Popen(
+        [*command, "--append", "--batch-size", "1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout
+        assert process.stderr
+        line = process.stdout.readline()
+        found = re.match(r"http://127\.0\.0\.1:(\d+): answers for .*, and adds images to it", line)
+        assert found, line
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{found[1]}/locate", pictures[0].read_bytes(), timeout=60
+        ) as answer:
+            assert len(json.load(answer)["neighbours"]) == 5
+        process.send_signal(number)
+        assert process.wait(60) == code
+        assert process.stderr.read().splitlines()[-1] == f"crisalad: {words}"
