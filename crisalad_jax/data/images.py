@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 
 from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.data.video import frame_time, read_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.notes import tell
@@ -69,7 +70,7 @@ def read_image(
     - The first page or frame of several is taken.
 
     Args:
-        path: the image file.
+        path: the image file, or a frame of a video, as in `walk.mp4#t=12.500` (seconds).
         size: height and width in pixels to resize to, by the default of `resize_image`; None keeps
             the file's. Where a model has another way, `prepare_image` follows it.
         enough: height and width in pixels that the image will be resized to; None for full size.
@@ -88,6 +89,13 @@ def read_image(
         >>> read_image(pictures / "0.png", (224, 224)).shape
         (224, 224, 3)
     """
+    image = _decode_file(path, enough) if frame_time(path) is None else read_frame(path)
+    return image if size is None else resize_image(image, size)
+
+
+def _decode_file(
+    path: str | os.PathLike[str], enough: tuple[int, int] | None
+) -> UInt8[np.ndarray, "h w 3"]:
     data = read_bytes(path, "an image file")
     if not data:
         raise InputError(f"{path}: found an empty file, expected {_FORMATS}")
@@ -116,7 +124,7 @@ def read_image(
         raise InputError(f"{path}: OpenCV cannot decode this image: {reason}") from error
     if image is None:
         raise InputError(f"{path}: found {len(data)} bytes that do not decode, expected {_FORMATS}")
-    return image if size is None else resize_image(image, size)
+    return image
 
 
 def _jpeg_is_whole(data: bytes) -> bool:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.data.images import list_images
+from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.video import frame_time
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.describe import useful_batch_size
@@ -16,6 +17,7 @@ from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.windows import check_window, describe_windows
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.progress import progress_bar
@@ -72,6 +74,8 @@ def query(
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     k: int = 5,
+    fps: float = 1.0,
+    window: int = 1,
     batch_size: int = 16,
     quiet: bool = False,
 ) -> Answers:
@@ -80,8 +84,12 @@ def query(
     Args:
         places: the map, open.
         params: parameters of the model that made the map (`Map.load_params`).
-        images: an image file, a folder, or a list of these.
+        images: an image file, a folder, another source of images
+            (docs/how-to/image-sources.md), or a list of these.
         k: number of answers to each query.
+        fps: frames a second taken of a video.
+        window: frames that are described together: each with those just before it in its source,
+            as a moving camera has them. 1 describes each alone, as a map's images are.
         batch_size: number of queries described at once, each as if it were alone.
         quiet: whether to show no progress bar.
 
@@ -108,10 +116,12 @@ def query(
     check_grouping((), batch_size, seed=0)
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
-    paths = _listed(images)
+    sources = _listed(images, fps)
+    paths = [path for source in sources for path in source]
     batch_size = useful_batch_size(batch_size, len(paths))
     places.check_params(params)
     config = places.description.config
+    check_window(config, window)
     try:
         check_params(params, config)
     except InputError as error:
@@ -119,11 +129,22 @@ def query(
     parts: list[Neighbours] = []
     waiting: list[np.ndarray] = []
     described = 0
+    if window == 1:
+        alone = describe_alone(params, config, paths, batch_size=batch_size)
+        stream = (part.descriptors for part in alone)
+    else:
+        stream = (
+            part
+            for source in sources
+            for part in describe_windows(
+                params, config, source, window=window, batch_size=batch_size
+            )
+        )
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
-        for part in describe_alone(params, config, paths, batch_size=batch_size):
-            waiting.append(part.descriptors)
-            described += len(part.indices)
-            bar.advance(len(part.indices))
+        for descriptors in stream:
+            waiting.append(descriptors)
+            described += len(descriptors)
+            bar.advance(len(descriptors))
             if sum(map(len, waiting)) >= AT_ONCE or described == len(paths):
                 parts.append(places.search(np.concatenate(waiting), k))
                 waiting.clear()
@@ -131,19 +152,24 @@ def query(
     return Answers(paths, neighbours, places.images, places.axes)
 
 
-def _listed(images: Any) -> list[pathlib.Path]:
+def _listed(images: Any, fps: float) -> list[list[pathlib.Path]]:
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
-    paths = map(pathlib.Path, given)
-    return [image for path in paths for image in (list_images(path) if path.is_dir() else [path])]
+    return [open_source(each, fps=fps).paths for each in given]
 
 
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
-    Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
+    Frames of videos have a `time` in seconds, too. Where a name has letters that no text shows, or
+    bytes that are no UTF-8, they are escaped.
     """
+    return map(json_text, json_rows(answers))
+
+
+def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
+    """Yield what `json_lines` writes of each query."""
     for path, ranked in answers.rows():
         neighbours = [
             {
@@ -151,12 +177,22 @@ def json_lines(answers: Answers) -> Iterator[str]:
                 "name": answer.image.name,
                 "similarity": round(answer.similarity, 6),
                 "position": answers.position(answer.image),
+                **_time(answer.image.name),
             }
             for answer in ranked
         ]
-        line = {"query": path.as_posix(), "neighbours": neighbours}
-        text = json.dumps(line, ensure_ascii=False)
-        yield text if text.isprintable() else json.dumps(line)
+        yield {"query": path.as_posix(), **_time(path), "neighbours": neighbours}
+
+
+def _time(name: str | os.PathLike[str]) -> dict[str, float]:
+    seconds = frame_time(name)
+    return {} if seconds is None else {"time": seconds}
+
+
+def json_text(row: dict[str, Any]) -> str:
+    """Return a row as one line of JSON."""
+    text = json.dumps(row, ensure_ascii=False)
+    return text if text.isprintable() else json.dumps(row)
 
 
 def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
