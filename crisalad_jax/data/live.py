@@ -148,7 +148,7 @@ class _Arriving:
             self._state, self._since, self._tried = state, time.monotonic(), False
         waits = 0.0 if path.suffix.lower() in _SELF_TOLD else _SETTLED
         # What was unreadable is read again when it has changed, and for the last time at the end.
-        if self._tried and self.still_for() <= _PATIENCE or self.still_for() < waits:
+        if (self._tried and self.still_for() <= _PATIENCE) or self.still_for() < waits:
             return False
         self._tried = True
         return state[0] > 0 or self.still_for() > _PATIENCE

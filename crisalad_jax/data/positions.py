@@ -156,7 +156,6 @@ def _position(
         raise InputError(f"{where}: found {texts}, expected a latitude and a longitude")
     if max(abs(first), abs(second)) > MOST_METRES:
         raise InputError(
-            f"{where}: found {texts}, expected metres {' and '.join(axes)}, at most "
-            f"{MOST_METRES:g}"
+            f"{where}: found {texts}, expected metres {' and '.join(axes)}, at most {MOST_METRES:g}"
         )
     return first, second

@@ -94,7 +94,9 @@ def _source(
 
 def _with_frames(paths: Sequence[pathlib.Path], fps: float) -> list[pathlib.Path]:
     """Put a video's frames in its place."""
-    return [each for path in paths for each in (list_frames(path, fps) if is_video(path) else [path])]
+    return [
+        each for path in paths for each in (list_frames(path, fps) if is_video(path) else [path])
+    ]
 
 
 def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:

@@ -5,6 +5,7 @@ that varies does no harm.
 """
 
 import collections
+import contextlib
 import os
 import pathlib
 import re
@@ -18,6 +19,9 @@ from jaxtyping import UInt8
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
+
+# OpenCV reads this as it opens its first video: our errors say what the user needs.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 """Suffixes of videos, in lower case."""
@@ -101,16 +105,24 @@ def _sampled(times: Iterable[int], fps: float) -> list[int]:
 
 def _frame_times(video: str | os.PathLike[str]) -> list[int]:
     """Read the times of all frames in milliseconds, in order, each once."""
+    times = _grabbed_times(video, decoded=False)
+    # A video that was trimmed without encoding it again keeps frames that are not shown.
+    if not times or not _can_read(pathlib.Path(video), times[-1]):
+        times = _grabbed_times(video, decoded=True)
+    if not times:
+        raise InputError(f"{video}: found no frame, expected {_VIDEO}")
+    return times
+
+
+def _grabbed_times(video: str | os.PathLike[str], *, decoded: bool) -> list[int]:
     capture = _opened(video)
     with QUIET:
-        # Packets are not decoded, and come in the order of decoding.
-        capture.set(cv2.CAP_PROP_FORMAT, -1)
+        if not decoded:  # packets as they are, in the order of decoding
+            capture.set(cv2.CAP_PROP_FORMAT, -1)
         times = set()
         while capture.grab():
             times.add(round(capture.get(cv2.CAP_PROP_POS_MSEC)))
         capture.release()
-    if not times:
-        raise InputError(f"{video}: found no frame, expected {_VIDEO}")
     return sorted(time for time in times if time >= 0)
 
 
@@ -157,6 +169,11 @@ class _Reader:
 
     def close(self) -> None:
         self._capture.release()
+
+
+def _can_read(video: pathlib.Path, time: int) -> bool:
+    with contextlib.closing(_Reader(video)) as reader:
+        return reader.read(time) is not None
 
 
 _lock = threading.Lock()

@@ -19,8 +19,8 @@ from jaxtyping import Float, Float32
 from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_seed
-from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.sources import open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
