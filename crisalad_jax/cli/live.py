@@ -23,6 +23,7 @@ class LiveFlags(Protocol):
     k: int
     json: pathlib.Path | None
     gallery: pathlib.Path | None
+    map_images: pathlib.Path | None
     watch: pathlib.Path | None
     camera: str | None
     fps: float | None
@@ -38,6 +39,7 @@ def run(arguments: LiveFlags) -> None:
         "IMAGE": bool(arguments.images),
         "--camera": arguments.camera is not None and name != "--camera",
         "--gallery": arguments.gallery is not None,
+        "--map-images": arguments.map_images is not None,
         "--fps": arguments.fps is not None and name == "--watch",
     }
     for other, given in others.items():

@@ -66,7 +66,8 @@ class Query:
 def run(arguments: Query) -> None:
     """Query the map, and print or write its answers."""
     if arguments.watch is not None or arguments.camera is not None:
-        return live.run(arguments)
+        live.run(arguments)
+        return
     file = None if arguments.json == STDOUT else arguments.json
     talk_beside(arguments.json)
     _check_files(file, arguments)

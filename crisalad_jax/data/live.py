@@ -205,8 +205,8 @@ class Camera:
         if not whole:
             self._capture.release()
             raise InputError(
-                f"camera: found no frame from {self.name}, expected a camera's number from 0, a URL "
-                "or a video file"
+                f"camera: found no frame from {self.name}, expected a number from 0, a URL or a "
+                "video file"
             )
         sides = (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH)
         height, width = (int(self._capture.get(side)) for side in sides)
