@@ -101,16 +101,19 @@ def folder(shared, tmp_path_factory) -> pathlib.Path:
     return out
 
 
-def test_a_pattern_and_a_window_of_queries(shared, folder, capfd):
+def test_a_pattern_and_a_window_of_queries(shared, folder, tmp_path, capfd):
     queries = shared / "town" / "images" / "test" / "queries"
-    said = succeeds(capfd, *query(folder, queries / "*.jpg", "--k", 1, "--json", "-"))
-    lines = [json.loads(line) for line in said.splitlines()]
+
+    def answers(*flags: object) -> list[dict]:
+        out = tmp_path / "answers.jsonl"
+        succeeds(capfd, *query(folder, queries / "*.jpg", "--k", 1, "--json", out, *flags))
+        return [json.loads(line) for line in out.read_text().splitlines()]
+
+    lines, together = answers(), answers("--window", 3)
     assert [line["query"] for line in lines] == [path.as_posix() for path in list_images(queries)]
-    together = succeeds(
-        capfd, *query(folder, queries / "*.jpg", "--k", 1, "--json", "-", "--window", 3)
+    alone, similar = (
+        [line["neighbours"][0]["similarity"] for line in each] for each in (lines, together)
     )
-    similar = [json.loads(line)["neighbours"][0]["similarity"] for line in together.splitlines()]
-    alone = [line["neighbours"][0]["similarity"] for line in lines]
     assert similar[0] == pytest.approx(alone[0], abs=ROUNDING + 1e-6)  # nothing is before it
     assert np.abs(np.subtract(similar, alone))[1:].max() > 1000 * ROUNDING
 

@@ -139,7 +139,7 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
         (
             "none",
             None,
-            "none: found nothing, expected a folder of images, an image, a video, a pat",
+            "none: found nothing, expected a folder of images, an image, a video, a p",
         ),
         ("none.jpg", None, "none.jpg: found no such file, expected an image file"),
         ("*.gif", None, r"\*.gif: found no file that is an image, expected some that end in .jpg"),

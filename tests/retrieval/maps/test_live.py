@@ -91,16 +91,16 @@ def test_a_watched_folder_and_a_camera(folder, shared, params, tmp_path):
 
 def test_a_map_of_a_video_tells_times(shared, params, tmp_path):
     video = write_video(tmp_path / "walk.avi", 21)
-    weights = shared / "weights.safetensors"
-    made = index(params, MODEL, video, tmp_path / "map", fps=1, weights=weights, quiet=True)
+    more = {"weights": shared / "weights.safetensors", "batch_size": BATCH, "quiet": True}
+    made = index(params, MODEL, video, tmp_path / "map", fps=1, **more)
     assert (made.added, made.positions) == (3, 0)
-    made = index(params, MODEL, video, tmp_path / "map", fps=2, weights=weights, quiet=True)
+    made = index(params, MODEL, video, tmp_path / "map", fps=2, **more)
     assert (made.added, made.there) == (2, 3)
     with Map.open(tmp_path / "map") as places:
         assert {image.root for image in places.images} == {tmp_path.resolve().as_posix()}
         assert places.images[1].bytes == video.stat().st_size
-        answers = query(places, params, list_frames(video, 1)[2], k=1, quiet=True)
-        whole = query(places, params, video, fps=2, k=1, quiet=True)
+        answers = query(places, params, list_frames(video, 1)[2], k=1, batch_size=BATCH, quiet=True)
+        whole = query(places, params, video, fps=2, k=1, batch_size=BATCH, quiet=True)
     (line,) = map(json.loads, json_lines(answers))
     assert (line["query"], line["time"]) == (f"{video}#t=2.000", 2.0)
     assert line["neighbours"][0] == {
