@@ -16,7 +16,7 @@ import safetensors
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
-from crisalad_jax.config.source import changed_sources, sources_of
+from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
@@ -78,6 +78,7 @@ def save_weights(
         "config": to_plain(config),
         "version": VERSION,
         "parts": sources_of(config),
+        "source_bytes": source_bytes_of(config),
         "aggregator": config.aggregator.metadata(params.aggregator),
     }
     write_sealed(path, arrays, FORMAT, metadata)
@@ -143,7 +144,9 @@ def load_weights(
             f"{error}; it is in the cache: once it is removed, the same command makes it anew"
         ) from error
     same_version = metadata.get("version") == VERSION
-    changed = changed_sources(config, metadata.get("parts", {}), same_version)
+    changed = changed_sources(
+        config, metadata.get("parts", {}), same_version, metadata.get("source_bytes")
+    )
     if changed:
         tell(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
@@ -186,7 +189,7 @@ def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         return dict(_renamed(arrays)), {"config": plain, _MARK: float(mark.max(initial=0))}
     if not isinstance(plain, dict) or "config" not in plain:
         raise InputError(f"{path}: found no configuration in its metadata, expected 'config'")
-    for name in ("parts", "aggregator"):
+    for name in ("parts", "source_bytes", "aggregator"):
         value = plain.setdefault(name, {})
         if not isinstance(value, dict):
             raise InputError(

@@ -13,6 +13,7 @@ import rich.console
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_seed
+from crisalad_jax.data.resize import compile_ahead
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training.recipes import recipe
@@ -104,6 +105,7 @@ def load_model(
             or both weights and a preset are given.
     """
     check_one_model(weights, preset)
+    compile_ahead()
     if weights is None:
         preset = preset or "b14"
         config = recipe(preset).model

@@ -17,6 +17,14 @@ def source_digest(part: type[Part]) -> str | None:
     The code is the part's module and, in a package, its sibling modules. Methods that were assigned
     from other modules count too. Comments, docstrings and layout do not.
     """
+    files = _files_of(part)
+    if files is None:
+        return None
+    return hashlib.sha256("".join(map(_file_digest, files)).encode()).hexdigest()
+
+
+def _files_of(part: type[Part]) -> list[pathlib.Path] | None:
+    """List the files of the code that defines a part; None where there is no code."""
     base = part.registry.base
     classes = [each for each in part.__mro__ if issubclass(each, base) and each is not base]
     files: set[pathlib.Path] = set()
@@ -27,7 +35,7 @@ def source_digest(part: type[Part]) -> str | None:
         if file is not None and file.is_file():
             beside = file.parent.glob("*.py") if (file.parent / "__init__.py").exists() else [file]
             files.update(beside)
-    return hashlib.sha256("".join(map(_file_digest, sorted(files))).encode()).hexdigest()
+    return sorted(files)
 
 
 def _file_of(member: Any) -> pathlib.Path | None:
@@ -89,17 +97,39 @@ def sources_of(config: Any) -> Sources:
     }
 
 
-def changed_sources(config: Any, recorded: Mapping[str, Any], same_version: bool) -> list[str]:
+def source_bytes_of(config: Any) -> dict[str, str]:
+    """Return a digest of the bytes of every part's source, which is quick to compare."""
+    digests = {}
+    for field, part in parts_of(config).items():
+        files = _files_of(type(part)) or []
+        digests[field] = hashlib.sha256(b"".join(map(_bytes_digest, files))).hexdigest()
+    return digests
+
+
+@functools.cache
+def _bytes_digest(path: pathlib.Path) -> bytes:
+    return hashlib.sha256(path.read_bytes()).digest()
+
+
+def changed_sources(
+    config: Any,
+    recorded: Mapping[str, Any],
+    same_version: bool,
+    recorded_bytes: Mapping[str, Any] | None = None,
+) -> list[str]:
     """Return the parts whose source differs from the recorded one, as "field name".
 
     Built-in parts of another version of this package are not compared: the package's tests check
-    that they do the same.
+    that they do the same. Sources of the bytes in `recorded_bytes` are the same, and not parsed.
     """
+    same_bytes = recorded_bytes and source_bytes_of(config)
     changed = []
     for field, part in parts_of(config).items():
         name, digest = recorded.get(field, (None, None))
         built_in = type(part).__module__.startswith("crisalad_jax.")
         if name != part.part_name or digest is None or (built_in and not same_version):
+            continue
+        if recorded_bytes and same_bytes and recorded_bytes.get(field) == same_bytes[field]:
             continue
         if digest != source_digest(type(part)):
             changed.append(f"{field} {name}")

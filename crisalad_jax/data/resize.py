@@ -169,6 +169,14 @@ def _compiled_floats() -> Callable[..., None]:
         return _machine_code(_resample_floats, "float32", "float32", "bool_") or _multiply_floats
 
 
+def compile_ahead() -> None:
+    """Start to load numba and the default filter's machine code in a thread.
+
+    A program that reads a model's file first has them when it comes to its first image.
+    """
+    threading.Thread(target=_compiled, daemon=True).start()
+
+
 @functools.cache
 def _machine_code(
     function: Callable[..., None], old: str, new: str, *more: str

@@ -15,6 +15,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.convolutions import ConvNorm
 from crisalad_jax.nn.layers import (
     Conv,
@@ -152,15 +153,15 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
         return None
     if kind == "serial-parallel":
         plain = dataclasses.replace(config, kind="mlp")
-        serial, parallel = (init_adapter(each, dim, plain) for each in jax.random.split(key))
+        serial, parallel = (init_adapter(each, dim, plain) for each in draw.split(key))
         assert isinstance(serial, MlpAdapter)
         assert isinstance(parallel, MlpAdapter)
         return SerialParallelAdapter(serial, parallel)
-    down_key, first, second, up_key = jax.random.split(key, 4)
+    down_key, first, second, up_key = draw.split(key, 4)
     depthwise, convolutions = kind == "depthwise", config.bias == "convolutions"
     down = init_linear(down_key, dim, width, bias=not depthwise)
     up = init_linear(up_key, width, dim, bias=not (depthwise and convolutions))
-    up = jax.tree.map(jnp.zeros_like, up)
+    up = jax.tree.map(lambda leaf: draw.zeros(*leaf.shape), up)
     if kind == "mlp":
         return MlpAdapter(down, up)
     if kind == "side":
@@ -183,8 +184,8 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
 
 
 def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
-    weight = jnp.full((kernel_size, kernel_size, d_in, d_out), CONV_INIT)
-    return ConvNorm(Conv(weight, jnp.full(d_out, CONV_INIT)), init_batch_norm(d_out))
+    weight = draw.full((kernel_size, kernel_size, d_in, d_out), CONV_INIT)
+    return ConvNorm(Conv(weight, draw.full((d_out,), CONV_INIT)), init_batch_norm(d_out))
 
 
 def adapter(

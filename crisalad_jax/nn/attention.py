@@ -16,6 +16,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.layers import (
     Linear,
     at_least_float32,
@@ -67,9 +68,9 @@ _CUDNN_HEAD = 128
 def init_torch_attention(qkv_key: PRNGKeyArray, proj_key: PRNGKeyArray, dim: int) -> Attention:
     """Draw parameters as torch's `nn.MultiheadAttention`: Glorot-uniform inputs, zero biases."""
     bound = math.sqrt(6 / (dim + 3 * dim))
-    qkv = jax.random.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound)
+    qkv = draw.uniform(qkv_key, (dim, 3 * dim), minval=-bound, maxval=bound)
     proj = init_linear(proj_key, dim, dim).weight
-    return Attention(Linear(qkv, jnp.zeros(3 * dim)), Linear(proj, jnp.zeros(dim)))
+    return Attention(Linear(qkv, draw.zeros(3 * dim)), Linear(proj, draw.zeros(dim)))
 
 
 def attention(

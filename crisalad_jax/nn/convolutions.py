@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.layers import BatchNorm, Conv, conv, init_batch_norm, train_batch_norm
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -30,8 +31,8 @@ def init_he_conv(
     This is He et al.'s start (2015), by the number of outputs.
     """
     deviation = math.sqrt(2 / (kernel_size**2 * d_out))
-    weight = deviation * jax.random.normal(key, (kernel_size, kernel_size, d_in, d_out))
-    return Conv(weight, jnp.zeros(d_out) if bias else None)
+    weight = draw.normal(key, (kernel_size, kernel_size, d_in, d_out), scale=deviation)
+    return Conv(weight, draw.zeros(d_out) if bias else None)
 
 
 def init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> ConvNorm:

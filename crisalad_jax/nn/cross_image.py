@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
 from crisalad_jax.config.fields import free_field
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.attention import (
     COLUMNS,
     Attention,
@@ -89,14 +90,14 @@ def init_cross_image(key: PRNGKeyArray, dim: int, config: CrossImageConfig) -> C
 
     All layers start equal, for torch's `nn.TransformerEncoder` copies the one that it is given.
     """
-    layer = init_encoder_layer(key, dim, config.feedforward)
-    # Copies: a training step that donates its buffers must not find one twice.
-    return CrossImageEncoder(tuple(jax.tree.map(jnp.copy, layer) for _ in range(config.layers)))
+    # Drawn anew: a training step that donates its buffers must not find one twice.
+    layers = (init_encoder_layer(key, dim, config.feedforward) for _ in range(config.layers))
+    return CrossImageEncoder(tuple(layers))
 
 
 def init_encoder_layer(key: PRNGKeyArray, dim: int, feedforward: int) -> EncoderLayer:
     """Draw parameters as torch's `nn.TransformerEncoderLayer` does."""
-    qkv_key, proj_key, first, second = jax.random.split(key, 4)
+    qkv_key, proj_key, first, second = draw.split(key, 4)
     return EncoderLayer(
         attn=init_torch_attention(qkv_key, proj_key, dim),
         linear1=init_linear(first, dim, feedforward),

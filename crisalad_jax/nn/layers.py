@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
+from crisalad_jax.nn import draw
 from crisalad_jax.utils.pytree import pytree_dataclass
 from crisalad_jax.utils.target import target
 
@@ -70,53 +71,51 @@ class BatchNorm:
 
 def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
     """Draw a linear layer as torch's `nn.Linear`: uniform within 1 / sqrt(d_in)."""
-    weight_key, bias_key = jax.random.split(key)
+    weight_key, bias_key = draw.split(key)
     bound = 1 / math.sqrt(d_in)
     return Linear(
-        jax.random.uniform(weight_key, (d_in, d_out), minval=-bound, maxval=bound),
-        jax.random.uniform(bias_key, (d_out,), minval=-bound, maxval=bound) if bias else None,
+        draw.uniform(weight_key, (d_in, d_out), minval=-bound, maxval=bound),
+        draw.uniform(bias_key, (d_out,), minval=-bound, maxval=bound) if bias else None,
     )
 
 
 def init_small_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
     """Draw a linear layer as vision transformers': normal of deviation 0.02, cut at two; bias 0."""
-    weight = 0.02 * jax.random.truncated_normal(key, -2.0, 2.0, (d_in, d_out))
-    return Linear(weight, jnp.zeros(d_out) if bias else None)
+    weight = draw.truncated_normal(key, -2.0, 2.0, (d_in, d_out), scale=0.02)
+    return Linear(weight, draw.zeros(d_out) if bias else None)
 
 
 def init_layer_norm(dim: int) -> LayerNorm:
     """Make a layer norm with gain 1 and shift 0."""
-    return LayerNorm(jnp.ones(dim), jnp.zeros(dim))
+    return LayerNorm(draw.ones(dim), draw.zeros(dim))
 
 
 def init_depthwise_conv(
     key: PRNGKeyArray, kernel_size: int, dim: int, *, bias: bool = True
 ) -> DepthwiseConv:
     """Draw depthwise filters as torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
-    weight_key, bias_key = jax.random.split(key)
+    weight_key, bias_key = draw.split(key)
     bound = 1 / kernel_size
     return DepthwiseConv(
-        jax.random.uniform(
-            weight_key, (kernel_size, kernel_size, dim), minval=-bound, maxval=bound
-        ),
-        jax.random.uniform(bias_key, (dim,), minval=-bound, maxval=bound) if bias else None,
+        draw.uniform(weight_key, (kernel_size, kernel_size, dim), minval=-bound, maxval=bound),
+        draw.uniform(bias_key, (dim,), minval=-bound, maxval=bound) if bias else None,
     )
 
 
 def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
     """Draw a convolution as torch's `nn.Conv2d`: uniform within 1 / sqrt(kernel_size^2 d_in)."""
-    weight_key, bias_key = jax.random.split(key)
+    weight_key, bias_key = draw.split(key)
     bound = 1 / (kernel_size * math.sqrt(d_in))
     shape = (kernel_size, kernel_size, d_in, d_out)
     return Conv(
-        jax.random.uniform(weight_key, shape, minval=-bound, maxval=bound),
-        jax.random.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
+        draw.uniform(weight_key, shape, minval=-bound, maxval=bound),
+        draw.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
     )
 
 
 def init_batch_norm(dim: int) -> BatchNorm:
     """Make a batch norm as torch's `nn.BatchNorm2d`: mean 0 and variance 1, the identity."""
-    return BatchNorm(jnp.ones(dim), jnp.zeros(dim), jnp.zeros(dim), jnp.ones(dim))
+    return BatchNorm(draw.ones(dim), draw.zeros(dim), draw.zeros(dim), draw.ones(dim))
 
 
 def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.config import ModelConfig
@@ -76,7 +77,7 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         >>> params.backbone.cls_token.shape
         (128,)
     """
-    keys = jax.random.split(key, 3)
+    keys = draw.split(key, 3)
     backbone = config.backbone.init(keys[0])
     check_drawn(backbone, f"backbone {config.backbone.part_name}")
     aggregator = config.aggregator.init(keys[1], config.backbone, config.grid)
@@ -87,9 +88,7 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         cross_image=init_cross_image(keys[2], config.token_shape.token_dim, config.cross_image)
         if config.cross_image.layers
         else None,
-        projection=init_linear(
-            jax.random.fold_in(key, 3), config.unprojected_dim, config.projection.dim
-        )
+        projection=init_linear(draw.fold_in(key, 3), config.unprojected_dim, config.projection.dim)
         if config.projection.dim
         else None,
     )
@@ -103,7 +102,8 @@ def parameter_shapes(config: ModelConfig) -> Crisalad:
 @functools.lru_cache(maxsize=64)
 def _shapes(config: ModelConfig, default: str) -> Crisalad:
     """Make the tree for JAX's `default` type of floats, which its 64-bit mode changes."""
-    return jax.eval_shape(lambda: init_crisalad(jax.random.key(0), config))
+    with draw.only_shapes():
+        return jax.eval_shape(lambda: init_crisalad(jax.random.key(0), config))
 
 
 def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> None:

@@ -3,10 +3,10 @@
 import dataclasses
 from typing import ClassVar
 
-import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.netvlad import scores_from_centroids
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
@@ -67,7 +67,7 @@ class AggregationTokensConfig(Aggregator):
         self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]
     ) -> AggregationTokens:
         """Draw tokens of deviation 1e-6, as published; `from_centroids` replaces them."""
-        return AggregationTokens(1e-6 * jax.random.normal(key, (self.tokens, backbone.dim)))
+        return AggregationTokens(draw.normal(key, (self.tokens, backbone.dim), scale=1e-6))
 
     def from_centroids(
         self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.netvlad import residual_sums
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
@@ -74,7 +75,7 @@ class AnyLocConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> AnyLoc:
         """Draw random unit vectors as words, until a vocabulary is built."""
-        return AnyLoc(l2_normalise(jax.random.normal(key, (self.clusters, backbone.dim))))
+        return AnyLoc(l2_normalise(draw.normal(key, (self.clusters, backbone.dim))))
 
     @property
     def spherical_centroids(self) -> bool:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.attention import (
     Attention,
@@ -102,8 +103,8 @@ class BoqConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Boq:
         """Draw parameters as the public code: standard normal queries, the rest as torch's."""
-        conv_key, blocks_key, rows_key = jax.random.split(key, 3)
-        keys = jax.random.split(blocks_key, self.layers)
+        conv_key, blocks_key, rows_key = draw.split(key, 3)
+        keys = draw.split(blocks_key, self.layers)
         return Boq(
             proj_c=init_conv(conv_key, 3, backbone.dim, self.channels),
             norm_input=init_layer_norm(self.channels),
@@ -133,10 +134,10 @@ class BoqConfig(Aggregator):
 
 
 def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
-    layer_key, queries_key, *keys = jax.random.split(key, 6)
+    layer_key, queries_key, *keys = draw.split(key, 6)
     return BoqBlock(
         encoder=init_encoder_layer(layer_key, channels, 4 * channels),
-        queries=jax.random.normal(queries_key, (queries, channels)),
+        queries=draw.normal(queries_key, (queries, channels)),
         self_attn=init_torch_attention(keys[0], keys[1], channels),
         norm_q=init_layer_norm(channels),
         cross_attn=init_torch_attention(keys[2], keys[3], channels),

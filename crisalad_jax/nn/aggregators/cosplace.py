@@ -3,10 +3,10 @@
 import dataclasses
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
 from crisalad_jax.nn.backbones.base import Backbone, Features
@@ -42,7 +42,7 @@ class CosPlaceConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> CosPlace:
         """Draw parameters as the public code: an exponent of 3, torch's default linear layer."""
-        return CosPlace(jnp.full((), START), init_linear(key, backbone.dim, self.dim))
+        return CosPlace(draw.full((), START), init_linear(key, backbone.dim, self.dim))
 
     def apply(
         self, params: CosPlace, features: Features, grid: tuple[int, int], *, key: Keys | None

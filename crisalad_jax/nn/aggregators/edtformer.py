@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.attention import (
     Attention,
@@ -102,10 +103,10 @@ class EdtFormerConfig(Aggregator):
 
         All layers start equal: torch's `nn.TransformerDecoder` copies the layer that it is given.
         """
-        queries, fc, layer_key, channels, rows = jax.random.split(key, 5)
+        queries, fc, layer_key, channels, rows = draw.split(key, 5)
         layer = _init_layer(layer_key, self.width)
         return EdtFormer(
-            queries=1e-6 * jax.random.normal(queries, (self.queries, self.width)),
+            queries=draw.normal(queries, (self.queries, self.width), scale=1e-6),
             fc=init_linear(fc, backbone.dim, self.width),
             # Copies: a training step that donates its buffers must not find one twice.
             layers=tuple(jax.tree.map(jnp.copy, layer) for _ in range(self.layers)),
@@ -127,7 +128,7 @@ class EdtFormerConfig(Aggregator):
 
 
 def _init_layer(key: PRNGKeyArray, width: int) -> DecoderLayer:
-    keys = jax.random.split(key, 4)
+    keys = draw.split(key, 4)
     return DecoderLayer(
         self_attn=init_torch_attention(keys[0], keys[1], width),
         multihead_attn=init_torch_attention(keys[2], keys[3], width),

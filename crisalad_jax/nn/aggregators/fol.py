@@ -6,12 +6,12 @@ Written from the paper, with the constants of the public model.
 import dataclasses
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_fraction, require_positive
 from crisalad_jax.config.fields import free_field
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.salad import (
     TwoLayer,
@@ -99,7 +99,7 @@ class FolConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Fol:
         """Draw parameters as torch's default layers, as the public code."""
-        token_key, cluster_key, score_key, first, second = jax.random.split(key, 5)
+        token_key, cluster_key, score_key, first, second = draw.split(key, 5)
         dim = backbone.dim
         return Fol(
             token_features=init_two_layer(token_key, dim, self.hidden, self.token_dim),

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, Features
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
@@ -37,7 +38,7 @@ class GemConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Gem:
         """Start at an exponent of 3, as public implementations do."""
-        return Gem(jnp.full((), START))
+        return Gem(draw.full((), START))
 
     def apply(
         self, params: Gem, features: Features, grid: tuple[int, int], *, key: Keys | None

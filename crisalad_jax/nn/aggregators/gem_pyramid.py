@@ -6,6 +6,7 @@ import itertools
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape, require_side
 from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
@@ -43,7 +44,7 @@ class GemPyramidConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> GemPyramid:
         """Start at an exponent of 3, as the public implementation does."""
-        return GemPyramid(jnp.full((), START))
+        return GemPyramid(draw.full((), START))
 
     def apply(
         self, params: GemPyramid, features: Features, grid: tuple[int, int], *, key: Keys | None

@@ -8,10 +8,10 @@ import math
 from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
@@ -82,12 +82,11 @@ class MixVprConfig(Aggregator):
         Mixers have zero biases and normal weights of deviation 0.02. (The public code truncates
         them at 100 deviations, which has no effect.) Projections start as torch's linears.
         """
-        mixers, channels, rows = jax.random.split(key, 3)
+        mixers, channels, rows = draw.split(key, 3)
         patches = math.prod(grid)
         return MixVpr(
             mix=tuple(
-                _init_mixer(mixer_key, patches)
-                for mixer_key in jax.random.split(mixers, self.depth)
+                _init_mixer(mixer_key, patches) for mixer_key in draw.split(mixers, self.depth)
             ),
             channel_proj=init_linear(channels, backbone.dim, self.channels),
             row_proj=init_linear(rows, patches, self.rows),
@@ -109,8 +108,8 @@ class MixVprConfig(Aggregator):
 
 
 def _init_mixer(key: PRNGKeyArray, patches: int) -> FeatureMixer:
-    weights = 0.02 * jax.random.normal(key, (2, patches, patches))
-    first, second = (Linear(weight, jnp.zeros(patches)) for weight in weights)
+    weights = draw.normal(key, (2, patches, patches), scale=0.02)
+    first, second = (Linear(weight, draw.zeros(patches)) for weight in weights)
     return FeatureMixer(init_layer_norm(patches), first, second)
 
 

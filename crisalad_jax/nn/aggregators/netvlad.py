@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, Features
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise
@@ -53,11 +54,11 @@ class NetVladConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> NetVlad:
         """Draw unit vectors as centroids. `training.vocabulary` makes centroids from images."""
-        conv_key, centroid_key = jax.random.split(key)
+        conv_key, centroid_key = draw.split(key)
         dim = backbone.dim
         return NetVlad(
             conv=init_linear(conv_key, dim, self.clusters, bias=False),
-            centroids=l2_normalise(jax.random.normal(centroid_key, (self.clusters, dim))),
+            centroids=l2_normalise(draw.normal(centroid_key, (self.clusters, dim))),
         )
 
     def from_centroids(

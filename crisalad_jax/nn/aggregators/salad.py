@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from crisalad_jax.config.checks import require, require_fraction, require_positive
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
@@ -124,16 +125,16 @@ class SaladConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Salad:
         """Draw parameters as the public code: torch's default linears, dustbin score 1."""
-        token_key, cluster_key, score_key = jax.random.split(key, 3)
+        token_key, cluster_key, score_key = draw.split(key, 3)
         dim = backbone.dim
         return Salad(
             token_features=init_two_layer(token_key, dim, self.hidden, self.token_dim),
             cluster_features=init_two_layer(cluster_key, dim, self.hidden, self.cluster_dim),
             score=init_two_layer(score_key, dim, self.hidden, self.scores),
             # Start at 3: `split` may derive the keys above from 0 to 2.
-            dust_bin=self.dustbin.init(jax.random.fold_in(key, 3), dim),
+            dust_bin=self.dustbin.init(draw.fold_in(key, 3), dim),
             log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
-            step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
+            step=self.sinkhorn.step.init_params(draw.fold_in(key, 4)),
         )
 
     def transport(
@@ -203,7 +204,7 @@ def require_more_patches(clusters: int, grid: tuple[int, int], patch_size: int) 
 
 def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
     """Draw a network of one hidden layer, each layer as torch's `nn.Linear`."""
-    first, second = jax.random.split(key)
+    first, second = draw.split(key)
     return TwoLayer(init_linear(first, d_in, hidden), init_linear(second, hidden, d_out))
 
 

@@ -4,10 +4,10 @@ import dataclasses
 import math
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
 from crisalad_jax.nn.backbones.base import Backbone, Features
@@ -61,9 +61,9 @@ class SelaVprConfig(Aggregator):
 
         That is torch's `nn.ConvTranspose2d`, which takes the channels out for those in.
         """
-        first, second = jax.random.split(key)
+        first, second = draw.split(key)
         return SelaVpr(
-            p=jnp.full((), START),
+            p=draw.full((), START),
             upconv1=init_upconv(first, backbone.dim, self.hidden),
             upconv2=init_upconv(second, self.hidden, self.local),
         )
@@ -82,11 +82,11 @@ class SelaVprConfig(Aggregator):
 
 def init_upconv(key: PRNGKeyArray, d_in: int, d_out: int) -> Conv:
     """Draw a transposed convolution of 3 x 3, weight and bias uniform within 1 / sqrt(9 d_out)."""
-    weight_key, bias_key = jax.random.split(key)
+    weight_key, bias_key = draw.split(key)
     bound = 1 / (3 * math.sqrt(d_out))
     return Conv(
-        jax.random.uniform(weight_key, (3, 3, d_in, d_out), minval=-bound, maxval=bound),
-        jax.random.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
+        draw.uniform(weight_key, (3, 3, d_in, d_out), minval=-bound, maxval=bound),
+        draw.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
     )
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
@@ -62,7 +63,7 @@ class TransVprConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> TransVpr:
         """Draw parameters as torch's `nn.Linear` does."""
-        first, second = jax.random.split(key)
+        first, second = draw.split(key)
         wide = self.levels * backbone.dim
         return TransVpr(
             init_linear(first, wide, self.levels, bias=False), init_linear(second, wide, self.dim)

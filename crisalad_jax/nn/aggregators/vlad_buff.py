@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.netvlad import residual_sums, scores_from_centroids, shares
 from crisalad_jax.nn.backbones.base import Backbone, Features
@@ -74,13 +75,13 @@ class VladBuffConfig(Aggregator):
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> VladBuff:
         """Draw an orthogonal reduction and unit centroids; `from_centroids` replaces them."""
-        rotation_key, conv_key, centroid_key = jax.random.split(key, 3)
+        rotation_key, conv_key, centroid_key = draw.split(key, 3)
         dim = self.reduced or backbone.dim
         rotation = jax.nn.initializers.orthogonal()(rotation_key, (backbone.dim, dim))
         return VladBuff(
-            reduction=Reduction(jnp.zeros(backbone.dim), rotation) if self.reduced else None,
+            reduction=Reduction(draw.zeros(backbone.dim), rotation) if self.reduced else None,
             conv=init_linear(conv_key, dim, self.clusters, bias=False),
-            centroids=l2_normalise(jax.random.normal(centroid_key, (self.clusters, dim))),
+            centroids=l2_normalise(draw.normal(centroid_key, (self.clusters, dim))),
             burst=jnp.asarray(BURST),
         )
 

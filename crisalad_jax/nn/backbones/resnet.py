@@ -8,6 +8,7 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.backbones.base import BACKBONES
 from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages, Valid
 from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_conv_norm, max_pool
@@ -89,7 +90,7 @@ class ResNetConfig(StagedBackbone):
 
     def init(self, key: PRNGKeyArray) -> Stages:
         """Draw parameters as torchvision does before training."""
-        stem_key, *keys = jax.random.split(key, 1 + self.stages)
+        stem_key, *keys = draw.split(key, 1 + self.stages)
         return Stages(
             init_conv_norm(stem_key, STEM_SIDE, 3, STEM_DIM),
             tuple(Stage(tuple(self._init_stage(keys[i], i))) for i in range(self.stages)),
@@ -105,8 +106,8 @@ class ResNetConfig(StagedBackbone):
 
     def _init_stage(self, key: PRNGKeyArray, stage: int) -> Iterator[Residual]:
         d_in = self.widths(stage - 1)[-1] if stage else STEM_DIM
-        for block_key in jax.random.split(key, BLOCKS[self.layers][stage]):
-            shortcut_key, *keys = jax.random.split(block_key, 4)
+        for block_key in draw.split(key, BLOCKS[self.layers][stage]):
+            shortcut_key, *keys = draw.split(block_key, 4)
             widths = self.widths(stage)
             shapes = zip(keys, self.kernels(), (d_in, *widths), widths, strict=False)
             convs = tuple(init_conv_norm(*shape) for shape in shapes)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.attention import Attention, attention
 from crisalad_jax.nn.backbones.base import (
     BACKBONES,
@@ -88,11 +89,11 @@ class TransVprNetConfig(BackboneWithStatistics):
 
     def init(self, key: PRNGKeyArray) -> TransVprNet:
         """Draw parameters: convolutions as He et al., linears normal of deviation 0.02."""
-        conv_key, token_key, block_key = jax.random.split(key, 3)
+        conv_key, token_key, block_key = draw.split(key, 3)
         maps = range(len(WIDTHS))
-        pairs = zip(jax.random.split(conv_key, len(WIDTHS)), (3, *WIDTHS), WIDTHS, strict=False)
+        pairs = zip(draw.split(conv_key, len(WIDTHS)), (3, *WIDTHS), WIDTHS, strict=False)
         part = self.dim // len(WIDTHS)
-        token_keys = jax.random.split(token_key, len(WIDTHS))
+        token_keys = draw.split(token_key, len(WIDTHS))
         return TransVprNet(
             convs=tuple(
                 ConvNorm(init_he_conv(each, 3, a, b, bias=True), init_batch_norm(b))
@@ -101,13 +102,13 @@ class TransVprNetConfig(BackboneWithStatistics):
             tokenizers=tuple(
                 init_he_conv(token_keys[i], _side(i), WIDTHS[i], part, bias=True) for i in maps
             ),
-            cls_token=jnp.zeros(self.dim),
-            blocks=jax.vmap(self._init_block)(jax.random.split(block_key, self.depth)),
+            cls_token=draw.zeros(self.dim),
+            blocks=draw.stacked(self._init_block, draw.split(block_key, self.depth)),
             norm=init_layer_norm(self.dim),
         )
 
     def _init_block(self, key: PRNGKeyArray) -> TransVprBlock:
-        qkv, proj, first, second = jax.random.split(key, 4)
+        qkv, proj, first, second = draw.split(key, 4)
         dim, hidden = self.dim, self.hidden
         return TransVprBlock(
             pre_norm=init_layer_norm(dim),

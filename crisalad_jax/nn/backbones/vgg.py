@@ -7,6 +7,7 @@ from typing import ClassVar
 import jax
 from jaxtyping import PRNGKeyArray
 
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.backbones.base import BACKBONES
 from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages, Valid
 from crisalad_jax.nn.convolutions import init_he_conv, max_pool
@@ -42,7 +43,7 @@ class VggConfig(StagedBackbone):
     def init(self, key: PRNGKeyArray) -> Stages:
         """Draw parameters as torchvision does before training."""
         widths = list(itertools.chain.from_iterable(WIDTHS))
-        pairs = zip(jax.random.split(key, len(widths)), (3, *widths), widths, strict=False)
+        pairs = zip(draw.split(key, len(widths)), (3, *widths), widths, strict=False)
         layers = iter([init_he_conv(each, 3, a, b, bias=True) for each, a, b in pairs])
         return Stages(None, tuple(Stage(tuple(itertools.islice(layers, len(w)))) for w in WIDTHS))
 

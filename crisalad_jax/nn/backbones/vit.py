@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import choose, require, require_positive
 from crisalad_jax.config.fields import free_field
+from crisalad_jax.nn import draw
 from crisalad_jax.nn.adapter import (
     Adapter,
     AdapterConfig,
@@ -262,10 +263,10 @@ class ViTConfig(VisionTransformer):
         """Draw the patches' positions, or make sine-cosine codes; the class token's are 0."""
         side = self.position_grid
         if self.position_init == "sincos":
-            positions = jnp.asarray(_sincos_positions(side, self.dim), jnp.float32)
+            positions = jax.device_put(_sincos_positions(side, self.dim).astype(np.float32))
         else:
-            positions = 0.02 * jax.random.normal(key, (side, side, self.dim))
-        return jnp.zeros(self.dim), positions
+            positions = draw.normal(key, (side, side, self.dim), scale=0.02)
+        return draw.zeros(self.dim), positions
 
     def add_positions(
         self, params: ViT, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
@@ -285,24 +286,24 @@ def _one_stack(params: ViT) -> Block:
 
 def init_vit(key: PRNGKeyArray, config: VisionTransformer) -> ViT:
     """Draw parameters as published before training: linears normal of deviation 0.02, biases 0."""
-    patch_key, class_key, register_key, position_key, block_key = jax.random.split(key, 5)
+    patch_key, class_key, register_key, position_key, block_key = draw.split(key, 5)
     dim, deviation = config.dim, config.token_deviation
     pos_embed_cls, pos_embed = config.init_positions(position_key)
     return ViT(
         patch_embed=init_small_linear(patch_key, 3 * config.patch_size**2, dim),
-        cls_token=deviation * jax.random.normal(class_key, (dim,)),
-        register_tokens=deviation * jax.random.normal(register_key, (config.registers, dim)),
+        cls_token=draw.normal(class_key, (dim,), scale=deviation),
+        register_tokens=draw.normal(register_key, (config.registers, dim), scale=deviation),
         pos_embed_cls=pos_embed_cls,
         pos_embed=pos_embed,
-        blocks=jax.vmap(functools.partial(_init_block, config=config))(
-            jax.random.split(block_key, config.depth)
+        blocks=draw.stacked(
+            functools.partial(_init_block, config=config), draw.split(block_key, config.depth)
         ),
         norm=init_layer_norm(dim),
     )
 
 
 def _init_block(key: PRNGKeyArray, config: VisionTransformer) -> Block:
-    qkv, proj, first, second, adapter_key = jax.random.split(key, 5)
+    qkv, proj, first, second, adapter_key = draw.split(key, 5)
     dim, hidden = config.dim, config.hidden
     if config.ffn == "swiglu":
         mlp = SwiGlu(
@@ -313,10 +314,10 @@ def _init_block(key: PRNGKeyArray, config: VisionTransformer) -> Block:
     return Block(
         norm1=init_layer_norm(dim),
         attn=Attention(init_small_linear(qkv, dim, 3 * dim), init_small_linear(proj, dim, dim)),
-        ls1=jnp.full(dim, config.layer_scale_init, jnp.float32),
+        ls1=draw.full((dim,), config.layer_scale_init),
         norm2=init_layer_norm(dim),
         mlp=mlp,
-        ls2=jnp.full(dim, config.layer_scale_init, jnp.float32),
+        ls2=draw.full((dim,), config.layer_scale_init),
         adapter=init_adapter(adapter_key, dim, config.adapter),
     )
 
