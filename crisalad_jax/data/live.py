@@ -168,8 +168,7 @@ class Camera:
         >>> import cv2, numpy as np
         >>> video = str(folder / "walk.avi")
         >>> writer = cv2.VideoWriter(video, cv2.VideoWriter.fourcc(*"MJPG"), 20, (80, 60))
-        >>> for _ in range(4):
-        ...     writer.write(np.zeros((60, 80, 3), np.uint8))
+        >>> _ = [writer.write(np.zeros((60, 80, 3), np.uint8)) for _ in range(4)]
         >>> writer.release()
         >>> with Camera(video) as camera:
         ...     frames = list(camera.frames())
