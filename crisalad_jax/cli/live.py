@@ -1,9 +1,8 @@
 """`crisalad query --watch` and `--camera`: answers as images come."""
 
 import contextlib
-import pathlib
 import sys
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from crisalad_jax.cli.common import STDOUT, find_given
 from crisalad_jax.data.live import Camera, FolderWatch
@@ -13,26 +12,11 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import printable
 from crisalad_jax.utils.signals import defer_signals
 
-
-class LiveFlags(Protocol):
-    """The flags of `crisalad query` that matter here."""
-
-    images: tuple[pathlib.Path, ...]
-    map: pathlib.Path
-    weights: pathlib.Path | None
-    k: int
-    json: pathlib.Path | None
-    gallery: pathlib.Path | None
-    map_images: pathlib.Path | None
-    watch: pathlib.Path | None
-    camera: str | None
-    fps: float | None
-    window: int
-    verify: bool
-    quiet: bool
+if TYPE_CHECKING:
+    from crisalad_jax.cli.query import Query
 
 
-def run(arguments: LiveFlags) -> None:
+def run(arguments: "Query") -> None:
     """Print an answer for each image that comes, until a signal or the end of a video."""
     name = "--camera" if arguments.watch is None else "--watch"
     others = {
