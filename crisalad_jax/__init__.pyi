@@ -15,6 +15,8 @@ from crisalad_jax.data.augmentations import register_augmentation as register_au
 from crisalad_jax.data.benchmarks import Benchmark as Benchmark
 from crisalad_jax.data.benchmarks import open_benchmark as open_benchmark
 from crisalad_jax.data.images import read_image as read_image
+from crisalad_jax.data.live import Camera as Camera
+from crisalad_jax.data.live import FolderWatch as FolderWatch
 from crisalad_jax.data.loader import image_batches as image_batches
 from crisalad_jax.data.loader import training_batches as training_batches
 from crisalad_jax.data.places import read_places as read_places
@@ -59,6 +61,7 @@ from crisalad_jax.retrieval.alone import describe_files as describe_files
 from crisalad_jax.retrieval.alone import describe_images as describe_images
 from crisalad_jax.retrieval.extract import extract as extract
 from crisalad_jax.retrieval.maps.build import index as index
+from crisalad_jax.retrieval.maps.live import query_live as query_live
 from crisalad_jax.retrieval.maps.map import Map as Map
 from crisalad_jax.retrieval.maps.query import query as query
 from crisalad_jax.retrieval.pca import fit_pca as fit_pca

@@ -77,6 +77,23 @@ def write_picture(path: pathlib.Path, seed: int, noise: float = 0.0) -> None:
     assert cv2.imwrite(str(path), np.clip(picture, 0, 255).astype(np.uint8))
 
 
+def write_video(
+    path: pathlib.Path,
+    frames: int,
+    *,
+    step: int = 10,
+    first: int = 0,
+    colour: tuple[int, int, int] = (1, 1, 1),
+) -> pathlib.Path:
+    """A video of 10 flat frames a second; frame i has the level `step` * (first + i)."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    assert writer.isOpened()
+    for number in range(first, first + frames):
+        writer.write(np.full((48, 64, 3), np.multiply(colour, step * number), np.uint8))
+    writer.release()
+    return path
+
+
 def write_city(root: pathlib.Path) -> pathlib.Path:
     """A training set in the layout of GSV-Cities."""
     for city_number, city in enumerate(CITIES):

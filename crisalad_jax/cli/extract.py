@@ -37,9 +37,12 @@ class Extract:
     weights: pathlib.Path
     """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
     images: pathlib.Path
-    """Folder, searched with its subfolders."""
+    """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
+    (docs/how-to/image-sources.md)."""
     out: pathlib.Path
     """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
+    fps: float = 1.0
+    """Frames a second taken of a video."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
@@ -105,6 +108,7 @@ def run(arguments: Extract) -> None:
         config,
         arguments.images,
         arguments.out,
+        fps=arguments.fps,
         weights=weights,
         grouping=arguments.grouping,
         batch_size=arguments.batch_size,

@@ -20,12 +20,15 @@ class Index:
     """A .safetensors file of this package, or a published model's name (`crisalad models`); of a
     map that is there, the same model's."""
     images: pathlib.Path
-    """Folder, searched with its subfolders; the map names images by their paths in it."""
+    """Folder, searched with its subfolders; the map names images by their paths in it. Or a file, a
+    pattern, a list, a table or a video (docs/how-to/image-sources.md)."""
     out: pathlib.Path
     """The map's folder. After a kill the same command goes on."""
+    fps: float = 1.0
+    """Frames a second taken of a video."""
     positions: pathlib.Path | None = None
-    """CSV of name,east,north (metres) or name,lat,lon, for images that are new; by default what
-    @UTM names say."""
+    """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for images that are new; by
+    default what a table as --images says, or @UTM names, or EXIF data."""
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
     map's, and of a new map files."""
@@ -64,6 +67,7 @@ def run(arguments: Index) -> None:
         arguments.images,
         arguments.out,
         weights=weights,
+        fps=arguments.fps,
         image_size=arguments.image_size,
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from crisalad_jax.cli import live
 from crisalad_jax.cli.common import STDOUT, console, find_given, say, talk_beside
 from crisalad_jax.cli.tables import answers_table
 from crisalad_jax.retrieval.maps.map import Map
@@ -23,6 +24,10 @@ _COLUMNS = 8
 COMMON = (
     "images",
     "map",
+    "watch",
+    "camera",
+    "fps",
+    "window",
     "weights",
     "k",
     "json",
@@ -42,9 +47,18 @@ class Query:
     images: Annotated[
         tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")
     ]
-    """Images, or folders of them."""
+    """Images, or folders of them, patterns, lists, tables or videos (docs/how-to/image-sources.md).
+    None with --watch and --camera."""
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""
+    watch: pathlib.Path | None = None
+    """Folder: answer the images that appear in it as they appear, a line of JSON each."""
+    camera: str | None = None
+    """Number from 0, URL or video file: answer its newest frame, time and again."""
+    fps: float | None = None
+    """Frames a second taken of a video, by default 1; of --camera at most so many."""
+    window: int = 1
+    """Frames described together, each with those just before it: a moving camera's."""
     weights: pathlib.Path | None = None
     """The model that made the map, as a file or a published name; by default where it was then."""
     k: int = 5
@@ -72,6 +86,9 @@ class Query:
 
 def run(arguments: Query) -> None:
     """Query the map, and print or write its answers."""
+    if arguments.watch is not None or arguments.camera is not None:
+        live.run(arguments)
+        return
     file = None if arguments.json == STDOUT else arguments.json
     talk_beside(arguments.json)
     _check_files(file, arguments)
@@ -81,6 +98,8 @@ def run(arguments: Query) -> None:
             places.load_params(find_given(arguments.weights, quiet=arguments.quiet)),
             arguments.images,
             k=arguments.k,
+            fps=1.0 if arguments.fps is None else arguments.fps,
+            window=arguments.window,
             batch_size=arguments.batch_size,
             on_bad_image=arguments.on_bad_image,
             quiet=arguments.quiet,

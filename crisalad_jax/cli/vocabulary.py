@@ -7,7 +7,7 @@ from typing import Literal
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import find_given, give_json, prepare_json, say
-from crisalad_jax.data.images import list_images
+from crisalad_jax.data.sources import open_source
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.vocabulary import (
@@ -48,9 +48,12 @@ class Vocabulary:
     """Build AnyLoc's vocabulary from a folder of images: a whole model; or NetVLAD's, to train."""
 
     images: pathlib.Path
-    """Folder, searched with its subfolders; not of images that are evaluated on."""
+    """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
+    (docs/how-to/image-sources.md). Not of images that are evaluated on."""
     out: pathlib.Path
     """A .safetensors file."""
+    fps: float = 1.0
+    """Frames a second taken of a video."""
     weights: pathlib.Path | None = None
     """A model of AnyLoc, NetVLAD or a part of yours with a vocabulary, for another one; a file, or
     a published model's name."""
@@ -98,13 +101,14 @@ def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    list_images(arguments.images)  # first: drawing parameters takes seconds
+    open_source(arguments.images, fps=arguments.fps)  # first: drawing parameters takes seconds
     params, config = _model(arguments)
     built = build_vocabulary(
         params,
         config,
         arguments.images,
         arguments.out,
+        fps=arguments.fps,
         max_images=arguments.max_images,
         seed=arguments.seed,
         batch_size=arguments.batch_size,

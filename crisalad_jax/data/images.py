@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 
 from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.data.video import frame_time, read_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.notes import tell
@@ -69,7 +70,7 @@ def read_image(
     - The first page or frame of several is taken.
 
     Args:
-        path: the image file.
+        path: the image file, or a frame of a video, as in `walk.mp4#t=12.500` (seconds).
         size: height and width in pixels to resize to, by the default of `resize_image`; None keeps
             the file's. Where a model has another way, `prepare_image` follows it.
         enough: height and width in pixels that the image will be resized to; None for full size.
@@ -88,7 +89,10 @@ def read_image(
         >>> read_image(pictures / "0.png", (224, 224)).shape
         (224, 224, 3)
     """
-    image = decode_image(read_bytes(path, "an image file"), path, enough=enough)
+    if frame_time(path) is None:
+        image = decode_image(read_bytes(path, "an image file"), path, enough=enough)
+    else:
+        image = read_frame(path)
     return image if size is None else resize_image(image, size)
 
 

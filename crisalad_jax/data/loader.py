@@ -21,6 +21,7 @@ from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.read_ahead import read_ahead
 from crisalad_jax.data.resize import Pixels
+from crisalad_jax.data.video import frame_time
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 
@@ -353,6 +354,8 @@ def image_batches(
     """
     if batch_size < 1:
         raise InputError(f"batch_size: found {batch_size}, expected at least 1")
+    if any(frame_time(path) is not None for path in paths):
+        threads = min(threads, 1)  # more would read a video each, from its beginning
     read = _read if cache is None else cache.read
     how = Preparation(image_size, preprocessing, side_multiple)
     indices = np.arange(len(paths))

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.images import check_lines, list_images, names_in
+from crisalad_jax.data.images import check_lines
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.video import frame_time
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
@@ -50,6 +52,7 @@ def extract(
     images: StrPath | Sequence[StrPath],
     out: StrPath | None = None,
     *,
+    fps: float = 1.0,
     weights: StrPath | None = None,
     grouping: str = "single",
     batch_size: int = 16,
@@ -70,15 +73,17 @@ def extract(
     Args:
         params: the model's parameters.
         config: the model; images are resized as it says.
-        images: a folder, searched with its subfolders in sorted order, or a list of files.
+        images: a folder, searched with its subfolders in sorted order, another source of images
+            (docs/how-to/image-sources.md), or a list of files.
         out: a file .npy, with the names beside it, or .h5, as hloc reads it. How it was made is
             written beside it too, as JSON. None writes nothing.
+        fps: frames a second taken of a video.
         weights: the file that the parameters are from, for that JSON and for messages.
         grouping: one of `GROUPINGS`: which images look at each other.
         batch_size: number of images described together.
         seed: draws the order of the grouping "shuffled".
-        root: folder that names are relative to. By default it is the folder `images`; files of a
-            list keep their names.
+        root: folder that names are relative to. By default it is the folder `images`, or that of
+            another source; files of a list keep their names.
         pairs: a file for hloc's pairs: each image with those most similar to it, never itself.
         database: descriptors, .h5 or .npy, of the images to pair these with; None is these.
         k: number of pairs of each image.
@@ -115,7 +120,7 @@ def extract(
         k=k,
     )
     components = _components(pca, config, weights, unit=pairs is not None, verify=verify)
-    paths, names = _listed(images, root)
+    paths, names = _listed(images, root, fps)
     length = config.descriptor_dim if components is None else len(components.components)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -155,6 +160,8 @@ def extract(
             "skipped": skipped,
             "model": to_plain(config),
         }
+        if any(frame_time(path) is not None for path in paths):
+            record["fps"] = fps
         nearest = None
         with contextlib.ExitStack() as staged:  # so that pairs and descriptors appear, or none
             if pairs is not None:
@@ -243,14 +250,13 @@ def _source(images: StrPath | Sequence[StrPath]) -> str:
 
 
 def _listed(
-    images: StrPath | Sequence[StrPath], root: StrPath | None
+    images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
     if isinstance(images, str | os.PathLike):
-        folder = pathlib.Path(images)
-        paths = list_images(folder)
-        inside = _inside(folder, root) if root is not None else pathlib.PurePath()
-        return paths, [(inside / name).as_posix() for name in names_in(folder, paths)]
+        source = open_source(images, fps=fps)
+        inside = _inside(source.root, root) if root is not None else pathlib.PurePath()
+        return source.paths, [(inside / name).as_posix() for name in source.names]
     paths = [pathlib.Path(path) for path in images]
     if not paths:
         raise InputError("images: found none, expected at least one")

@@ -14,6 +14,7 @@ from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.video import file_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.describe import FolderTokens, tokens_in_batches
@@ -131,7 +132,7 @@ def _digest(paths: Sequence[pathlib.Path]) -> str:
     files = hashlib.sha256()
     for path in paths:
         with contextlib.suppress(OSError):  # told when it is read
-            there = path.stat()
+            there = file_of(path).stat()
             line = f"{os.fspath(path)} {there.st_size} {there.st_mtime_ns}\n"
             files.update(line.encode(errors="surrogateescape"))
     return files.hexdigest()

@@ -19,8 +19,8 @@ from jaxtyping import Float, Float32
 from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_seed
-from crisalad_jax.data.images import list_images
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.sources import open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
@@ -178,6 +178,7 @@ def build_vocabulary(
     images: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
+    fps: float = 1.0,
     max_images: int = IMAGES,
     seed: int = 0,
     batch_size: int = 16,
@@ -189,8 +190,10 @@ def build_vocabulary(
     Args:
         params: a model's parameters; its backbone is as it will be used.
         config: the model, whose aggregator starts from centroids.
-        images: the folder, searched with its subfolders; not of images that are evaluated on.
+        images: the folder, searched with its subfolders, or another source of images
+            (docs/how-to/image-sources.md); not of images that are evaluated on.
         out: the .safetensors file to write.
+        fps: frames a second taken of a video.
         max_images: number of images that are read at most, drawn at random.
         seed: as `with_vocabulary` takes it, and so are the others.
         batch_size: number of images described at a time.
@@ -215,7 +218,7 @@ def build_vocabulary(
         True
     """
     check_target(out, ".safetensors")
-    paths = list_images(images)
+    paths = open_source(images, fps=fps).paths
     params = with_vocabulary(
         params,
         config,

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 _CLI = ("tyro", "rich", "shtab")
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
-    "maps": ("faiss", "h5py", *_CLI),
+    "maps": ("faiss", "h5py", "PIL", *_CLI),
     "report": ("jinja2", "matplotlib", *_CLI),
     "export": ("flatbuffers", *_CLI),
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),

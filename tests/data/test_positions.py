@@ -39,8 +39,8 @@ def test_a_table_in_any_order_with_more_columns(tmp_path, axes):
         ("name,east,north\na,1,1e300\n", r"line 2: .*expected metres .*, at most 1e\+08"),
         (
             "name,east,north,lat,lon\na,1,2,3,4\n",
-            "found columns name, east, north, lat, lon, expected name,east,north or name,lat,lon, "
-            "not both",
+            "found columns name, east, north, lat, lon, expected name,east,north or name,lat,lon "
+            "or name,x,y, only one of these",
         ),
         (  # decimal commas
             "name,east,north\na.jpg,500123,4,4500000,7\n",

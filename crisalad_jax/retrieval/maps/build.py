@@ -10,9 +10,11 @@ import numpy as np
 
 from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.data.images import list_images, names_in
+from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions, read_positions, utm_positions
+from crisalad_jax.data.sources import ImageSource, open_source
+from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.alone import Described, describe_alone
@@ -29,6 +31,7 @@ from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.progress import progress_bar
 
 SEGMENT = 256
@@ -87,7 +90,7 @@ def index_images(
     config = target.description.config
     names, sizes, new, listed = [], [], [], set[str]()
     for path in paths:
-        name, size = path.relative_to(root).as_posix(), path.stat().st_size
+        name, size = path.relative_to(root).as_posix(), file_of(path).stat().st_size
         listed.add(name)
         if (known := target.image(name)) is None:
             names.append(name)
@@ -148,6 +151,7 @@ def index(
     out: str | os.PathLike[str],
     *,
     weights: str | os.PathLike[str],
+    fps: float = 1.0,
     image_size: tuple[int, int] | None = None,
     resize: Sequence[str] = (),
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
@@ -166,13 +170,16 @@ def index(
         params: the model's parameters.
         config: the model.
         images: the folder, searched with its subfolders; the map names images by their paths in it.
+            Or another source of images (docs/how-to/image-sources.md).
         out: the map's folder.
         weights: the file that the parameters are from, which queries load by default.
+        fps: frames a second taken of a video.
         image_size: height and width in pixels. None is the map's, and of a new map the model's.
         resize: words that change how images are resized; see `ModelConfig.resized`. None are the
             map's way, and of a new map the model's.
         compute_dtype: type of the matrix products. None is the map's, and of a new map the model's.
-        positions: where images were taken, or a table of it; None is what @UTM names say.
+        positions: where images were taken, or a table of it. None is what `images` says, if that
+            is a table; else what @UTM names say; else what the EXIF data of JPEGs says.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
         dtype: what files keep descriptors as. None is the map's, and of a new map "float32".
         batch_size: number of images described at once, each as if it were alone.
@@ -199,12 +206,13 @@ def index(
     """
     check_params(params, config)
     check_grouping((), batch_size, seed=0)
-    images, out = pathlib.Path(images), pathlib.Path(out)
+    out = pathlib.Path(out)
     description = read_description(out)
     if not has_images(out):
         description = None  # a map that a kill left without images binds nobody
-    paths = list_images(images)
-    known = _positions(positions, images, names_in(images, paths))
+    source = open_source(images, fps=fps)
+    table = source.positions if positions is None else positions
+    known = _positions(table, images, source.names)
     if description is None:
         config = config.resized(image_size, resize)
         if compute_dtype is not None:
@@ -222,23 +230,27 @@ def index(
         way = config.preprocessing.changed_by(resize) if resize else None
         _check_settings(description, out, image_size, way, compute_dtype, dtype, store)
     with open_for_appending(out, description) as target:
+        if table is None and not known.of:
+            known = _by_exif(target, source)
         result = index_images(
             target,
             params,
-            images,
-            paths,
+            source.root,
+            source.paths,
             positions=known,
             batch_size=batch_size,
             on_bad_image=on_bad_image,
             quiet=quiet,
         )
         if not result.images:
-            raise InputError(f"{images}: found {len(paths)} images, none of them readable")
-    return result if positions is not None else result._replace(stay=0)
+            raise InputError(f"{images}: found {len(source.paths)} images, none of them readable")
+    return result if table is not None else result._replace(stay=0)
 
 
 def _positions(
-    given: Positions | str | os.PathLike[str] | None, images: pathlib.Path, names: Sequence[str]
+    given: Positions | str | os.PathLike[str] | None,
+    images: str | os.PathLike[str],
+    names: Sequence[str],
 ) -> Positions:
     """Read the positions of the images; a table has to name at least one of them."""
     if given is None:
@@ -251,6 +263,23 @@ def _positions(
             f"{names[0]!r}"
         )
     return positions
+
+
+def _by_exif(target: Map, source: ImageSource) -> Positions:
+    """Read where JPEGs that the map lacks were taken, if its own positions are in degrees too."""
+    new = (
+        (name, path)
+        for name, path in zip(source.names, source.paths, strict=True)
+        if target.image(name) is None and frame_time(path) is None
+    )
+    found = exif_positions(new)
+    if found.of and target.axes not in (None, found.axes):
+        tell(
+            f"{target.folder}: left out the EXIF positions of {len(found.of)} images, expected "
+            f"{', '.join(target.axes or ())} as in the map"
+        )
+        return utm_positions(())
+    return found
 
 
 def _check_settings(

@@ -8,15 +8,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.data.images import list_images
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.video import frame_time
+from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
-from crisalad_jax.retrieval.alone import describe_alone
+from crisalad_jax.retrieval.alone import Described, describe_alone
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.windows import check_window, describe_windows
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.progress import progress_bar
@@ -62,6 +65,8 @@ def query(
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     k: int = 5,
+    fps: float = 1.0,
+    window: int = 1,
     batch_size: int = 16,
     on_bad_image: OnBadImage = "stop",
     quiet: bool = False,
@@ -71,8 +76,12 @@ def query(
     Args:
         places: the map, open.
         params: parameters of the model that made the map (`Map.load_params`).
-        images: an image file, a folder, or a list of these.
+        images: an image file, a folder, another source of images
+            (docs/how-to/image-sources.md), or a list of these.
         k: number of answers to each query.
+        fps: frames a second taken of a video.
+        window: frames that are described together: each with those just before it in its source,
+            as a moving camera has them. 1 describes each alone, as a map's images are.
         batch_size: number of queries described at once, each as if it were alone.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         quiet: whether to show no progress bar.
@@ -100,10 +109,12 @@ def query(
     check_grouping((), batch_size, seed=0)
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
-    paths = _listed(images)
+    sources = _listed(images, fps)
+    paths = [path for source in sources for path in source]
     batch_size = useful_batch_size(batch_size, len(paths))
     places.check_params(params)
     config = places.description.config
+    check_window(config, window)
     try:
         check_params(params, config)
     except InputError as error:
@@ -113,8 +124,8 @@ def query(
     unreadable: list[pathlib.Path] = []
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
-        for part in describe_alone(
-            params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image
+        for part in _described(
+            params, config, sources, window=window, batch_size=batch_size, on_bad_image=on_bad_image
         ):
             waiting.append(part.descriptors)
             unreadable += (paths[index] for index in part.unreadable)
@@ -133,12 +144,43 @@ def query(
     return Answers(readable, neighbours, places.images, places.axes, unreadable)
 
 
-def _listed(images: Any) -> list[pathlib.Path]:
+def _described(
+    params: Crisalad,
+    config: ModelConfig,
+    sources: Sequence[list[pathlib.Path]],
+    *,
+    window: int,
+    batch_size: int,
+    on_bad_image: OnBadImage,
+) -> Iterator[Described]:
+    """Describe the images of all sources; a window holds images of one source alone."""
+    if window == 1:
+        sources = [[path for source in sources for path in source]]
+    first = 0
+    for source in sources:
+        if window == 1:
+            stream = describe_alone(
+                params, config, source, batch_size=batch_size, on_bad_image=on_bad_image
+            )
+        else:
+            stream = describe_windows(
+                params,
+                config,
+                source,
+                window=window,
+                batch_size=batch_size,
+                on_bad_image=on_bad_image,
+            )
+        for part in stream:
+            yield Described(part.indices + first, part.descriptors, part.unreadable + first)
+        first += len(source)
+
+
+def _listed(images: Any, fps: float) -> list[list[pathlib.Path]]:
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
-    paths = map(pathlib.Path, given)
-    return [image for path in paths for image in (list_images(path) if path.is_dir() else [path])]
+    return [open_source(each, fps=fps).paths for each in given]
 
 
 def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, float] | None:
@@ -161,13 +203,30 @@ def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
-    Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
+    Frames of videos have a `time` in seconds, too. Where a name has letters that no text shows, or
+    bytes that are no UTF-8, they are escaped.
     """
+    return map(json_text, json_rows(answers))
+
+
+def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
+    """Yield what `json_lines` writes of each query."""
     for path, ranked in answers.rows():
-        neighbours = [answer_fields(answer, answers.axes) for answer in ranked]
-        line = {"query": path.as_posix(), "neighbours": neighbours}
-        text = json.dumps(line, ensure_ascii=False)
-        yield text if text.isprintable() else json.dumps(line)
+        neighbours = [
+            answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in ranked
+        ]
+        yield {"query": path.as_posix(), **_time(path), "neighbours": neighbours}
+
+
+def _time(name: str | os.PathLike[str]) -> dict[str, float]:
+    seconds = frame_time(name)
+    return {} if seconds is None else {"time": seconds}
+
+
+def json_text(row: dict[str, Any]) -> str:
+    """Return a row as one line of JSON."""
+    text = json.dumps(row, ensure_ascii=False)
+    return text if text.isprintable() else json.dumps(row)
 
 
 def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:

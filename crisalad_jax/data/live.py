@@ -1,0 +1,303 @@
+"""Images as they come: files that appear in a folder, and the newest frame of a camera."""
+
+import contextlib
+import os
+import pathlib
+import threading
+import time
+import urllib.parse
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Self
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from crisalad_jax.config.preprocessing import Size
+from crisalad_jax.data.images import IMAGE_SUFFIXES, read_image
+from crisalad_jax.data.opencv import QUIET
+from crisalad_jax.data.video import check_rate, frame_name
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
+
+_POLL = 0.05
+"""Seconds between two looks into a folder, and four times what a look takes if that is longer."""
+_SELF_TOLD = (".jpg", ".jpeg", ".png")
+"""Suffixes of formats that tell by themselves whether a file is whole."""
+_SETTLED = 1.0
+"""Seconds for which a file of another format stays as it is before it counts as whole."""
+_PATIENCE = 5.0
+"""Seconds for which an unreadable file stays as it is before it is given up."""
+_TURN = 0.1
+"""Longest seconds between two calls of `check`."""
+
+
+class Frame(NamedTuple):
+    """A picture with its moment."""
+
+    name: str
+    """The file's path, or the camera and the time."""
+    time: float
+    """Seconds: into a video; else since 1970, of the file's last change or the camera's frame."""
+    image: UInt8[np.ndarray, "h w 3"]
+    """8-bit RGB, upright."""
+    taken: float
+    """`time.perf_counter()` when it was in hand: a whole file, or a frame from the camera."""
+
+
+def _go_on() -> None:
+    """Check nothing."""
+
+
+class FolderWatch:
+    """The images that appear in a folder and its subfolders, each once, when it is whole.
+
+    Those that are there before are left out. The folder is looked at 20 times a second, which
+    works on any file system. A JPEG or PNG is whole when it decodes; files of other formats when
+    they have not changed for a second. A file that stays unreadable for five is left out, with a
+    note.
+
+    Example:
+        >>> import shutil
+        >>> from crisalad_jax import FolderWatch
+        >>> watch = FolderWatch(folder)
+        >>> _ = shutil.copy(pictures / "0.png", folder / "new.png")
+        >>> next(watch.frames()).image.shape
+        (60, 80, 3)
+    """
+
+    size: Size | None = None
+    """Height and width of all frames; None where that is unknown."""
+    dropped = 0
+    """Number of frames passed over for newer ones: none."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        """Note what is there.
+
+        Args:
+            folder: the folder.
+
+        Raises:
+            InputError: there is no such folder.
+        """
+        self._folder = pathlib.Path(folder)
+        if not self._folder.is_dir():
+            kind = "a file" if self._folder.exists() else "nothing"
+            raise InputError(f"{folder}: found {kind}, expected a folder to watch")
+        self._done = set(self._scan())
+        self.there = len(self._done)
+        """Number of images that were there before."""
+
+    def _scan(self) -> Iterator[pathlib.Path]:
+        for parent, folders, files in os.walk(self._folder):
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            for name in files:
+                if name.lower().endswith(IMAGE_SUFFIXES) and not name.startswith("."):
+                    yield pathlib.Path(parent, name)
+
+    def frames(self, check: Callable[[], None] = _go_on) -> Iterator[Frame]:
+        """Yield images as they appear, without end; the oldest first where there are several.
+
+        Args:
+            check: called several times a second; it may raise, to end this.
+        """
+        waiting: dict[pathlib.Path, _Arriving] = {}
+        while True:
+            check()
+            begun = time.monotonic()
+            found: list[tuple[float, pathlib.Path]] = []
+            for path in self._scan():
+                if path not in self._done:
+                    with contextlib.suppress(OSError):  # gone again
+                        there = path.stat()
+                        arriving = waiting.setdefault(path, _Arriving())
+                        if arriving.may_be_whole(path, (there.st_size, there.st_mtime_ns)):
+                            found.append((there.st_mtime, path))
+            for changed, path in sorted(found):
+                check()
+                taken = time.perf_counter()
+                try:
+                    image = read_image(path)
+                except InputError as error:
+                    if waiting[path].still_for() > _PATIENCE:
+                        self._done.add(path)
+                        del waiting[path]
+                        if path.exists():
+                            tell(f"{error}; it is left out")
+                    continue
+                self._done.add(path)
+                del waiting[path]
+                yield Frame(path.as_posix(), changed, image, taken)
+            time.sleep(max(_POLL, 4 * (time.monotonic() - begun)) if not found else 0)
+
+    def close(self) -> None:
+        """Do nothing: no file is open."""
+
+
+class _Arriving:
+    """What is known of a file that is perhaps not whole yet."""
+
+    def __init__(self) -> None:
+        self._state: tuple[int, int] | None = None
+        self._since = 0.0
+        self._tried = False
+
+    def may_be_whole(self, path: pathlib.Path, state: tuple[int, int]) -> bool:
+        """Return whether to read the file, which has this size and time of change now."""
+        if state != self._state:
+            self._state, self._since, self._tried = state, time.monotonic(), False
+        waits = 0.0 if path.suffix.lower() in _SELF_TOLD else _SETTLED
+        # What was unreadable is read again when it has changed, and for the last time at the end.
+        if (self._tried and self.still_for() <= _PATIENCE) or self.still_for() < waits:
+            return False
+        self._tried = True
+        return state[0] > 0 or self.still_for() > _PATIENCE
+
+    def still_for(self) -> float:
+        """Return the seconds since the file changed."""
+        return time.monotonic() - self._since
+
+
+class Camera:
+    """The newest frame of a camera, whenever one is asked for; older ones are passed over.
+
+    A thread takes all frames from the camera, so that none waits in the camera's own queue. A
+    video file plays at its own pace, as if it were a camera.
+
+    Example:
+        >>> import cv2, numpy as np
+        >>> video = str(folder / "walk.avi")
+        >>> writer = cv2.VideoWriter(video, cv2.VideoWriter.fourcc(*"MJPG"), 20, (80, 60))
+        >>> _ = [writer.write(np.zeros((60, 80, 3), np.uint8)) for _ in range(4)]
+        >>> writer.release()
+        >>> with Camera(video) as camera:
+        ...     frames = list(camera.frames())
+        >>> frames[-1].time, frames[-1].image.shape
+        (0.15, (60, 80, 3))
+    """
+
+    def __init__(self, camera: int | str | os.PathLike[str], *, fps: float | None = None) -> None:
+        """Open the camera.
+
+        Args:
+            camera: its number, from 0, or a URL, or a video file.
+            fps: most frames a second that `frames` yields; None is as many as are asked for.
+
+        Raises:
+            InputError: it cannot be opened, or gives no frame; or a rate out of range.
+        """
+        if fps is not None:
+            check_rate(fps)
+        self._fps = fps
+        given = os.fspath(camera) if isinstance(camera, os.PathLike) else str(camera)
+        self._is_file = pathlib.Path(given).is_file()
+        self.name = _name(given)
+        """What names of frames begin with: no user or password of a URL."""
+        is_number = given.isdecimal() and not self._is_file
+        if not (self._is_file or is_number or "://" in given):
+            raise InputError(
+                f"camera: found {given!r}, expected a number from 0, a URL or a video file"
+            )
+        with QUIET:
+            self._capture = cv2.VideoCapture(int(given) if is_number else given)
+            whole = self._capture.isOpened() and self._capture.grab()
+        if not whole:
+            self._capture.release()
+            raise InputError(
+                f"camera: found no frame from {self.name}, expected a number from 0, a URL or a "
+                "video file"
+            )
+        sides = (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH)
+        height, width = (int(self._capture.get(side)) for side in sides)
+        self.size: Size | None = (height, width) if height > 0 and width > 0 else None
+        """Height and width of the frames; None where the camera does not tell."""
+        self.dropped = 0
+        """Number of frames passed over for newer ones."""
+        self._lock = threading.Lock()
+        self._newest: Frame | None = None
+        self._came, self._closing = threading.Event(), threading.Event()
+        self._ended = False
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> Self:
+        """Return the camera itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the camera."""
+        self.close()
+
+    def frames(self, check: Callable[[], None] = _go_on) -> Iterator[Frame]:
+        """Yield the newest frame, time and again, until the camera or the video ends.
+
+        Args:
+            check: called several times a second; it may raise, to end this.
+
+        Raises:
+            InputError: a camera, which is no video file, gives no more frames.
+        """
+        self._thread = threading.Thread(target=self._take, daemon=True)
+        self._thread.start()
+        due = 0.0
+        while True:
+            check()
+            now = time.monotonic()
+            if now < due:
+                time.sleep(min(_TURN, due - now))
+                continue
+            if not self._came.wait(_TURN):
+                continue
+            with self._lock:
+                frame, self._newest = self._newest, None
+                if frame is None and self._ended:
+                    break
+                if not self._ended:
+                    self._came.clear()
+            if frame is not None:
+                due = now + (0 if self._fps is None else 1 / self._fps)
+                yield frame
+        if not self._is_file and not self._closing.is_set():
+            raise InputError(f"camera: found no more frames from {self.name}, expected it to go on")
+
+    def _take(self) -> None:
+        """Take frames until there are no more; a video's at their times."""
+        begun, grabbed = time.monotonic(), True  # the first frame was grabbed to try the camera
+        while grabbed and not self._closing.is_set():
+            with QUIET:
+                at = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                found, image = self._capture.retrieve()
+            if self._is_file:
+                self._closing.wait(max(0.0, begun + at - time.monotonic()))
+            taken, seconds = time.perf_counter(), at if self._is_file else time.time()
+            if found:
+                image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+                frame = Frame(frame_name(self.name, seconds), round(seconds, 3), image, taken)
+                with self._lock:
+                    self.dropped += self._newest is not None
+                    self._newest = frame
+                    self._came.set()
+            with QUIET:
+                grabbed = self._capture.grab()
+        self._capture.release()
+        with self._lock:
+            self._ended = True
+            self._came.set()
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._closing.set()
+        if self._thread is None:
+            self._capture.release()
+        else:
+            self._thread.join(timeout=1)  # a camera that hangs is left to the end of the process
+
+
+def _name(camera: str) -> str:
+    """Return a camera's name without what may be a secret in a URL."""
+    if camera.isdecimal():
+        return f"camera-{camera}"
+    if "://" not in camera:
+        return camera
+    parts = urllib.parse.urlsplit(camera)
+    host = parts.netloc.rpartition("@")[2]
+    return urllib.parse.urlunsplit((parts.scheme, host, parts.path, "", ""))

@@ -1,0 +1,163 @@
+"""Sources of images: a folder, a file, a pattern, a list, a table or a video."""
+
+import glob
+import os
+import pathlib
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, names_in
+from crisalad_jax.data.positions import Positions, read_image_table
+from crisalad_jax.data.video import check_rate, file_of, frame_time, is_video, list_frames
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source, read_text
+
+_FORMS = (
+    "a folder of images, an image, a video, a pattern such as 'frames/*.jpg', a list (.txt) or a "
+    "table (.csv)"
+)
+_PATTERN = re.compile(r"[*?\[]")
+_AN_IMAGE = "an image file"
+
+
+class ImageSource(NamedTuple):
+    """Images in order, and the names that descriptors and maps know them by."""
+
+    root: pathlib.Path
+    """Folder that names are relative to."""
+    paths: list[pathlib.Path]
+    """Below the root; frames of videos under the names of `data.video`."""
+    names: list[str]
+    """Posix paths relative to the root, each once."""
+    positions: Positions | None = None
+    """What the columns of a table say; None without such columns."""
+
+
+def open_source(images: str | os.PathLike[str], *, fps: float = 1.0) -> ImageSource:
+    """List the images of a source.
+
+    Args:
+        images: a folder, searched with its subfolders; an image; a video; a pattern, where ** is
+            any folders; a list, .txt, of a path a line; or a table, .csv, with a column `name`
+            (see `read_image_table`). Paths in lists and tables are relative to their folder.
+        fps: frames a second taken of videos.
+
+    Returns:
+        The images. Names are relative to the folder; to that of the file; to the part of a pattern
+        before its first wildcard; to the folder of a list or table or, where a path leads out of
+        it, to the root of the file system.
+
+    Raises:
+        InputError: no such source, no image in it, a path twice, or a file that is missing or that
+            no line of text can name.
+    """
+    check_rate(fps)
+    if not os.fspath(images):
+        raise InputError(f"images: found an empty name, expected {_FORMS}")
+    path = pathlib.Path(images)
+    if path.is_dir():
+        return _source(path, list_images(path), path)
+    if not path.exists() and frame_time(path) is None:
+        if _PATTERN.search(str(path)):
+            root, found = _matching(path)
+            return _source(root, _with_frames(found, fps), path)
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
+            raise InputError(f"{path}: found nothing, expected {_FORMS}")
+    suffix = path.suffix.lower()
+    if suffix == ".txt":
+        lines = enumerate(read_text(path, "a list of images, a path a line").splitlines(), 1)
+        return _listed(path, [(number, line.strip()) for number, line in lines], None, fps)
+    if suffix == ".csv":
+        table = read_image_table(path)
+        return _listed(path, table.rows, table.positions, fps)
+    check_source(file_of(path), _AN_IMAGE)
+    return _source(path.parent, _with_frames([path], fps), path)
+
+
+def _is_below(root: pathlib.Path, path: pathlib.Path) -> bool:
+    return path.is_relative_to(root) and ".." not in path.relative_to(root).parts
+
+
+def _source(
+    root: pathlib.Path,
+    paths: list[pathlib.Path],
+    given: pathlib.Path,
+    positions: Positions | None = None,
+) -> ImageSource:
+    names = names_in(root, paths)
+    if len(set(names)) < len(names):
+        twice = next(name for number, name in enumerate(names) if name in names[:number])
+        raise InputError(f"{given}: found {twice!r} twice, expected it once")
+    return ImageSource(root, paths, names, positions)
+
+
+def _with_frames(paths: Sequence[pathlib.Path], fps: float) -> list[pathlib.Path]:
+    """Put a video's frames in its place."""
+    return [
+        each for path in paths for each in (list_frames(path, fps) if is_video(path) else [path])
+    ]
+
+
+def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:
+    """Find the images and videos of a pattern, and the folder before its first wildcard."""
+    parts = pattern.parts
+    first = next(number for number, part in enumerate(parts) if _PATTERN.search(part))
+    root = pathlib.Path(*parts[:first])
+    matches = [pathlib.Path(match) for match in glob.glob(str(pattern), recursive=True)]
+    found = [
+        match
+        for match in matches
+        if (match.name.lower().endswith(IMAGE_SUFFIXES) or is_video(match)) and match.is_file()
+    ]
+    if not found:
+        among = f"none of {len(matches)} files" if matches else "no file"
+        raise InputError(
+            f"{pattern}: found {among} that is an image, expected some that end in "
+            f"{' '.join(IMAGE_SUFFIXES)}"
+        )
+    return root, sorted(found, key=lambda match: match.relative_to(root).as_posix())
+
+
+def _listed(
+    source: pathlib.Path,
+    rows: Sequence[tuple[int, str]],
+    positions: Positions | None,
+    fps: float,
+) -> ImageSource:
+    """List the images that a text or table names, with the positions by the source's own names."""
+    folder = source.parent
+    paths: list[pathlib.Path] = []
+    lines: dict[pathlib.Path, int] = {}
+    for number, line in rows:
+        if not line:
+            continue
+        # Written out, so that a name has no .. in it, and a path that is there twice is found.
+        path = pathlib.Path(os.path.normpath(folder / line))
+        where = f"{source}: line {number}"
+        if path in lines:
+            raise InputError(
+                f"{where}: found {line!r}, which is on line {lines[path]} too, expected it once"
+            )
+        lines[path] = number
+        try:
+            check_source(file_of(path), _AN_IMAGE)
+            if positions is not None and is_video(path):
+                raise InputError(
+                    f"{path}: found a video, expected {_AN_IMAGE}, or a frame such as "
+                    f"{path.name}#t=12.500"
+                )
+            paths += _with_frames([path], fps)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
+    if not paths:
+        raise InputError(f"{source}: found no image, expected a path a line")
+    root = pathlib.Path(os.path.normpath(folder))
+    if not all(_is_below(root, path) for path in paths):
+        paths = [pathlib.Path(os.path.abspath(path)) for path in paths]
+        root = pathlib.Path(paths[0].anchor)
+    if positions is not None:
+        names = dict(zip((line for _, line in rows), names_in(root, paths), strict=True))
+        of = {names[name]: position for name, position in positions.of.items()}
+        positions = positions._replace(of=of) if of else None
+    return _source(root, paths, source, positions)

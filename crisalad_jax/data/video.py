@@ -1,0 +1,208 @@
+"""Frames of video files, under names that say when they were taken: `walk.mp4#t=12.500`.
+
+Such a name stands for an image wherever a path does. Times are those in the file, so that a rate
+that varies does no harm.
+"""
+
+import collections
+import contextlib
+import os
+import pathlib
+import re
+import threading
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from crisalad_jax.data.opencv import QUIET
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source
+
+# OpenCV reads this as it opens its first video: our errors say what the user needs.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+"""Suffixes of videos, in lower case."""
+_VIDEO = f"a video ({' '.join(VIDEO_SUFFIXES)})"
+_FRAME = re.compile(
+    rf"(.*(?:{'|'.join(map(re.escape, VIDEO_SUFFIXES))}))#t=(\d+(?:\.\d+)?)", re.I | re.S
+)
+FASTEST = 1000.0
+"""Most frames a second: names have milliseconds."""
+_OPEN = 2
+"""Number of videos that stay open between frames."""
+_FAR = 30_000
+"""Milliseconds ahead from which seeking beats decoding all that is between."""
+_BEFORE_KEY = 2_000
+"""Milliseconds before a wanted frame that are sought: some decoders arrive late."""
+
+
+def is_video(path: str | os.PathLike[str]) -> bool:
+    """Return whether a name ends as a video's does."""
+    return os.fspath(path).lower().endswith(VIDEO_SUFFIXES)
+
+
+def frame_name(video: str | os.PathLike[str], seconds: float) -> str:
+    """Return the name of a frame."""
+    return f"{os.fspath(video)}#t={seconds:.3f}"
+
+
+def frame_time(path: str | os.PathLike[str]) -> float | None:
+    """Return the seconds in a frame's name; None for other names.
+
+    Example:
+        >>> frame_time("walk.mp4#t=12.500")
+        12.5
+    """
+    match = _FRAME.fullmatch(os.fspath(path))
+    return None if match is None else float(match[2])
+
+
+def file_of(path: str | os.PathLike[str]) -> pathlib.Path:
+    """Return the file that holds an image: of a frame, its video."""
+    match = _FRAME.fullmatch(os.fspath(path))
+    return pathlib.Path(path if match is None else match[1])
+
+
+def check_rate(fps: float) -> None:
+    """Raise InputError for a number of frames a second that no video is sampled at."""
+    if not 0 < fps <= FASTEST:
+        raise InputError(f"fps: found {fps:g}, expected more than 0, and at most {FASTEST:g}")
+
+
+def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib.Path]:
+    """List the frames of a video that are nearest after each 1 / fps seconds.
+
+    The times are read from the container. Nothing is decoded.
+
+    Args:
+        video: the file.
+        fps: frames for each second; more than the video has are all of them.
+
+    Returns:
+        Names of frames, which `read_image` reads.
+
+    Raises:
+        InputError: no file, no video, or a rate out of range.
+    """
+    check_rate(fps)
+    chosen = _sampled(_frame_times(video), fps)
+    return [pathlib.Path(frame_name(video, time / 1000)) for time in chosen]
+
+
+def _sampled(times: Iterable[int], fps: float) -> list[int]:
+    """Choose the first time at or after each multiple of 1 / fps seconds."""
+    chosen: list[int] = []
+    due = 0.0
+    for time in times:
+        if time + 1 > due:  # times are rounded to a millisecond
+            chosen.append(time)
+            due = (int((time + 1) * fps / 1000) + 1) * 1000 / fps
+    return chosen
+
+
+def _frame_times(video: str | os.PathLike[str]) -> list[int]:
+    """Read the times of all frames in milliseconds, in order, each once."""
+    times = _grabbed_times(video, decoded=False)
+    # A video that was trimmed without encoding it again keeps frames that are not shown.
+    if not times or not _can_read(pathlib.Path(video), times[-1]):
+        times = _grabbed_times(video, decoded=True)
+    if not times:
+        raise InputError(f"{video}: found no frame, expected {_VIDEO}")
+    return times
+
+
+def _grabbed_times(video: str | os.PathLike[str], *, decoded: bool) -> list[int]:
+    capture = _opened(video)
+    with QUIET:
+        if not decoded:  # packets as they are, in the order of decoding
+            capture.set(cv2.CAP_PROP_FORMAT, -1)
+        times = set()
+        while capture.grab():
+            times.add(round(capture.get(cv2.CAP_PROP_POS_MSEC)))
+        capture.release()
+    return sorted(time for time in times if time >= 0)
+
+
+def _opened(video: str | os.PathLike[str]) -> cv2.VideoCapture:
+    check_source(video, _VIDEO)
+    with QUIET:
+        capture = cv2.VideoCapture(os.fspath(video), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise InputError(f"{video}: found a file that does not decode, expected {_VIDEO}")
+    return capture
+
+
+class _Reader:
+    """An open video, which is read forwards as far as possible."""
+
+    def __init__(self, video: pathlib.Path) -> None:
+        self._video = video
+        self._capture = _opened(video)
+        self._at = -1
+        """Time of the last frame in milliseconds; -1 before the first."""
+
+    def read(self, wanted: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        """Read the first frame at or after a time; None behind the last one."""
+        with QUIET:
+            if not self._at <= wanted < self._at + _FAR:
+                self._seek(wanted)
+            while self._at < wanted:
+                if not self._grab():
+                    return None
+            found, image = self._capture.retrieve()
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if found else None
+
+    def _grab(self) -> bool:
+        if not self._capture.grab():
+            return False
+        self._at = round(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        return True
+
+    def _seek(self, wanted: int) -> None:
+        self._capture.set(cv2.CAP_PROP_POS_MSEC, max(0, wanted - _BEFORE_KEY))
+        if not self._grab() or self._at > wanted:
+            self.close()
+            self._capture, self._at = _opened(self._video), -1
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def _can_read(video: pathlib.Path, time: int) -> bool:
+    with contextlib.closing(_Reader(video)) as reader:
+        return reader.read(time) is not None
+
+
+_lock = threading.Lock()
+_readers: "collections.OrderedDict[tuple[str, int, int], _Reader]" = collections.OrderedDict()
+"""Open videos by name, size and time of change, the last used one last."""
+
+
+def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
+    """Read a frame as 8-bit RGB, upright: the first one at or after the time in its name.
+
+    Frames are read in order of time without seeking, so one thread should read a video.
+
+    Raises:
+        InputError: no video, or no such frame in it.
+    """
+    time = frame_time(path)
+    assert time is not None
+    video = file_of(path)
+    check_source(video, _VIDEO)
+    there = video.stat()
+    key = (os.path.abspath(video), there.st_size, there.st_mtime_ns)
+    with _lock:
+        reader = _readers.get(key)
+        if reader is None:
+            reader = _readers[key] = _Reader(video)
+        _readers.move_to_end(key)
+        while len(_readers) > _OPEN:
+            _readers.popitem(last=False)[1].close()
+        image = reader.read(round(time * 1000))
+    if image is None:
+        raise InputError(f"{path}: found no frame there, expected a time in the video")
+    return image

@@ -1,0 +1,123 @@
+"""Answers of a map to images as they come, one at a time."""
+
+import pathlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from crisalad_jax.config.preprocessing import Size
+from crisalad_jax.data.live import Frame
+from crisalad_jax.nn.model import Crisalad, check_params
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.query import Answers, json_rows, json_text
+from crisalad_jax.retrieval.windows import FrameDescriber, check_window
+from crisalad_jax.utils.errors import InputError
+
+
+class FrameSource(Protocol):
+    """What gives frames as they come: a `Camera` or a `FolderWatch`."""
+
+    size: Size | None
+    """Height and width of the frames; None where they are unknown or differ."""
+
+    def frames(self, check: Callable[[], None] = ...) -> Iterator[Frame]:
+        """Yield the frames; `check` is called several times a second, and may raise."""
+        ...
+
+
+class LiveAnswer(NamedTuple):
+    """The answer to one frame."""
+
+    answers: Answers
+    """Of this one query."""
+    time: float
+    """The frame's; see `Frame`."""
+    latency_ms: float
+    """Milliseconds from the frame in hand to the answer."""
+
+    def json_line(self) -> str:
+        """Return the answer as one line of JSON."""
+        (row,) = json_rows(self.answers)
+        more = {"time": round(self.time, 3), "latency_ms": round(self.latency_ms, 1)}
+        return json_text({"query": row["query"], **more, "neighbours": row["neighbours"]})
+
+
+def query_live(
+    places: Map,
+    params: Crisalad,
+    source: FrameSource,
+    *,
+    k: int = 5,
+    window: int = 1,
+    ready: Callable[[], None] = lambda: None,
+    check: Callable[[], None] = lambda: None,
+) -> Iterator[LiveAnswer]:
+    """Answer images as they come: which of a map's are most similar.
+
+    The programs are compiled before the first frame is taken, for frames of the source's size.
+
+    Args:
+        places: the map, open.
+        params: parameters of the model that made the map (`Map.load_params`).
+        source: a `Camera` or a `FolderWatch`.
+        k: number of answers to each frame.
+        window: frames that are described together: each with those just answered before it. 1
+            describes each alone, as a map's images are.
+        ready: called when the first frame can be answered.
+        check: called several times a second; it may raise, to end this.
+
+    Yields:
+        The answer to each frame, with its latency.
+
+    Raises:
+        InputError: parameters of another model, a number out of range, or what the source raises.
+
+    Example:
+        >>> import jax, shutil
+        >>> from crisalad_jax import PRESETS, FolderWatch, Map, index, init_crisalad, save_weights
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> weights = folder / "weights.safetensors"
+        >>> save_weights(weights, params, config)
+        >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+        >>> (folder / "new").mkdir()
+        >>> watch = FolderWatch(folder / "new")
+        >>> _ = shutil.copy(pictures / "2.png", folder / "new")
+        >>> with Map.open(folder / "map") as places:
+        ...     found = next(query_live(places, params, watch, k=1))
+        >>> [answer.image.name for _, ranked in found.answers.rows() for answer in ranked]
+        ['2.png']
+    """
+    if k < 1:
+        raise InputError(f"k: found {k}, expected at least 1")
+    config = places.description.config
+    check_window(config, window)
+    places.check_params(params)
+    check_params(params, config)
+    describer = FrameDescriber(params, config, window)
+
+    def answers() -> Iterator[LiveAnswer]:
+        blank = np.zeros((*(source.size or config.image_size), 3), np.uint8)
+        places.search(describer(blank), k)
+        describer.forget()
+        ready()
+        for frame in source.frames(check):
+            neighbours = places.search(describer(frame.image), k)
+            found = Answers([pathlib.Path(frame.name)], neighbours, places.images, places.axes)
+            latency = time.perf_counter() - frame.taken
+            yield LiveAnswer(found, frame.time, 1000 * latency)
+
+    return answers()
+
+
+def latency_words(milliseconds: Sequence[float]) -> str:
+    """Summarise latencies in words."""
+    if not milliseconds:
+        return "no answers"
+    median, high = np.percentile(milliseconds, (50, 95))
+    return (
+        f"{len(milliseconds)} answers, latency median {median:.1f} ms, 95th percentile "
+        f"{high:.1f} ms"
+    )

@@ -1,0 +1,198 @@
+"""Sources of images and live queries on the command line."""
+
+import json
+import os
+import pathlib
+import shutil
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from crisalad_jax.cli import main
+from crisalad_jax.data.images import list_images
+from crisalad_jax.retrieval.descriptor_files import read_descriptors
+from crisalad_jax.retrieval.maps.map import Map
+from tests.cli.test_cli import fails, succeeds
+from tests.cli.test_index import index, query
+from tests.conftest import BATCH, write_video
+from tests.data.test_sources import write_jpeg
+from tests.retrieval.maps.test_stores import ROUNDING
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory) -> pathlib.Path:
+    """Two JPEGs with EXIF positions, N 52.2296 E 21.0125 and S."""
+    folder = tmp_path_factory.mktemp("images")
+    write_jpeg(folder / "a.jpg")
+    write_jpeg(folder / "b.jpg", _1="S")
+    return folder
+
+
+def positions(folder: pathlib.Path) -> dict[str, tuple[float, float] | None]:
+    with Map.open(folder) as places:
+        return {image.name: image.position for image in places.images}
+
+
+def test_positions_are_of_the_flag_the_table_names_or_exif(shared, images, tmp_path, capfd):
+    exif = {
+        name: (pytest.approx(sign * 52.2296, abs=1e-6), pytest.approx(21.0125, abs=1e-6))
+        for name, sign in (("a.jpg", 1), ("b.jpg", -1))  # 1e-6: ratios of integers of 32 bits
+    }
+    said = succeeds(capfd, *index(shared, images, tmp_path / "exif"))
+    assert "2 images added, 2 with positions" in said
+    assert positions(tmp_path / "exif") == exif
+
+    work = tmp_path / "work"
+    shutil.copytree(images, work)
+    (work / "poses.csv").write_text("name;x;y\na.jpg;1,5;2\nb.jpg;;\n")
+    said = succeeds(capfd, *index(shared, work / "poses.csv", tmp_path / "table"))
+    assert "2 images added, 1 with positions" in said
+    assert positions(tmp_path / "table") == {"a.jpg": (1.5, 2.0), "b.jpg": None}
+
+    (work / "more.csv").write_text("name,lat,lon\nb.jpg,3,4\n")
+    flags = ("--positions", work / "more.csv")
+    succeeds(capfd, *index(shared, work / "poses.csv", tmp_path / "flag", *flags))
+    assert positions(tmp_path / "flag") == {"a.jpg": None, "b.jpg": (3.0, 4.0)}
+
+    # A table without positions leaves them to EXIF; a map of metres leaves EXIF out, with a note.
+    (work / "names.csv").write_text("name\nb.jpg\n")
+    succeeds(capfd, *index(shared, work / "names.csv", tmp_path / "names"))
+    assert positions(tmp_path / "names") == {"b.jpg": exif["b.jpg"]}
+    shutil.copy(work / "a.jpg", work / "new.jpg")
+    given = map(str, index(shared, work / "new.jpg", tmp_path / "table"))
+    assert main(list(given)) == 0
+    error = capfd.readouterr().err
+    assert "left out the EXIF positions of 1 images, expected x, y as in the map" in error
+    assert positions(tmp_path / "table")["new.jpg"] is None
+
+
+def test_a_video_is_extracted_and_described_as_its_frames(shared, tmp_path, capfd):
+    video = write_video(tmp_path / "walk.avi", 21)
+    common = ("--weights", shared / "weights.safetensors", "--batch-size", BATCH, "--quiet")
+    out = tmp_path / "d.npy"
+    succeeds(capfd, "extract", "--images", video, "--fps", 2, "--out", out, *common)
+    names, descriptors = read_descriptors(out)
+    assert names == [f"walk.avi#t={time:.3f}" for time in (0, 0.5, 1, 1.5, 2)]
+    (record,) = (
+        value
+        for path in tmp_path.glob("d.npy*json")
+        if "fps" in (value := json.loads(path.read_text()))
+    )
+    assert (record["images"], record["fps"]) == (str(video), 2)
+    # The same frames by name, in another order.
+    (tmp_path / "list.txt").write_text("\n".join(reversed(names)))
+    succeeds(
+        capfd, "extract", "--images", tmp_path / "list.txt", "--out", tmp_path / "e.npy", *common
+    )
+    again, found = read_descriptors(tmp_path / "e.npy")
+    assert again == names[::-1]
+    # float32 sums of other batches.
+    np.testing.assert_allclose(found[::-1], descriptors, atol=ROUNDING)
+
+
+@pytest.fixture(scope="module")
+def folder(shared, tmp_path_factory) -> pathlib.Path:
+    out = tmp_path_factory.mktemp("live") / "map"
+    database = shared / "town" / "images" / "test" / "database"
+    assert main([str(part) for part in index(shared, database, out)]) == 0
+    return out
+
+
+def test_a_pattern_and_a_window_of_queries(shared, folder, tmp_path, capfd):
+    queries = shared / "town" / "images" / "test" / "queries"
+
+    def answers(*flags: object) -> list[dict]:
+        out = tmp_path / "answers.jsonl"
+        succeeds(capfd, *query(folder, queries / "*.jpg", "--k", 1, "--json", out, *flags))
+        return [json.loads(line) for line in out.read_text().splitlines()]
+
+    lines, together = answers(), answers("--window", 3)
+    assert [line["query"] for line in lines] == [path.as_posix() for path in list_images(queries)]
+    alone, similar = (
+        [line["neighbours"][0]["similarity"] for line in each] for each in (lines, together)
+    )
+    assert similar[0] == pytest.approx(alone[0], abs=ROUNDING + 1e-6)  # nothing is before it
+    assert np.abs(np.subtract(similar, alone))[1:].max() > 1000 * ROUNDING
+
+
+def test_a_camera_of_a_video(folder, tmp_path, capfd):
+    video = write_video(tmp_path / "walk.avi", 5)
+    given = query(folder, "--camera", video, "--k", 1, "--window", 3)
+    assert main([str(part) for part in given]) == 0
+    out, error = capfd.readouterr()
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert lines[-1]["query"] == f"{video}#t=0.400"
+    assert lines[-1]["time"] == 0.4
+    assert set(lines[-1]) == {"query", "time", "latency_ms", "neighbours"}
+    ready, summary = error.splitlines()
+    assert ready == f"crisalad: ready, taking frames from {video}"
+    assert summary.startswith(f"crisalad: {len(lines)} answers, latency median ")
+    assert " ms, 95th percentile " in summary
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, capfd, number, code):
+    image = list_images(shared / "town" / "images" / "test" / "database")[2]
+    (tmp_path / "in").mkdir()
+    shutil.copy(image, tmp_path / "in" / "old.jpg")
+    errors: list[str] = []
+    ended = threading.Event()
+
+    def wait_for(word: str, out: bool) -> None:
+        """Wait until a word is printed, or for a minute."""
+        for _ in range(1200):
+            printed = capfd.readouterr()
+            errors.append(printed.err)
+            printed_out.append(printed.out)
+            if word in "".join(printed_out if out else errors) or ended.is_set():
+                return
+            time.sleep(0.05)
+
+    printed_out: list[str] = []
+
+    def feed() -> None:
+        wait_for("ready", out=False)
+        shutil.copy(image, tmp_path / "in" / "new.jpg")
+        wait_for("latency_ms", out=True)
+        if not ended.is_set():
+            os.kill(os.getpid(), number)
+
+    feeder = threading.Thread(target=feed)
+    before = signal.getsignal(number)
+    feeder.start()
+    given = query(folder, "--watch", tmp_path / "in", "--k", 1)
+    try:
+        found = main([str(part) for part in given])
+    finally:
+        ended.set()
+        feeder.join()
+    rest = capfd.readouterr()
+    (line,) = map(json.loads, "".join([*printed_out, rest.out]).splitlines())
+    assert (found, signal.getsignal(number)) == (code, before)
+    assert line["query"] == (tmp_path / "in" / "new.jpg").as_posix()
+    assert line["neighbours"][0]["name"] == image.name
+    said = "".join([*errors, rest.err])
+    assert f"ready, watching {tmp_path / 'in'} (1 images are there, and left out)" in said
+    assert "crisalad: 1 answers, latency median " in said
+    assert said.endswith(f"crisalad: stopped by {number.name}\n")
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--watch", "{map}", "a.jpg"), "--watch: found beside IMAGE, expected only one of the tw"),
+        (("--watch", "{map}", "--camera", "0"), "--watch: found beside --camera, expected only on"),
+        (("--watch", "{map}", "--fps", "2"), "--watch: found beside --fps, expected only one"),
+        (("--camera", "0", "--gallery", "a.png"), "--camera: found beside --gallery, expected onl"),
+        (("--camera", "0", "--json", "a"), "--json: found a with --camera, expected -: answers go"),
+        (("--camera", "x.avi"), "camera: found 'x.avi', expected a number from 0, a URL or a vid"),
+        (("--watch", "{map}/none"), "none: found nothing, expected a folder to watch"),
+        (("{map}/map.json", "--window", "0"), "window: found 0, expected at least 1"),
+        ((), "images: found none, expected images or folders of them"),
+    ],
+)
+def test_bad_live_queries_are_one_line(folder, capfd, flags, words):
+    fails(capfd, *query(folder, *(flag.format(map=folder) for flag in flags)), words=(words,))

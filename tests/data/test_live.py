@@ -1,0 +1,195 @@
+"""Images as they come: a folder that fills, and a camera, which is a video here."""
+
+import contextlib
+import os
+import pathlib
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+import crisalad_jax.data.live
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.live import Camera, FolderWatch
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
+from tests.conftest import write_picture, write_video
+from tests.data.test_sources import LEVELS
+
+
+class Ended(Exception):
+    """What a test's check raises."""
+
+
+def until_idle(seconds: float):
+    """A check that ends a watch after some seconds."""
+    end = time.monotonic() + seconds
+
+    def check() -> None:
+        if time.monotonic() > end:
+            raise Ended
+
+    return check
+
+
+def encoded(suffix: str, level: int) -> bytes:
+    noise = np.random.default_rng(level).integers(0, 256, (40, 60, 3), np.uint8)
+    return cv2.imencode(suffix, noise)[1].tobytes()
+
+
+def test_a_watched_folder_gives_each_image_once_when_it_is_whole(tmp_path, monkeypatch):
+    """Half-written files, slow writers, renamed files, subfolders; what was there is left out."""
+    monkeypatch.setattr(crisalad_jax.data.live, "_SETTLED", 0.5)
+    write_picture(tmp_path / "there.jpg", 0)
+    watch = FolderWatch(tmp_path)
+    assert (watch.there, watch.size, watch.dropped) == (1, None, 0)
+    whole = {suffix: encoded(suffix, 1) for suffix in (".jpg", ".png", ".bmp")}
+
+    def write() -> None:
+        for suffix, data in whole.items():
+            (tmp_path / f"half{suffix}").write_bytes(data[: len(data) // 2])
+        time.sleep(0.25)  # polls of 0.05 s see the halves
+        for suffix, data in whole.items():
+            with (tmp_path / f"half{suffix}").open("ab") as file:
+                file.write(data[len(data) // 2 :])
+        (tmp_path / "sub").mkdir()
+        (tmp_path / "sub" / ".part.png").write_bytes(whole[".png"])
+        (tmp_path / "sub" / ".part.png").rename(tmp_path / "sub" / "moved.png")
+        os.utime(tmp_path / "half.jpg")  # a later time of change is no new image
+        os.utime(tmp_path / "there.jpg")
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    found = {}
+    over = until_idle(20)
+
+    def check() -> None:  # a moment after the fourth, for what would come twice
+        if len(found) == 4 and time.perf_counter() > last + 0.3:
+            raise Ended
+        over()
+
+    with contextlib.suppress(Ended):
+        for frame in watch.frames(check):
+            last = time.perf_counter()
+            assert frame.name not in found
+            found[frame.name] = frame
+    writer.join()
+    names = ("half.jpg", "half.png", "half.bmp", "sub/moved.png")
+    assert set(found) == {(tmp_path / name).as_posix() for name in names}
+    for name, frame in found.items():
+        np.testing.assert_array_equal(frame.image, read_image(name))
+        assert frame.taken <= time.perf_counter()
+    bmp = tmp_path / "half.bmp"
+    assert found[bmp.as_posix()].time == bmp.stat().st_mtime
+
+
+def test_several_come_by_their_time_of_change(tmp_path):
+    watch = FolderWatch(tmp_path)
+    for number, name in enumerate(("c.png", "a.png", "b.png")):
+        write_picture(tmp_path / name, number)
+        os.utime(tmp_path / name, (1000 + number, 1000 + number))
+    frames = watch.frames()
+    found = [next(frames) for _ in range(3)]
+    assert [(pathlib.Path(f.name).name, f.time) for f in found] == [
+        ("c.png", 1000.0),
+        ("a.png", 1001.0),
+        ("b.png", 1002.0),
+    ]
+
+
+def test_a_file_that_stays_unreadable_is_left_out_with_a_note(tmp_path, monkeypatch):
+    monkeypatch.setattr(crisalad_jax.data.live, "_PATIENCE", 0.3)
+    watch = FolderWatch(tmp_path)
+    (tmp_path / "bad.jpg").write_bytes(b"none")
+    (tmp_path / "empty.png").touch()
+    with pytest.warns(Note) as notes, pytest.raises(Ended):
+        next(watch.frames(until_idle(1)))
+    told = sorted(str(note.message) for note in notes)
+    assert len(told) == 2
+    assert "bad.jpg: found 4 bytes that do not decode" in told[0]
+    assert "empty.png: found an empty file" in told[1]
+    assert all(line.endswith("; it is left out") for line in told)
+
+
+def test_a_video_plays_as_a_camera(tmp_path):
+    """Whatever is passed over: times and levels agree, and the last frame is answered."""
+    video = write_video(tmp_path / "a.avi", 8)
+    begun = time.perf_counter()
+    with Camera(video) as camera:
+        assert camera.size == (48, 64)
+        found = list(camera.frames())
+    assert found[-1].time == 0.7
+    assert len(found) + camera.dropped == 8
+    for frame in found:
+        assert frame.name == f"{video}#t={frame.time:.3f}"
+        assert frame.image.mean() == pytest.approx(100 * frame.time, abs=LEVELS)
+        # At its own pace: never before its time. Clocks differ by far less than a frame.
+        assert frame.taken - begun > frame.time - 0.01
+
+
+def test_only_the_newest_frame_is_given(tmp_path):
+    """Who is busy for four frames' time misses three of them, and gets none late."""
+    video = write_video(tmp_path / "a.avi", 12)
+    with Camera(video) as camera:
+        frames = camera.frames()
+        first = next(frames)
+        time.sleep(0.45)
+        begun = time.perf_counter()
+        second = next(frames)
+        # Of the four since then, one or two fewer on a busy machine.
+        assert second.time >= first.time + 0.2
+        assert camera.dropped >= 1
+        # Never one that waited: a frame's time, and some for a busy machine.
+        assert begun - second.taken < 0.4
+
+
+def test_a_camera_at_a_rate(tmp_path):
+    with Camera(write_video(tmp_path / "a.avi", 7), fps=4) as camera:
+        given = [time.monotonic() for _ in camera.frames()]
+    # Sleeping is never shorter than asked for, but for the clock's resolution.
+    assert np.diff(given).min() > 0.25 - 0.01
+    assert len(given) + camera.dropped == 7
+    assert camera.dropped >= 1
+
+
+def test_a_camera_ends_when_it_is_told_to(tmp_path):
+    def stop() -> None:
+        raise Ended
+
+    with Camera(write_video(tmp_path / "a.avi", 30)) as camera, pytest.raises(Ended):
+        next(camera.frames(stop))
+    assert not camera._thread or not camera._thread.is_alive()
+
+
+def test_no_secret_of_a_url_is_a_name():
+    assert (
+        crisalad_jax.data.live._name("rtsp://me:secret@10.0.0.7:554/front?token=1#x")
+        == "rtsp://10.0.0.7:554/front"
+    )
+    assert crisalad_jax.data.live._name("0") == "camera-0"
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        ("none.avi", "camera: found 'none.avi', expected a number from 0, a URL or a video file"),
+        ("97", "camera: found no frame from camera-97, expected a number from 0, a URL or a video"),
+        ("http://u:pass@127.0.0.1:9/x", "camera: found no frame from http://127.0.0.1:9/x, exp"),
+        ("{here}/text.avi", "text.avi, expected a number from 0"),
+    ],
+)
+def test_no_camera_is_one_line(tmp_path, camera, words, capfd):
+    (tmp_path / "text.avi").write_text("text")
+    with pytest.raises(InputError, match=words) as error:
+        Camera(camera.format(here=tmp_path))
+    assert "pass@" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_no_folder_is_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    for name, kind in (("none", "nothing"), ("file", "a file")):
+        with pytest.raises(InputError, match=f"{name}: found {kind}, expected a folder to watch"):
+            FolderWatch(tmp_path / name)

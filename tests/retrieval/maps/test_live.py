@@ -1,0 +1,128 @@
+"""Answers as images come: those of `query` to the same images, with their latency."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.live import Camera, FolderWatch, Frame
+from crisalad_jax.data.video import list_frames
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.live import latency_words, query_live
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.query import json_lines, query
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import BATCH, MODEL, write_video
+from tests.retrieval.maps.test_stores import ROUNDING
+
+
+@pytest.fixture(scope="module")
+def folder(shared, params, tmp_path_factory):
+    """A map of the town's database."""
+    out = tmp_path_factory.mktemp("live") / "map"
+    images = shared / "town" / "images" / "test" / "database"
+    weights = shared / "weights.safetensors"
+    index(params, MODEL, images, out, weights=weights, batch_size=BATCH, quiet=True)
+    return out
+
+
+class Given:
+    """A source of images that are there."""
+
+    size = None
+
+    def __init__(self, paths) -> None:
+        self.paths, self.taken = paths, 0
+
+    def frames(self, check=lambda: None):
+        for path in self.paths:
+            check()
+            self.taken += 1
+            yield Frame(path.as_posix(), 1.5, read_image(path), 0.0)
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_the_answers_are_those_of_query(folder, shared, params, window):
+    paths = list_images(shared / "town" / "images" / "test" / "queries")
+    source = Given(paths)
+    with Map.open(folder) as places:
+        expected = query(
+            places, params, paths[0].parent, k=2, window=window, batch_size=BATCH, quiet=True
+        )
+        stream = query_live(
+            places, params, source, k=2, window=window, ready=lambda: seen.append(source.taken)
+        )
+        seen = []
+        assert not seen  # nothing is compiled before the first answer is asked for
+        found = list(stream)
+    assert seen == [0]  # ready before the first frame is taken
+    lines = [json.loads(answer.json_line()) for answer in found]
+    assert [line["query"] for line in lines] == [path.as_posix() for path in paths]
+    for line, right in zip(lines, map(json.loads, json_lines(expected)), strict=True):
+        assert line["time"] == 1.5
+        assert [one["name"] for one in line["neighbours"]] == [
+            one["name"] for one in right["neighbours"]
+        ]
+        similarities = [[one["similarity"] for one in each["neighbours"]] for each in (line, right)]
+        # float32 sums of other batches, and six decimals.
+        np.testing.assert_allclose(*similarities, atol=ROUNDING + 1e-6)
+    # `taken` was the clock's zero: the latency is what it shows.
+    assert all(answer.latency_ms > 0 for answer in found)
+
+
+def test_a_watched_folder_and_a_camera(folder, shared, params, tmp_path):
+    database = shared / "town" / "images" / "test" / "database"
+    image = list_images(database)[4]
+    (tmp_path / "in").mkdir()
+    watch = FolderWatch(tmp_path / "in")
+    shutil.copy(image, tmp_path / "in")
+    video = write_video(tmp_path / "walk.avi", 4)
+    with Map.open(folder) as places:
+        first = next(query_live(places, params, watch, k=1))
+        line = json.loads(first.json_line())
+        assert line["neighbours"][0]["name"] == image.name
+        assert 0 < line["latency_ms"] < 60_000
+        with Camera(video) as camera:
+            last = list(query_live(places, params, camera, k=1))[-1]
+    assert (last.time, json.loads(last.json_line())["query"]) == (0.3, f"{video}#t=0.300")
+
+
+def test_a_map_of_a_video_tells_times(shared, params, tmp_path):
+    video = write_video(tmp_path / "walk.avi", 21)
+    more = {"weights": shared / "weights.safetensors", "batch_size": BATCH, "quiet": True}
+    made = index(params, MODEL, video, tmp_path / "map", fps=1, **more)
+    assert (made.added, made.positions) == (3, 0)
+    made = index(params, MODEL, video, tmp_path / "map", fps=2, **more)
+    assert (made.added, made.there) == (2, 3)
+    with Map.open(tmp_path / "map") as places:
+        assert {image.root for image in places.images} == {tmp_path.resolve().as_posix()}
+        assert places.images[1].bytes == video.stat().st_size
+        answers = query(places, params, list_frames(video, 1)[2], k=1, batch_size=BATCH, quiet=True)
+        whole = query(places, params, video, fps=2, k=1, batch_size=BATCH, quiet=True)
+    (line,) = map(json.loads, json_lines(answers))
+    assert (line["query"], line["time"]) == (f"{video}#t=2.000", 2.0)
+    assert line["neighbours"][0] == {
+        "rank": 1,
+        "name": "walk.avi#t=2.000",
+        "similarity": pytest.approx(1, abs=ROUNDING),
+        "position": None,
+        "time": 2.0,
+    }
+    assert [path.name for path in whole.queries] == [f"walk.avi#t={i / 2:.3f}" for i in range(5)]
+
+
+def test_latencies_in_words():
+    # By hand: of 1 to 21 the 11th, and the 20th.
+    words = "21 answers, latency median 11.0 ms, 95th percentile 20.0 ms"
+    assert latency_words(range(1, 22)) == words
+    assert latency_words([]) == "no answers"
+
+
+def test_what_is_refused(folder, params):
+    with Map.open(folder) as places:
+        with pytest.raises(InputError, match="k: found 0, expected at least 1"):
+            query_live(places, params, Given([]), k=0)
+        with pytest.raises(InputError, match="window: found 0, expected at least 1"):
+            query_live(places, params, Given([]), window=0)
