@@ -94,6 +94,7 @@ def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
         config,
         flags.out,
         page=flags.page,
+        jobs=flags.jobs,
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
         quiet=flags.quiet,
     )

@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import warnings
 from collections.abc import Callable
 
 from crisalad_jax.experiments.comparison.ablation import adapter_costs_once
@@ -10,7 +11,11 @@ from crisalad_jax.experiments.comparison.plan import ComparisonConfig, prepare
 from crisalad_jax.experiments.comparison.runner import carry_out
 from crisalad_jax.experiments.comparison.summary import Summary, summarise
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
+from crisalad_jax.experiments.comparison.workers import run_jobs
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import around, check_target, real_path
+from crisalad_jax.utils.locks import next_writer
+from crisalad_jax.utils.notes import Note
 
 
 def compare(
@@ -18,12 +23,16 @@ def compare(
     out: str | os.PathLike[str],
     *,
     page: str | os.PathLike[str] | None = None,
+    jobs: int = 1,
     say: Callable[[str], None] = lambda line: None,
     quiet: bool = False,
 ) -> Summary:
     """Train or load the methods of a comparison, evaluate them alike, and write the tables.
 
     Everything is checked before any work, as far as it can be. The same call resumes after a kill.
+    It also goes on with a folder that holds a part of the comparison, or more: methods, rows, seeds
+    and sets may be added. Several hosts that share the folder may make the same call, and share
+    the runs.
 
     Args:
         config: what to compare.
@@ -31,6 +40,7 @@ def compare(
             index.html.
         page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and
             <!-- end of NAME -->, where NAME is the name of the folder.
+        jobs: number of runs at once, each in a process with its share of this host's devices.
         say: is given a line at the start and before each run.
         quiet: whether to show no progress bars.
 
@@ -47,12 +57,19 @@ def compare(
     place = real_path(out).name
     if page is not None:
         around(pathlib.Path(page), place)
-    prepared = prepare(config)
+    if jobs < 1:
+        raise InputError(f"--jobs: found {jobs}, expected at least 1")
+    with warnings.catch_warnings():
+        if jobs > 1:
+            run_jobs(config, out, jobs, say=say)
+            warnings.simplefilter("ignore", Note)  # the processes have told them
+        prepared = prepare(config)
     carry_out(prepared, out, say=say, quiet=quiet)
-    adapters = adapter_costs_once(out) if config.kind == "ablate" else []
-    summary = summarise(prepared, out, adapters)
-    write_tables(summary, out)
-    write_page(summary, out)
+    with next_writer(out):
+        adapters = adapter_costs_once(out) if config.kind == "ablate" else []
+        summary = summarise(prepared, out, adapters)
+        write_tables(summary, out)
+        write_page(summary, out)
     if page is not None:
         put_in_page(pathlib.Path(page), place, markdown(summary))
     return summary

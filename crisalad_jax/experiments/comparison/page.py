@@ -62,7 +62,10 @@ def write_page(summary: Summary, out: pathlib.Path) -> pathlib.Path:
         "charts": charts,
         "reference": tables.title_of_reference(summary),
         "differences": [
-            (tables.title_of(row, summary.rows), [_difference(d) for by_k in found.values() for d in by_k])
+            (
+                tables.title_of(row, summary.rows),
+                [_difference(d) for by_k in found.values() for d in by_k],
+            )
             for row, found in tables.compared_rows(summary)
         ],
         "cost_headers": tables.COSTS,

@@ -12,6 +12,7 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY
 from crisalad_jax.experiments.comparison.ablation import NOTES, AdapterCost
+from crisalad_jax.experiments.comparison.ledger import numbers_of
 from crisalad_jax.experiments.comparison.paired import RESAMPLES, Difference, paired_difference
 from crisalad_jax.experiments.comparison.plan import Prepared, Variant, labels_of, short_names
 from crisalad_jax.experiments.comparison.records import advised, read_result
@@ -104,9 +105,7 @@ def summarise(
         if beside:
             took = theirs = None
         for grouping, of_sets in ranks[variant.name].items():
-            recalls = {
-                name: {k: recall_of(each, k) for k in KS} for name, each in of_sets.items()
-            }
+            recalls = {name: {k: recall_of(each, k) for k in KS} for name, each in of_sets.items()}
             rows.append(
                 Row(
                     variant.name,
@@ -194,7 +193,8 @@ def _ranks(
 ) -> dict[str, dict[str, np.ndarray]]:
     """Read a variant's (seed, query) ranks of first right retrievals, by grouping and set."""
     by_grouping: dict[str, dict[str, np.ndarray]] = {}
-    for number, (name, benchmark) in enumerate(sets.items()):
+    numbers = numbers_of(out, prepared.config)
+    for number, (name, benchmark) in zip(numbers, sets.items(), strict=True):
         paths = [
             result_path(out, variant, seed, number) for seed in variant.seeds(prepared.config.seeds)
         ]

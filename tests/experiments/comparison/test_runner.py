@@ -188,8 +188,8 @@ def test_a_result_of_another_set(finished, flags, capfd):
 
 
 def test_another_comparison_is_refused(finished, flags, capfd):
-    words = (finished, "holds another comparison: seeds: found 3, expected 2")
-    fails(capfd, *flags, "--seeds", 3, "--out", finished, words=words)
+    words = (finished, "holds another comparison: epochs: was 3, is 4; give the same to go on")
+    fails(capfd, *flags, "--epochs", 4, "--out", finished, words=words)
 
 
 def test_weights_that_change_behind_their_name_are_refused(
@@ -303,9 +303,7 @@ def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
 
     monkeypatch.setattr(runner, "evaluate", noted)
     monkeypatch.delattr(runner, "fit")
-    (finished / "config.json").unlink()
     config = ComparisonConfig(**settings | {"names": ("crisalad", "ranked"), "rerank": 5})
-    runner.write_json(finished / "config.json", runner.to_plain(config))
     summary = run(config, finished)
     assert seen == [(0, "parsed by-name:5"), (1, "parsed by-name:5")]
     first, second = summary.rows
