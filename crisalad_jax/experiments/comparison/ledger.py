@@ -18,7 +18,7 @@ from crisalad_jax.experiments.comparison.rows import AblationRow
 from crisalad_jax.training.run_files import checksum_of_benchmark, checksum_of_places
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, write_json
+from crisalad_jax.utils.files import check_target, read_json, write_json
 from crisalad_jax.utils.temporaries import holds_other_files
 
 _GROWING = ("names", "rows", "test", "weights", "seeds")
@@ -56,8 +56,8 @@ def numbers_of(out: pathlib.Path, config: ComparisonConfig) -> list[int]:
     Raises:
         InputError: the folder's config.json cannot be read.
     """
-    existing = read_config(ComparisonConfig, out / "config.json").test
-    return [existing.index(test) for test in config.test]
+    there: Any = read_json(out / "config.json", "a configuration as JSON", quiet=True)
+    return [there["test"].index(test) for test in config.test]
 
 
 def grown(
@@ -84,8 +84,7 @@ def grown(
         )
     weights = _files(existing.weights) | _files(config.weights)
     rows = {row.name: row for each in (existing, config) for row in _rows(each)}
-    return dataclasses.replace(
-        existing,
+    together: dict[str, Any] = dict(
         names=tuple(dict.fromkeys((*existing.names, *config.names))),
         rows=tuple(rows.values()),
         test=tuple(dict.fromkeys((*existing.test, *config.test))),
@@ -93,6 +92,9 @@ def grown(
         seeds=max(existing.seeds, config.seeds),
         **{name: getattr(config, name) for name in _unused(existing)},
     )
+    if all(getattr(existing, name) == value for name, value in together.items()):
+        return existing
+    return dataclasses.replace(existing, **together)
 
 
 def _changed_settings(existing: ComparisonConfig, config: ComparisonConfig) -> list[str]:

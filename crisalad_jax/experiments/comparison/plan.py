@@ -395,6 +395,10 @@ def _fitted_row(
     epochs = training.epochs if "epochs" in row.flags else config.epochs
     if "images-per-place" in row.flags:
         views = training.images_per_place
+    if "cities" in row.flags:
+        assert config.train is not None
+        own = read_places(config.train, cities=training.cities, min_images=views)
+        count = len(own.place_id)
     # Twice: what is fitted depends on what is set, and must not replace it.
     fitted = row.changed(_fitted(training, config, count, views, epochs), config.preset)
     if config.backbone is None and not _sets_warmup(row):

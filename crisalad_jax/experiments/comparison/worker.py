@@ -1,4 +1,4 @@
-"""A process that takes runs of a comparison: `python -m crisalad_jax.experiments.comparison.worker`.
+"""A process that takes runs of a comparison; `workers` starts it by its module's name.
 
 Its task comes as a line of JSON on standard input, which stays open as long as the parent lives.
 What it says goes to standard output, an object of JSON a line.
