@@ -161,6 +161,7 @@ def _started(share: Share, task: Mapping[str, Any]) -> "subprocess.Popen[bytes]"
         [sys.executable, "-m", _MODULE],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         env=_environment() | dict(share.environment),
         # Ctrl-C comes to this process alone, which ends the others.
         start_new_session=True,
@@ -177,10 +178,21 @@ def _started(share: Share, task: Mapping[str, Any]) -> "subprocess.Popen[bytes]"
 def _listen(number: int, worker: "subprocess.Popen[bytes]", said: "queue.Queue[Any]") -> None:
     """Put what a process says into a queue, and None when it has ended."""
     assert worker.stdout is not None
+    errors = threading.Thread(target=_forward, args=(worker,), daemon=True)
+    errors.start()
     for line in worker.stdout:
         said.put((number, json.loads(line)))
+    errors.join()
     worker.wait()
     said.put((number, None))
+
+
+def _forward(worker: "subprocess.Popen[bytes]") -> None:
+    """Show what a process prints for people, but not that this one ended it."""
+    assert worker.stderr is not None
+    for line in worker.stderr:
+        if not line.startswith((b"crisalad: ended by", b"crisalad: interrupted")):
+            sys.stderr.write(line.decode(errors="replace"))
 
 
 def _pass_on(
