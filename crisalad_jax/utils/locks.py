@@ -46,8 +46,12 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def next_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
+def next_writer(folder: str | os.PathLike[str], *, quiet: bool = False) -> Iterator[None]:
     """Hold the lock of a folder as `one_writer`, after the process that holds it now.
+
+    Args:
+        folder: the folder.
+        quiet: whether to tell nothing of the wait.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -59,7 +63,7 @@ def next_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
                 stack.enter_context(one_writer(folder))
                 break
             except BusyFolderError:
-                if not waits:
+                if not waits and not quiet:
                     tell(f"{folder}: waiting for another process{_holder(_lock_of(folder))}")
                 waits = True
                 time.sleep(POLL)

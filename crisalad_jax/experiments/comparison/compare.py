@@ -66,7 +66,9 @@ def compare(
         prepared = prepare(config)
     carry_out(prepared, out, say=say, quiet=quiet)
     with next_writer(out):
-        adapters = adapter_costs_once(out) if config.kind == "ablate" else []
+        # Table 3 belongs to the paper's rows, and takes a minute.
+        papers = config.kind == "ablate" and not config.rows
+        adapters = adapter_costs_once(out) if papers else []
         summary = summarise(prepared, out, adapters)
         write_tables(summary, out)
         write_page(summary, out)

@@ -320,8 +320,10 @@ def _drafts(config: ComparisonConfig, weights: Mapping[str, pathlib.Path]) -> It
                 training = row_training(name, config.preset, from_nothing=from_nothing)
             else:
                 training = row.training(config.preset, from_nothing=from_nothing)
-            changed = ("-" if row is None else row.words or "-",) if config.rows else ()
-            labels, run = (name, *changed, *row_labels(training)), name
+            described = row_labels(training)
+            if config.rows:
+                described = (row.words if row is not None else _changed_words(described, config),)
+            labels, run = (name, *(words or "-" for words in described)), name
         if config.image_size is not None or config.resize:
             way = training.model.preprocessing.changed_by(config.resize)
             size = config.image_size or training.model.image_size
@@ -329,6 +331,14 @@ def _drafts(config: ComparisonConfig, weights: Mapping[str, pathlib.Path]) -> It
             training = dataclasses.replace(training, model=model)
         learns = training.model.aggregator.learns
         yield Variant(name, labels, run, training, learns, rerank, None, training.model, row)
+
+
+def _changed_words(labels: tuple[str, ...], config: ComparisonConfig) -> str:
+    """Say in words in what a row of the paper differs from its first."""
+    from_nothing = config.backbone is None
+    base = row_labels(row_training("crisalad", config.preset, from_nothing=from_nothing))
+    described = zip(ROW_HEADERS[1:], labels, base, strict=True)
+    return ", ".join(f"{header} {label}" for header, label, was in described if label != was)
 
 
 def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
@@ -500,7 +510,7 @@ def labels_of(config: ComparisonConfig) -> tuple[str, ...]:
     """Return the headers above `Variant.labels`."""
     if config.kind == "compare":
         return ("method",)
-    return (ROW_HEADERS[0], "changed", *ROW_HEADERS[1:]) if config.rows else ROW_HEADERS
+    return (ROW_HEADERS[0], "changed") if config.rows else ROW_HEADERS
 
 
 def short_names(benchmarks: list[Benchmark]) -> list[str]:

@@ -315,7 +315,7 @@ def _notes(
         )
     if config.kind == "compare":
         notes += _method_notes(prepared)
-    elif config.backbone is None:
+    elif config.backbone is None and not config.rows:
         notes.append(
             "From nothing the learning rates are the recipe scratch's in the paper's proportion, "
             "6e-5 to 1e-4, and the step schedule is the paper's, after the warm-up: halved every "

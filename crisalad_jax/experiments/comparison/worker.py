@@ -67,7 +67,7 @@ def _work(task: dict[str, Any], send: Any) -> None:
         load_plugin(plugin)
     prepared = prepare(from_plain(ComparisonConfig, task["config"], source="--jobs"))
     out = pathlib.Path(task["out"])
-    with next_writer(out):
+    with next_writer(out, quiet=True):  # after the other processes, in a moment
         claim(out, prepared)
     take_runs(
         prepared,

@@ -114,12 +114,15 @@ def test_the_cities_of_a_row_are_its_training_set(ablation):
 
 
 def test_a_table_says_what_a_row_changes(ablation):
-    config = ComparisonConfig(**ablation | {"rows": ("hot: optimiser.learning-rate=0.01",)})
-    first, second = prepare(config).variants
-    assert labels_of(config)[:2] == ("row", "changed")
-    assert first.labels == ("crisalad", "-", "depthwise", "yes", "0.001", "linear")
-    change = "optimiser.learning-rate=0.01"
-    assert second.labels == ("hot", change, "depthwise", "yes", "0.01", "linear")
+    rows = ("hot: optimiser.learning-rate=0.01",)
+    names = ("crisalad", "no-encoder-step")
+    config = ComparisonConfig(**ablation | {"names": names, "rows": rows})
+    assert labels_of(config) == ("row", "changed")
+    assert [variant.labels for variant in prepare(config).variants] == [
+        ("crisalad", "-"),
+        ("no-encoder-step", "cross-image encoder no, scheduler step"),
+        ("hot", "optimiser.learning-rate=0.01"),
+    ]
 
 
 def test_a_plug_ins_loss_and_its_settings(ablation, monkeypatch):
