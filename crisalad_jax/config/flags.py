@@ -133,6 +133,7 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
                 prog=what,
                 args=arguments,
                 default=default,
+                add_help=False,
                 config=(tyro.conf.FlagConversionOff,),
             )
         return config_of(flags, parsed)

@@ -59,6 +59,7 @@ def compare(
         around(pathlib.Path(page), place)
     if jobs < 1:
         raise InputError(f"--jobs: found {jobs}, expected at least 1")
+    jobs = min(jobs, len(config.names) * config.seeds)
     with warnings.catch_warnings():
         if jobs > 1:
             run_jobs(config, out, jobs, say=say)

@@ -110,7 +110,7 @@ def _changed_settings(existing: ComparisonConfig, config: ComparisonConfig) -> l
 
 def _unused(existing: ComparisonConfig) -> list[str]:
     """Return settings that no result in the folder depends on."""
-    unused = list(_OF_TRAINING) if existing.train is None else []
+    unused: list[str] = [*_OF_TRAINING] if existing.train is None else []
     methods = [name for name in existing.names if name not in existing.models]
     if existing.kind == "ablate" or not any(
         method_of(name, existing.preset).rerank for name in methods

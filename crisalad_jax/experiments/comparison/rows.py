@@ -14,6 +14,8 @@ from crisalad_jax.utils.errors import InputError
 _SHAPE = "NAME: flag=value, flag=value"
 _ITEM = re.compile(r"""(?:[^,"']|"[^"]*"|'[^']*'|["'])+""")
 """Text up to a comma that is in no quotes."""
+_LARGEST = 2**40
+"""Largest whole number, as of the command line's flags."""
 _NOT_A_ROWS = {
     "seed": "the comparison's --seeds",
     "preset": "the comparison's --preset",
@@ -56,6 +58,12 @@ class AblationRow:
                     f"--row {self.name}: {flag}: found {value.strip()}, expected "
                     f"{_NOT_A_ROWS[flag]}"
                 )
+            for word in value.split():
+                if word.lstrip("+-").isdecimal() and abs(int(word)) > _LARGEST:
+                    raise InputError(
+                        f"--row {self.name}: {flag}: found {word}, expected a number of at most "
+                        "2**40"
+                    )
             given.append((flag, value.strip()))
         flags = [flag for flag, _ in given]
         for flag in flags:
