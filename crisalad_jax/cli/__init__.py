@@ -50,6 +50,7 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
     import tyro
 
     from crisalad_jax.cli import help as helping
+    from crisalad_jax.config.flags import unboxed
 
     program = f"crisalad {name}"
     complaint = io.StringIO()
@@ -69,28 +70,10 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
         error: BaseException | None = stop
         while error is not None and not isinstance(error, InputError):
             error = error.__context__
-        reason = _unboxed(complaint.getvalue()) if error is None else str(error)
+        reason = unboxed(complaint.getvalue()) if error is None else str(error)
         raise InputError(f"{reason} (see {program} --help)") from stop
     except InputError as error:
         raise InputError(f"{error} (see {program} --help)") from error
-
-
-# Beginnings of the parts of tyro's boxes that repeat the first one.
-_ASIDES = ("Argument help", "Got errors", "For full")
-
-
-def _unboxed(box: str) -> str:
-    """Extract the text of tyro's boxes, without frames, help texts and footer."""
-    sections = [[]]
-    # The title is dropped. Without UTF-8 on stdout, the frame is of spaces and hyphens.
-    for line in box.splitlines()[1:]:
-        row = line[2:].rstrip("│ ")
-        if not row.strip("─╯-"):
-            sections.append([])
-        elif not row.startswith(" " * 5):
-            sections[-1].append(row.strip())
-    texts = [" ".join(rows) for rows in sections]
-    return "; ".join(t for t in texts if t and not t.startswith(_ASIDES))
 
 
 def _usage() -> str:
@@ -122,7 +105,7 @@ def _load_plugins(given: Sequence[str]) -> None:
 
 def _limit_pixels(given: Sequence[str]) -> None:
     """Set the largest image that OpenCV decodes, before OpenCV is imported."""
-    from crisalad_jax.cli.flags import find_flag
+    from crisalad_jax.config.flags import find_flag
 
     pixels = find_flag(given, "--max-pixels")
     if pixels is not None:

@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import tyro
+
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
 COMMON = (
@@ -33,12 +35,21 @@ class Ablate(ComparisonFlags):
     rows: str | None = None
     """Comma-separated; by default all of the paper: crisalad, lr-1e-4, step, multi-resolution, mlp,
     no-adapter, no-encoder, no-encoder-step. Any registered part is a row too, as NAME or KIND:NAME:
-    CriSALAD with it in place."""
+    CriSALAD with it in place. With --row the default is crisalad alone."""
+    row: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A row of your own, as "NAME: flag=value, flag=value" with any flags of `train` that set the
+    model, loss, optimiser, augmentation or training, and recipe=NAME for another start than
+    crisalad. Give --row again for each row. Spaces part the numbers of a flag (image-size=224 224);
+    a value with a comma stands in quotes."""
 
 
 def run(arguments: Ablate) -> None:
     """Train the rows of the ablation, and print the tables."""
     from crisalad_jax.experiments.comparison import ABLATIONS, ComparisonConfig
 
-    names = tuple(ABLATIONS) if arguments.rows is None else names_of(arguments.rows)
-    run_comparison(ComparisonConfig("ablate", names, **settings_of(arguments)), arguments)
+    if arguments.rows is not None:
+        names = names_of(arguments.rows)
+    else:
+        names = ("crisalad",) if arguments.row else tuple(ABLATIONS)
+    config = ComparisonConfig("ablate", names, **settings_of(arguments), rows=arguments.row)
+    run_comparison(config, arguments)

@@ -41,6 +41,12 @@ class ComparisonFlags:
     """Images described together, which a grouping lets look at each other."""
     grouping: str = "single"
     """Comma-separated, as `evaluate` takes them, for methods with a cross-image encoder."""
+    reference: str | None = None
+    """Which line differences, speeds and training times are relative to; by default crisalad, or
+    the first where that is not compared."""
+    jobs: int = 1
+    """Runs at once, each in a process of its own: on a GPU of its own where there are as many, else
+    beside the others. Other hosts that run the same command on a shared folder take runs too."""
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
@@ -73,6 +79,7 @@ def settings_of(flags: ComparisonFlags) -> dict[str, Any]:
         "batch_size": flags.batch_size,
         "grouping": flags.grouping,
         "seeds": flags.seeds,
+        "reference": flags.reference,
     }
 
 
@@ -93,6 +100,7 @@ def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
         flags.out,
         page=flags.page,
         on_bad_image=flags.on_bad_image,
+        jobs=flags.jobs,
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
         quiet=flags.quiet,
     )

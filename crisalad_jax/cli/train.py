@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from crisalad_jax.cli.common import console, give_json, prepare_json
-from crisalad_jax.cli.flags import find_flag, parse_settings, with_settings
+from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
 from crisalad_jax.config.io import read_config
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import recipe

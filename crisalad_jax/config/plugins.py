@@ -18,6 +18,8 @@ ENTRY_POINTS = "crisalad_jax.plugins"
 _FILES: dict[str, pathlib.Path] = {}
 """File of each loaded plug-in, by its module's name."""
 _ENTERED: set[str] = set()
+_PLUGINS: dict[str, None] = {}
+"""What `load_plugin` loaded, in that order; of a file its whole path."""
 _LOADED: set[str] = set()
 """Source files of all loaded plug-ins."""
 
@@ -54,6 +56,12 @@ def load_plugin(plugin: str) -> None:
             _load_module(plugin)
     except InputError as error:
         raise InputError(f"plugin {plugin}: {error}") from error
+    _PLUGINS[str(real_path(pathlib.Path(plugin))) if plugin.endswith(".py") else plugin] = None
+
+
+def loaded_plugins() -> list[str]:
+    """Return what `load_plugin` takes to load the same in another process."""
+    return list(_PLUGINS)
 
 
 _LARGEST = 2**24

@@ -46,8 +46,12 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def next_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
+def next_writer(folder: str | os.PathLike[str], *, quiet: bool = False) -> Iterator[None]:
     """Hold the lock of a folder as `one_writer`, after the process that holds it now.
+
+    Args:
+        folder: the folder.
+        quiet: whether to tell nothing of the wait.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -59,15 +63,39 @@ def next_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
                 stack.enter_context(one_writer(folder))
                 break
             except BusyFolderError:
-                if not waits:
+                if not waits and not quiet:
                     tell(f"{folder}: waiting for another process{_holder(_lock_of(folder))}")
                 waits = True
-                time.sleep(_POLL)
+                time.sleep(POLL)
         yield
 
 
-_POLL = 0.2
+POLL = 0.2
 """Seconds between two looks at a lock that another process holds."""
+
+
+def holder_of(folder: str | os.PathLike[str]) -> str | None:
+    """Return "process P on HOST" of the process that writes into a folder; None without one."""
+    import fcntl
+
+    path = _lock_of(folder)
+    try:
+        with path.open(encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _words(path)
+    except OSError:
+        pass
+    return None
+
+
+def is_here(holder: str) -> bool:
+    """Return whether what `holder_of` returned is another process of this host."""
+    return holder != _signature() and holder.endswith(f" on {socket.gethostname()}")
+
+
+def _signature() -> str:
+    return f"process {os.getpid()} on {socket.gethostname()}"
 
 
 def _lock_of(folder: str | os.PathLike[str]) -> pathlib.Path:
@@ -118,16 +146,20 @@ def _sign(descriptor: int) -> None:
     """Write who holds a lock into its file, for messages; a full disk has no room for that."""
     with contextlib.suppress(OSError):
         os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+        os.write(descriptor, f"{_signature()}\n".encode())
 
 
 def _holder(path: pathlib.Path) -> str:
     """Return the words of a lock's holder in brackets; nothing while it is still writing them."""
+    words = _words(path)
+    return f" ({words})" if words else ""
+
+
+def _words(path: pathlib.Path) -> str:
     try:
-        words = path.read_text(encoding="utf-8", errors="replace").strip()
+        return path.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
         return ""
-    return f" ({words})" if words else ""
 
 
 def _is_still(path: pathlib.Path, descriptor: int) -> bool:

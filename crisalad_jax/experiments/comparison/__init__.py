@@ -7,22 +7,27 @@ from crisalad_jax.experiments.comparison.ablation import (
     adapter_costs_once,
 )
 from crisalad_jax.experiments.comparison.compare import compare
+from crisalad_jax.experiments.comparison.ledger import claim
 from crisalad_jax.experiments.comparison.methods import METHODS, ComparedMethod
+from crisalad_jax.experiments.comparison.paired import Difference, paired_difference
 from crisalad_jax.experiments.comparison.plan import (
     ComparisonConfig,
     Prepared,
     names_to_compare,
     prepare,
 )
-from crisalad_jax.experiments.comparison.runner import carry_out, claim
+from crisalad_jax.experiments.comparison.rows import AblationRow, parse_row
+from crisalad_jax.experiments.comparison.runner import carry_out
 from crisalad_jax.experiments.comparison.summary import Recall, Row, Summary, summarise
 
 __all__ = [
     "ABLATIONS",
     "METHODS",
+    "AblationRow",
     "AdapterCost",
     "ComparedMethod",
     "ComparisonConfig",
+    "Difference",
     "Prepared",
     "Recall",
     "Row",
@@ -33,6 +38,8 @@ __all__ = [
     "claim",
     "compare",
     "names_to_compare",
+    "paired_difference",
+    "parse_row",
     "prepare",
     "summarise",
 ]

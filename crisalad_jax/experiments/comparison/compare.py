@@ -2,17 +2,21 @@
 
 import os
 import pathlib
+import warnings
 from collections.abc import Callable
 
-from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.experiments.comparison.ablation import adapter_costs_once
 from crisalad_jax.experiments.comparison.page import write_page
-from crisalad_jax.experiments.comparison.plan import ComparisonConfig, prepare
+from crisalad_jax.experiments.comparison.plan import ComparisonConfig, prepare, without_unreadable
 from crisalad_jax.experiments.comparison.runner import carry_out
 from crisalad_jax.experiments.comparison.summary import Summary, summarise
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
+from crisalad_jax.experiments.comparison.workers import run_jobs
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import around, check_target, real_path
+from crisalad_jax.utils.locks import next_writer
+from crisalad_jax.utils.notes import Note
 
 
 def compare(
@@ -21,12 +25,16 @@ def compare(
     *,
     page: str | os.PathLike[str] | None = None,
     on_bad_image: OnBadImage = "stop",
+    jobs: int = 1,
     say: Callable[[str], None] = lambda line: None,
     quiet: bool = False,
 ) -> Summary:
     """Train or load the methods of a comparison, evaluate them alike, and write the tables.
 
     Everything is checked before any work, as far as it can be. The same call resumes after a kill.
+    It also goes on with a folder that holds a part of the comparison, or more: methods, rows, seeds
+    and sets may be added. Several hosts that share the folder may make the same call, and share
+    the runs.
 
     Args:
         config: what to compare.
@@ -36,6 +44,7 @@ def compare(
             <!-- end of NAME -->, where NAME is the name of the folder.
         on_bad_image: "stop" at an unreadable image, or "skip" it: training masks it out, and the
             sets are compared on without it. Each call reads all images of the sets to find them.
+        jobs: number of runs at once, each in a process with its share of this host's devices.
         say: is given a line at the start and before each run.
         quiet: whether to show no progress bars.
 
@@ -52,25 +61,24 @@ def compare(
     place = real_path(out).name
     if page is not None:
         around(pathlib.Path(page), place)
-    prepared = prepare(config)
-    left_out: list[str] = []
-    if on_bad_image == "skip":
-        readable = [leave_out_unreadable(each, quiet=quiet) for each in prepared.benchmarks]
-        for before, after in zip(prepared.benchmarks, readable, strict=True):
-            queries = len(before.queries) - len(after.queries)
-            database = len(before.database) - len(after.database)
-            if queries or database:
-                left_out.append(
-                    f"{before.name}: unreadable and left out: {queries} queries and {database} "
-                    "database images."
-                )
-        prepared = prepared._replace(benchmarks=readable, on_bad_image=on_bad_image)
+    if jobs < 1:
+        raise InputError(f"--jobs: found {jobs}, expected at least 1")
+    jobs = min(jobs, len(config.names) * config.seeds)
+    with warnings.catch_warnings():
+        if jobs > 1:
+            run_jobs(config, out, jobs, on_bad_image=on_bad_image, say=say)
+            warnings.simplefilter("ignore", Note)  # the processes have told them
+        prepared = prepare(config)
+    prepared, left_out = without_unreadable(prepared, on_bad_image, quiet=quiet)
     carry_out(prepared, out, say=say, quiet=quiet)
-    adapters = adapter_costs_once(out) if config.kind == "ablate" else []
-    summary = summarise(prepared, out, adapters)
-    summary.notes.extend(left_out)
-    write_tables(summary, out)
-    write_page(summary, out)
+    with next_writer(out):
+        # Table 3 belongs to the paper's rows, and takes a minute.
+        papers = config.kind == "ablate" and not config.rows
+        adapters = adapter_costs_once(out) if papers else []
+        summary = summarise(prepared, out, adapters)
+        summary.notes.extend(left_out)
+        write_tables(summary, out)
+        write_page(summary, out)
     if page is not None:
         put_in_page(pathlib.Path(page), place, markdown(summary))
     return summary

@@ -9,6 +9,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison import tables
+from crisalad_jax.experiments.comparison.paired import Difference
 from crisalad_jax.experiments.comparison.summary import KS, Recall, Summary
 from crisalad_jax.experiments.report.embedding import Drawing, drawing
 from crisalad_jax.experiments.report.page import ESCAPED, PAGE, render
@@ -31,6 +32,8 @@ class _Cell(NamedTuple):
     text: str
     note: str = ""
     best: bool = False
+    kind: str = ""
+    """Class of a cell of differences: right or wrong."""
 
 
 def write_page(summary: Summary, out: pathlib.Path) -> pathlib.Path:
@@ -57,6 +60,14 @@ def write_page(summary: Summary, out: pathlib.Path) -> pathlib.Path:
         "ks": KS,
         "rows": rows,
         "charts": charts,
+        "reference": tables.title_of_reference(summary),
+        "differences": [
+            (
+                tables.title_of(row, summary.rows),
+                [_difference(d) for by_k in found.values() for d in by_k],
+            )
+            for row, found in tables.compared_rows(summary)
+        ],
         "cost_headers": tables.COSTS,
         "costs": costs,
         "adapter_headers": tables.ADAPTERS,
@@ -86,6 +97,13 @@ def _cell(recall: Recall, *, best: bool) -> _Cell:
     spread = "" if recall.spread is None else f"± {percent(recall.spread)}\n"
     interval = tables.interval_words(recall).replace("-", "\N{EN DASH}")
     return _Cell(percent(recall.mean), spread + interval, best)
+
+
+def _difference(difference: Difference) -> _Cell:
+    low, high = map(tables.points, difference.interval)
+    kind = {"better": "right", "worse": "wrong"}.get(difference.verdict, "")
+    note = f"{low} to {high}\n{difference.verdict}"
+    return _Cell(tables.points(difference.mean), note, kind=kind)
 
 
 def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawing:

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -14,6 +14,7 @@ from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.experiments.comparison.ablation import (
@@ -30,6 +31,7 @@ from crisalad_jax.experiments.comparison.methods import (
     method_of,
     method_training,
 )
+from crisalad_jax.experiments.comparison.rows import AblationRow, as_row
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
@@ -78,10 +80,21 @@ class ComparisonConfig:
     """Number of first retrievals that methods with a second stage re-rank."""
     seeds: int = 3
     """Number of runs of each method, with seeds from 0."""
+    rows: tuple[AblationRow | str | tuple[str, Mapping[str, Any]], ...] = ()
+    """Rows of one's own, of an ablation: text as `parse_row` reads it, or (name, changes), where
+    changes are values by the flags of `train`. Those that `names` lacks follow after it."""
+    reference: str | None = None
+    """Name that differences, speeds and training times are relative to; None is crisalad, or the
+    first where that is not compared."""
 
     def __post_init__(self) -> None:
         """Check the types, the ranges and the names."""
+        rows = tuple(map(as_row, self.rows))
+        object.__setattr__(self, "rows", rows)
+        own = [row.name for row in rows if row.name not in self.names]
+        object.__setattr__(self, "names", (*self.names, *own))
         check_types(self)
+        self._check_rows(rows)
         check_grouping((), self.batch_size, 0, self.seeds)
         parse_groupings(self.grouping.split(","))
         what = "--methods" if self.kind == "compare" else "--rows"
@@ -89,7 +102,7 @@ class ComparisonConfig:
             if self.kind == "compare":
                 if name not in self.models:
                     method_of(name, self.preset)
-            elif name not in ABLATIONS:
+            elif name not in ABLATIONS and self.row(name) is None:
                 find_row(name, self.preset)
         folders = [file_name(name) for name in self.names]
         for flag, values, files in ((what, self.names, folders), ("--test", self.test, self.test)):
@@ -101,6 +114,29 @@ class ComparisonConfig:
         for flag, value, least in (("--epochs", self.epochs, 1), ("--rerank", self.rerank, 2)):
             if value is not None and value < least:
                 raise InputError(f"{flag}: found {value}, expected at least {least}")
+
+        if self.reference is not None and self.reference not in self.names:
+            raise InputError(
+                f"--reference: found {self.reference}, expected one of those compared, "
+                f"{', '.join(self.names)}"
+            )
+
+    def _check_rows(self, rows: tuple[AblationRow, ...]) -> None:
+        """Check rows of one's own, with the parts and flags that they name."""
+        if rows and self.kind != "ablate":
+            raise InputError("--row: found rows beside methods, expected them in an ablation alone")
+        names = [row.name for row in rows]
+        for row in rows:
+            if row.name in ABLATIONS or names.count(row.name) > 1:
+                raise InputError(
+                    f"--row: found the name {row.name} twice, or as one of the paper's rows, "
+                    "expected another"
+                )
+            row.training(self.preset, from_nothing=self.backbone is None)
+
+    def row(self, name: str) -> AblationRow | None:
+        """Return the row of one's own with a name; None where there is none."""
+        return next((row for row in map(as_row, self.rows) if row.name == name), None)
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -158,6 +194,8 @@ class Variant:
     """File of the model, if it comes from one."""
     model: ModelConfig
     """Configuration of the model in `weights`, or of the one that `training` makes."""
+    row: AblationRow | None = None
+    """What it changes, if it is a row of one's own."""
     places: Places | None = None
     """Training set, if it is trained here; it includes small places if its loss regroups the
     images."""
@@ -188,6 +226,29 @@ class Prepared(NamedTuple):
         return [(v, seed) for v in self.variants for seed in v.seeds(self.config.seeds)]
 
 
+def without_unreadable(
+    prepared: Prepared, on_bad_image: OnBadImage, *, quiet: bool
+) -> tuple[Prepared, list[str]]:
+    """Leave unreadable images out of the sets where `on_bad_image` is "skip".
+
+    Returns:
+        The comparison, whose training masks them out; and a line for each set that lost some.
+    """
+    if on_bad_image == "stop":
+        return prepared, []
+    lines = []
+    readable = [leave_out_unreadable(each, quiet=quiet) for each in prepared.benchmarks]
+    for before, after in zip(prepared.benchmarks, readable, strict=True):
+        queries = len(before.queries) - len(after.queries)
+        database = len(before.database) - len(after.database)
+        if queries or database:
+            lines.append(
+                f"{before.name}: unreadable and left out: {queries} queries and {database} "
+                "database images."
+            )
+    return prepared._replace(benchmarks=readable, on_bad_image=on_bad_image), lines
+
+
 def prepare(config: ComparisonConfig) -> Prepared:
     """Read the sets and make and check all configurations, weights from files included.
 
@@ -216,11 +277,12 @@ def prepare(config: ComparisonConfig) -> Prepared:
     for draft in drafts:
         training = draft.training
         if places is not None and draft.run not in weights:
-            training = _fitted(training, config, len(places.place_id), views)
+            training = _fitted_row(draft, config, places, views)
             own, per_epoch = _own_training_set(draft, training, config, places)
             steps = per_epoch * training.epochs
             optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
-            if config.backbone is not None:  # from nothing `_fitted` has shortened it
+            # From nothing `_fitted` has shortened it.
+            if config.backbone is not None and not _sets_warmup(draft.row):
                 training = dataclasses.replace(training, optimiser=optimiser)
             before, after = (
                 warmup_length(each.optimiser, per_epoch) for each in (draft.training, training)
@@ -251,7 +313,11 @@ def _own_training_set(
 ) -> tuple[Places, int]:
     """Choose a variant's training set, and count the steps of an epoch, which has some."""
     assert config.train is not None
-    if training.min_images_of_place < training.min_images:
+    if draft.row is not None:
+        places = read_places(
+            config.train, cities=training.cities, min_images=training.min_images_of_place
+        )
+    elif training.min_images_of_place < training.min_images:
         places = read_places(config.train, min_images=training.min_images_of_place)
     try:
         steps = steps_per_epoch(training, groups_of(training, places))
@@ -269,7 +335,7 @@ def _drafts(config: ComparisonConfig, weights: Mapping[str, pathlib.Path]) -> It
             training = TrainConfig(model=model, trainable="head")
             yield Variant(name, (name,), name, training, True, None, weights[name], model)
             continue
-        rerank = None
+        rerank, row = None, config.row(name)
         if config.kind == "compare":
             method = method_of(name, config.preset)
             training = method_training(method.recipe, config.preset, from_nothing=from_nothing)
@@ -277,15 +343,29 @@ def _drafts(config: ComparisonConfig, weights: Mapping[str, pathlib.Path]) -> It
             if method.rerank is not None:
                 rerank = f"{method.rerank}:{config.rerank}"
         else:
-            training = row_training(name, config.preset, from_nothing=from_nothing)
-            labels, run = (name, *row_labels(training)), name
+            if row is None:
+                training = row_training(name, config.preset, from_nothing=from_nothing)
+            else:
+                training = row.training(config.preset, from_nothing=from_nothing)
+            described = row_labels(training)
+            if config.rows:
+                described = (row.words if row is not None else _changed_words(described, config),)
+            labels, run = (name, *(words or "-" for words in described)), name
         if config.image_size is not None or config.resize:
             way = training.model.preprocessing.changed_by(config.resize)
             size = config.image_size or training.model.image_size
             model = dataclasses.replace(training.model, image_size=size, preprocessing=way)
             training = dataclasses.replace(training, model=model)
         learns = training.model.aggregator.learns
-        yield Variant(name, labels, run, training, learns, rerank, None, training.model)
+        yield Variant(name, labels, run, training, learns, rerank, None, training.model, row)
+
+
+def _changed_words(labels: tuple[str, ...], config: ComparisonConfig) -> str:
+    """Say in words in what a row of the paper differs from its first."""
+    from_nothing = config.backbone is None
+    base = row_labels(row_training("crisalad", config.preset, from_nothing=from_nothing))
+    described = zip(ROW_HEADERS[1:], labels, base, strict=True)
+    return ", ".join(f"{header} {label}" for header, label, was in described if label != was)
 
 
 def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
@@ -342,15 +422,47 @@ def _places(config: ComparisonConfig) -> tuple[Places, int]:
     return places, views
 
 
+def _fitted_row(
+    draft: Variant, config: ComparisonConfig, places: Places, views: int
+) -> TrainConfig:
+    """Fit a variant's recipe to a training set; what a row of one's own sets stays as it is."""
+    training, row, count = draft.training, draft.row, len(places.place_id)
+    if row is None:
+        return _fitted(training, config, count, views, config.epochs)
+    epochs = training.epochs if "epochs" in row.flags else config.epochs
+    if "images-per-place" in row.flags:
+        views = training.images_per_place
+    if "cities" in row.flags:
+        assert config.train is not None
+        own = read_places(config.train, cities=training.cities, min_images=views)
+        count = len(own.place_id)
+    # Twice: what is fitted depends on what is set, and must not replace it.
+    fitted = row.changed(_fitted(training, config, count, views, epochs), config.preset)
+    if config.backbone is None and not _sets_warmup(row):
+        steps = count // fitted.places_per_batch
+        optimiser = dataclasses.replace(
+            fitted.optimiser,
+            warmup_steps=training.optimiser.warmup_steps,
+            warmup_epochs=training.optimiser.warmup_epochs,
+        )
+        optimiser = with_short_warmup(optimiser, steps * fitted.epochs, steps)
+        fitted = dataclasses.replace(fitted, optimiser=optimiser)
+    return fitted
+
+
+def _sets_warmup(row: AblationRow | None) -> bool:
+    return row is not None and any(flag.startswith("optimiser.warmup-") for flag in row.flags)
+
+
 def _fitted(
-    training: TrainConfig, config: ComparisonConfig, places: int, views: int
+    training: TrainConfig, config: ComparisonConfig, places: int, views: int, epochs: int | None
 ) -> TrainConfig:
     """Fit a recipe to a training set of so many places, so that it can fill its batches.
 
     From random weights all methods have the same number of images in a batch, and of steps.
     """
-    if config.epochs is not None:
-        training = dataclasses.replace(training, epochs=config.epochs)
+    if epochs is not None:
+        training = dataclasses.replace(training, epochs=epochs)
     training = dataclasses.replace(training, patience=None)
     if config.backbone is not None:
         training = dataclasses.replace(
@@ -363,7 +475,7 @@ def _fitted(
             return _of_views(training, training.images_per_place, views)
         return training
     size = min(training.places_per_batch * training.images_per_place // views, places)
-    epochs = config.epochs or EPOCHS
+    epochs = epochs or EPOCHS
     return dataclasses.replace(
         training,
         loss=_own_places(training.loss),
@@ -421,11 +533,11 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "-", name)
 
 
-def labels_of(kind: str) -> tuple[str, ...]:
+def labels_of(config: ComparisonConfig) -> tuple[str, ...]:
     """Return the headers above `Variant.labels`."""
-    if kind == "compare":
+    if config.kind == "compare":
         return ("method",)
-    return ROW_HEADERS
+    return (ROW_HEADERS[0], "changed") if config.rows else ROW_HEADERS
 
 
 def short_names(benchmarks: list[Benchmark]) -> list[str]:

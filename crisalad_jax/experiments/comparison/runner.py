@@ -1,13 +1,14 @@
 """The work of a comparison: runs, evaluations and timing, each done once, results in its folder.
 
-OUT/config.json                       what is compared
+OUT/config.json                       what was ever compared here (see `ledger`)
 OUT/NAME/seed-S/run/                  a training run, which can be resumed
 OUT/NAME/seed-S/start.safetensors     what it starts from, where a vocabulary was built
 OUT/NAME/seed-S/training.json         the time that training took
-OUT/NAME/seed-S/test-N.json           an evaluation, on the N-th set
+OUT/NAME/seed-S/test-N.json           an evaluation, on the N-th set of config.json
 OUT/speed.json                        the timing of all models
 """
 
+import contextlib
 import dataclasses
 import functools
 import pathlib
@@ -21,14 +22,12 @@ import numpy as np
 
 from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
-from crisalad_jax.config.io import differences, read_config, to_plain
-from crisalad_jax.config.parts import parts_of
-from crisalad_jax.config.source import source_digest
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import right_retrievals
 from crisalad_jax.evaluation.results import GroupingResult
+from crisalad_jax.experiments.comparison.ledger import claim, numbers_of
 from crisalad_jax.experiments.comparison.plan import (
     ComparisonConfig,
     Prepared,
@@ -44,77 +43,29 @@ from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
-from crisalad_jax.training.run_files import checksum_of_benchmark, checksum_of_places
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
-from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, read_json, write_json
-from crisalad_jax.utils.locks import one_writer
-from crisalad_jax.utils.temporaries import holds_other_files
+from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.locks import (
+    POLL,
+    BusyFolderError,
+    holder_of,
+    is_here,
+    next_writer,
+    one_writer,
+)
+from crisalad_jax.utils.temporaries import LOCK
 
 _ROUNDS = 5
 
 Say = Callable[[str], None]
 
 
-def claim(out: pathlib.Path, prepared: Prepared) -> None:
-    """Make `out` the folder of this comparison, or check that it is.
-
-    Raises:
-        InputError: it holds another comparison, or files but none; or the content behind a name has
-            changed since the comparison began: weights, a backbone, a set, a plug-in's part.
-    """
-    config, path = prepared.config, out / "config.json"
-    check_target(path)
-    if path.exists():
-        existing = read_config(ComparisonConfig, path)
-        wrong = differences(config, existing)
-        if wrong:
-            raise InputError(
-                f"{out}: holds another comparison: {'; '.join(wrong)}; give the same to go on with "
-                "it, or another folder"
-            )
-    elif out.exists() and holds_other_files(out):
-        raise InputError(
-            f"{out}: found files but no comparison, expected one or a new or empty folder"
-        )
-    else:
-        write_json(path, to_plain(config))
-    behind, path = _behind(prepared), out / "behind.json"
-    if path.exists():
-        there = read_result(path)
-        changed = [name for name, digest in there.items() if behind.get(name) != digest]
-        if changed:
-            raise InputError(
-                f"{out}: {', '.join(changed)}: found changed since this comparison began, expected "
-                "the same, or another folder"
-            )
-    else:
-        write_json(path, behind)
-
-
-def _behind(prepared: Prepared) -> dict[str, str]:
-    """Compute digests of what the configuration only names: files, sets' image names, plug-ins."""
-    files = {str(v.weights) for v in prepared.variants if v.weights is not None}
-    if prepared.config.backbone is not None:
-        files.add(prepared.config.backbone)
-    digests = {name: sha256_of(name) for name in sorted(files)}
-    if prepared.places is not None:
-        digests[str(prepared.config.train)] = str(checksum_of_places(prepared.places))
-    for name, benchmark in zip(prepared.config.test, prepared.benchmarks, strict=True):
-        digests[name] = str(checksum_of_benchmark(benchmark))
-    for variant in prepared.variants:
-        for part in map(type, parts_of(variant.training).values()):
-            digest = source_digest(part)
-            if digest is not None and not part.__module__.startswith("crisalad_jax."):
-                digests[f"{part.registry.kind} {part.part_name}"] = digest
-    return digests
-
-
 def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = False) -> None:
     """Do what is left of a comparison, and write its results into `out`.
 
-    Results of earlier calls are reused, also of one that was killed.
+    Results of earlier calls are reused, also of one that was killed. Other processes may do the
+    same for this folder, on other hosts too: each takes runs that no other one is at.
 
     Args:
         prepared: the comparison.
@@ -124,32 +75,82 @@ def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = 
         quiet: no progress bars.
 
     Raises:
-        InputError: what `claim`, `fit` and `evaluate` raise; a result that is not whole, or of
-            another set than is given now; or another process writes there.
+        InputError: what `claim`, `fit` and `evaluate` raise; or a result that is not whole, or of
+            another set than is given now.
         Stopped: what `fit` raises; the same call resumes.
     """
-    with one_writer(out):
-        _carry_out(prepared, out, say, quiet)
-
-
-def _carry_out(prepared: Prepared, out: pathlib.Path, say: Say, quiet: bool) -> None:
-    claim(out, prepared)
+    with next_writer(out):
+        claim(out, prepared)
     say(_start_words(prepared))
-    left = [unit for unit in prepared.units if not _is_done(prepared, out, *unit)]
-    total, started = len(prepared.units), time.monotonic()
-    for number, (variant, seed) in enumerate(left):
-        line = (
-            f"{variant.name}, seed {seed}: method {_place(prepared, variant)} of "
-            f"{len(prepared.variants)}, {total - len(left) + number} of {total} runs done"
-        )
-        if number:
-            rest = (time.monotonic() - started) / number * (len(left) - number)
-            line += f", about {_words(rest)} left"
-        say(line)
-        _one(prepared, out, variant, seed, quiet)
-    if not (out / "speed.json").exists():
-        say("images described a second, all models in turns")
-        write_json(out / "speed.json", _race(prepared, out, quiet))
+    take_runs(prepared, out, say=say, quiet=quiet)
+    with next_writer(out):
+        if not _is_timed(prepared, out):
+            say("images described a second, all models in turns")
+            write_json(out / "speed.json", _race(prepared, out, quiet))
+
+
+def take_runs(
+    prepared: Prepared,
+    out: pathlib.Path,
+    *,
+    say: Say,
+    quiet: bool = False,
+    jobs: int = 1,
+    beside: bool = False,
+) -> None:
+    """Take runs that no other process is at, until all are done, by whomever.
+
+    Args:
+        prepared: the comparison, whose folder was claimed.
+        out: the folder.
+        say: is given a line before each run.
+        quiet: no progress bars.
+        jobs: number of processes that share the runs, for the time that is left.
+        beside: whether others share this process's device.
+
+    Raises:
+        InputError: what `fit` and `evaluate` raise.
+        Stopped: what `fit` raises; the same call resumes.
+    """
+    numbers = numbers_of(out, prepared.config)
+    started, made, waits = time.monotonic(), 0, False
+    while left := [unit for unit in prepared.units if not _is_done(out, numbers, *unit)]:
+        before = made
+        for variant, seed in left:
+            with contextlib.ExitStack() as stack:
+                try:
+                    stack.enter_context(one_writer(folder_of(out, variant.run, seed)))
+                except BusyFolderError:
+                    continue
+                if _is_done(out, numbers, variant, seed):  # by another process, a moment ago
+                    continue
+                seconds = (time.monotonic() - started) / made / jobs if made else None
+                say(_run_words(prepared, out, numbers, variant, seed, seconds))
+                _one(prepared, out, numbers, variant, seed, quiet, beside)
+                made += 1
+        if made == before:
+            if not waits:
+                say("waiting for the runs of other processes")
+            waits = True
+            time.sleep(POLL)
+
+
+def _run_words(
+    prepared: Prepared,
+    out: pathlib.Path,
+    numbers: list[int],
+    variant: Variant,
+    seed: int,
+    seconds: float | None,
+) -> str:
+    """Say which run begins, of how many, and how long the rest takes if a run takes so long."""
+    total = len(prepared.units)
+    done = sum(_is_done(out, numbers, *unit) for unit in prepared.units)
+    line = (
+        f"{variant.name}, seed {seed}: method {_place(prepared, variant)} of "
+        f"{len(prepared.variants)}, {done} of {total} runs done"
+    )
+    return line if seconds is None else f"{line}, about {_words(seconds * (total - done))} left"
 
 
 def _start_words(prepared: Prepared) -> str:
@@ -179,16 +180,34 @@ def result_path(out: pathlib.Path, variant: Variant, seed: int, number: int) -> 
     return folder_of(out, variant.name, seed) / f"test-{number}.json"
 
 
-def _is_done(prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int) -> bool:
-    results = [result_path(out, variant, seed, n) for n in range(len(prepared.benchmarks))]
+def _is_done(out: pathlib.Path, numbers: list[int], variant: Variant, seed: int) -> bool:
+    results = [result_path(out, variant, seed, number) for number in numbers]
     trained = folder_of(out, variant.run, seed) / "training.json"
     return all(path.exists() for path in results) and (not variant.trains or trained.exists())
 
 
-def _one(prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int, quiet: bool) -> None:
+def _is_timed(prepared: Prepared, out: pathlib.Path) -> bool:
+    """Return whether all models were timed in one race, as their ratios need."""
+    path = out / "speed.json"
+    if not path.exists():
+        return False
+    return {variant.run for variant in prepared.variants} <= read_result(path, rounds=dict)[
+        "rounds"
+    ].keys()
+
+
+def _one(
+    prepared: Prepared,
+    out: pathlib.Path,
+    numbers: list[int],
+    variant: Variant,
+    seed: int,
+    quiet: bool,
+    beside: bool,
+) -> None:
     """Train a variant for one seed and evaluate it, as far as results are missing."""
-    params = _model(prepared, out, variant, seed, quiet)
-    for number, benchmark in enumerate(prepared.benchmarks):
+    params = _model(prepared, out, variant, seed, quiet, beside)
+    for number, benchmark in zip(numbers, prepared.benchmarks, strict=True):
         path = result_path(out, variant, seed, number)
         if not path.exists():
             write_json(path, _evaluated(prepared.config, variant, params, benchmark, seed))
@@ -232,7 +251,12 @@ def _ranks(result: GroupingResult, benchmark: Benchmark) -> list[int]:
 
 
 def _model(
-    prepared: Prepared, out: pathlib.Path, variant: Variant, seed: int, quiet: bool
+    prepared: Prepared,
+    out: pathlib.Path,
+    variant: Variant,
+    seed: int,
+    quiet: bool,
+    beside: bool = False,
 ) -> Crisalad:
     """Load a variant's parameters from a file, or make or train them."""
     if variant.weights is not None:
@@ -247,6 +271,7 @@ def _model(
     training = dataclasses.replace(variant.training, seed=seed)
     assert variant.places is not None
     _count_sitting(folder)
+    beside = beside or _has_neighbours(out)
     result = fit(
         training,
         variant.places,
@@ -255,8 +280,17 @@ def _model(
         on_bad_image=prepared.on_bad_image,
         quiet=quiet,
     )
-    write_json(trained, _training_record(folder, training, result.steps))
+    beside = beside or _has_neighbours(out)
+    write_json(trained, _training_record(folder, training, result.steps) | {"beside": beside})
     return result.params
+
+
+def _has_neighbours(out: pathlib.Path) -> bool:
+    """Return whether other processes of this host are at runs, and share its CPU with this one."""
+    if is_absolute():
+        return False
+    holders = (holder_of(path.parent) for path in out.glob(f"*/seed-*/{LOCK}"))
+    return any(holder is not None and is_here(holder) for holder in holders)
 
 
 def _start(

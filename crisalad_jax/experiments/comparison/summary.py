@@ -12,6 +12,8 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY
 from crisalad_jax.experiments.comparison.ablation import NOTES, AdapterCost
+from crisalad_jax.experiments.comparison.ledger import numbers_of
+from crisalad_jax.experiments.comparison.paired import RESAMPLES, Difference, paired_difference
 from crisalad_jax.experiments.comparison.plan import Prepared, Variant, labels_of, short_names
 from crisalad_jax.experiments.comparison.records import advised, read_result
 from crisalad_jax.experiments.comparison.runner import folder_of, read_race, result_path
@@ -58,6 +60,11 @@ class Row(NamedTuple):
     """Mean over the seeds of the steps times a step's median seconds."""
     sittings: int
     """Largest number of calls that a run took; more than one if it was resumed."""
+    differences: Mapping[str, Mapping[int, Difference]] | None = None
+    """Differences to the reference by set, then by K; None of the reference itself."""
+    beside: bool = False
+    """Whether a run, or the reference's, shared its device with another one: its training time
+    tells nothing, and is None."""
 
 
 class Summary(NamedTuple):
@@ -85,8 +92,8 @@ def summarise(
     """
     sets = dict(zip(short_names(prepared.benchmarks), prepared.benchmarks, strict=True))
     raced, measured = read_race(out, {variant.run for variant in prepared.variants})
-    names = [variant.name for variant in prepared.variants]
-    reference = prepared.variants["crisalad" in names and names.index("crisalad")]
+    reference = _reference(prepared)
+    ranks = {v.name: _ranks(prepared, out, v, sets) for v in prepared.variants}
     records = {v.name: _training_records(prepared, out, v) for v in prepared.variants}
     seconds = {name: _seconds(trainings) for name, trainings in records.items()}
     rows = []
@@ -94,7 +101,11 @@ def summarise(
         parameters, trained = _parameters(variant)
         batch = statistics.median(raced.rounds[variant.run])
         took, theirs = seconds[variant.name], seconds[reference.name]
-        for grouping, recalls in _recalls(prepared, out, variant, sets).items():
+        beside = any(r.get("beside") for n in (variant, reference) for r in records[n.name])
+        if beside:
+            took = theirs = None
+        for grouping, of_sets in ranks[variant.name].items():
+            recalls = {name: {k: recall_of(each, k) for k in KS} for name, each in of_sets.items()}
             rows.append(
                 Row(
                     variant.name,
@@ -109,11 +120,19 @@ def summarise(
                     None if took is None or theirs is None else took / theirs,
                     took,
                     max((record["sittings"] for record in records[variant.name]), default=0),
+                    None
+                    if variant is reference
+                    else _differences(
+                        of_sets,
+                        _under(ranks[reference.name], grouping),
+                        same_runs=variant.run == reference.run,
+                    ),
+                    beside,
                 )
             )
     return Summary(
         prepared.config.kind,
-        labels_of(prepared.config.kind),
+        labels_of(prepared.config),
         reference.name,
         sets,
         rows,
@@ -162,12 +181,20 @@ def _parameters(variant: Variant) -> tuple[int, int | None]:
     return total, count_trainable(variant.model, variant.training.trainable)
 
 
-def _recalls(
+def _reference(prepared: Prepared) -> Variant:
+    """Choose the variant that the others are compared with."""
+    variants = {variant.name: variant for variant in prepared.variants}
+    name = prepared.config.reference or "crisalad"
+    return variants.get(name, prepared.variants[0])
+
+
+def _ranks(
     prepared: Prepared, out: pathlib.Path, variant: Variant, sets: Mapping[str, Benchmark]
-) -> dict[str, dict[str, dict[int, Recall]]]:
-    """Read a variant's recalls by grouping, set and K."""
-    by_grouping: dict[str, dict[str, dict[int, Recall]]] = {}
-    for number, (name, benchmark) in enumerate(sets.items()):
+) -> dict[str, dict[str, np.ndarray]]:
+    """Read a variant's (seed, query) ranks of first right retrievals, by grouping and set."""
+    by_grouping: dict[str, dict[str, np.ndarray]] = {}
+    numbers = numbers_of(out, prepared.config)
+    for number, (name, benchmark) in zip(numbers, sets.items(), strict=True):
         paths = [
             result_path(out, variant, seed, number) for seed in variant.seeds(prepared.config.seeds)
         ]
@@ -180,9 +207,26 @@ def _recalls(
                 )
         for grouping in results[0]:
             ranks = np.array([result[grouping] for result in results])
-            recalls = {k: recall_of(ranks, k) for k in KS}
-            by_grouping.setdefault(grouping, {})[name] = recalls
+            by_grouping.setdefault(grouping, {})[name] = ranks
     return by_grouping
+
+
+def _under(groupings: Mapping[str, dict[str, np.ndarray]], grouping: str) -> dict[str, np.ndarray]:
+    """Return the reference's ranks under a grouping, or under its first where it lacks that."""
+    return groupings.get(grouping, next(iter(groupings.values())))
+
+
+def _differences(
+    ranks: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray], *, same_runs: bool
+) -> dict[str, dict[int, Difference]]:
+    """Compute differences by set and K."""
+    return {
+        name: {
+            k: paired_difference(hits_of(each, k), hits_of(reference[name], k), same_runs=same_runs)
+            for k in KS
+        }
+        for name, each in ranks.items()
+    }
 
 
 def _checked(path: pathlib.Path, benchmark: Benchmark) -> dict[str, list[int]]:
@@ -207,9 +251,14 @@ def _checked(path: pathlib.Path, benchmark: Benchmark) -> dict[str, list[int]]:
     return result["groupings"]
 
 
+def hits_of(ranks: np.ndarray, k: int) -> np.ndarray:
+    """Return which ranks are among the first `k`; 0 is none."""
+    return (ranks > 0) & (ranks <= k)
+
+
 def recall_of(ranks: np.ndarray, k: int) -> Recall:
     """Compute Recall@K of (seed, query) ranks of the first right retrieval, from 1; 0 is none."""
-    hits = (ranks > 0) & (ranks <= k)
+    hits = hits_of(ranks, k)
     by_seed = tuple(hits.mean(axis=1).tolist())
     return Recall(
         statistics.fmean(by_seed),
@@ -232,8 +281,10 @@ def _notes(
     )
     if all(variant.weights is not None for variant in prepared.variants):
         recalls = f"Recalls in percent of all queries, and {interval}. All models are from files."
-    notes = [
-        recalls,
+    notes = [recalls]
+    if len(prepared.variants) > 1:
+        notes.append(_difference_note(prepared, title))
+    notes += [
         f"Images/s: describing batches of {measured['batch_size']} of the first set's images, "
         f"each alone, all models in turns, on {measured['device']}"
         + ("." if measured["absolute"] else f", over {title}'s.")
@@ -246,6 +297,12 @@ def _notes(
             + ", without compiling; runs are not interleaved."
         )
         notes.append(_training_note(prepared))
+    beside = sorted({row.labels[0] for row in rows if row.beside})
+    if beside:
+        notes.append(
+            f"Trained beside others on one device, so that no training time is told: "
+            f"{', '.join(beside)}."
+        )
     resumed = sorted({row.labels[0] for row in rows if row.sittings > 1})
     if resumed:
         notes.append(
@@ -258,13 +315,24 @@ def _notes(
         )
     if config.kind == "compare":
         notes += _method_notes(prepared)
-    elif config.backbone is None:
+    elif config.backbone is None and not config.rows:
         notes.append(
             "From nothing the learning rates are the recipe scratch's in the paper's proportion, "
             "6e-5 to 1e-4, and the step schedule is the paper's, after the warm-up: halved every "
             "three epochs."
         )
     return notes
+
+
+def _difference_note(prepared: Prepared, title: str) -> str:
+    """Say how the differences are computed, and what their words mean."""
+    seeds = "" if prepared.config.seeds > 1 else " One seed says nothing of another start."
+    return (
+        f"Δ: recall less {title}'s on the same queries, in points, with 95 % by bootstrap over "
+        f"queries (drawn together for both) and seeds (drawn for each): {RESAMPLES:,} resamples, "
+        "seed 0, percentiles. Better or worse: the interval excludes 0; else the two are not told "
+        f"apart.{seeds}"
+    )
 
 
 def _training_note(prepared: Prepared) -> str:

@@ -11,12 +11,15 @@ from rich.text import Text
 
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.ablation import AdapterCost
+from crisalad_jax.experiments.comparison.paired import Difference
 from crisalad_jax.experiments.comparison.summary import KS, Recall, Row, Summary
 from crisalad_jax.experiments.report.page import ESCAPED
 from crisalad_jax.experiments.report.tables import no_formula
 from crisalad_jax.utils.files import around, atomic_path, write_json
 
 NOTHING = "-"
+BESIDE = "beside others"
+"""In place of the training time of a run that had no device of its own."""
 
 
 def title_of(row: Row, rows: Sequence[Row]) -> str:
@@ -36,12 +39,24 @@ def interval_words(recall: Recall) -> str:
     return f"{percent(recall.interval.low)}-{percent(recall.interval.high)}"
 
 
+def difference_words(difference: Difference) -> str:
+    """Format a difference in points, its interval and what that decides."""
+    low, high = map(points, difference.interval)
+    return f"{points(difference.mean)} ({low} to {high}), {difference.verdict}"
+
+
+def points(fraction: float) -> str:
+    """Format a difference in percentage points, with its sign."""
+    # Adding 0 makes a rounded -0.0 positive.
+    return f"{round(100 * fraction, 1) + 0:+.1f}"
+
+
 def costs_of(row: Row) -> list[str]:
     """Format a row's costs, in the columns of `COSTS`."""
     speed = f"{row.speed:.2f} x"
     if row.images_per_second is not None:
         speed = f"{row.images_per_second:.0f}"
-    training = NOTHING
+    training = BESIDE if row.beside else NOTHING
     if row.training_seconds is not None and row.images_per_second is not None:
         training = f"{row.training_seconds / 60:.1f} min"
     elif row.training is not None:
@@ -67,6 +82,33 @@ def recall_table(summary: Summary) -> Table:
             lines = (f"{mean_words(r)}  {interval_words(r):>10}" for r in recalls.values())
             cells.append("\n".join(lines))
         table.add_row(*map(Text, cells))
+    return table
+
+
+def compared_rows(summary: Summary) -> list[tuple[Row, dict[str, Sequence[Difference]]]]:
+    """Return the rows that have differences, with those of each set by K."""
+    return [
+        (row, {name: list(by_k.values()) for name, by_k in row.differences.items()})
+        for row in summary.rows
+        if row.differences is not None
+    ]
+
+
+def title_of_reference(summary: Summary) -> str:
+    """Return the label of the row that the others are compared with."""
+    return next(row.labels[0] for row in summary.rows if row.name == summary.reference)
+
+
+def difference_table(summary: Summary) -> Table:
+    """Make the terminal's table of differences to the reference."""
+    table = Table(f"{summary.headers[0]}, less {title_of_reference(summary)}", show_lines=True)
+    table.add_column("R@", justify="right")
+    for name in summary.sets:
+        table.add_column(f"{name}\nΔ (95 %)", no_wrap=True)
+    for row, differences in compared_rows(summary):
+        lines = ("\n".join(map(difference_words, each)) for each in differences.values())
+        ks = "\n".join(map(str, KS))
+        table.add_row(*map(Text, [title_of(row, summary.rows), ks, *lines]))
     return table
 
 
@@ -127,6 +169,8 @@ def adapter_table(costs: Sequence[AdapterCost]) -> Table:
 def terminal_tables(summary: Summary) -> list[Table]:
     """Make all tables of a comparison for the terminal."""
     tables = [recall_table(summary), cost_table(summary)]
+    if compared_rows(summary):
+        tables.insert(1, difference_table(summary))
     return [*tables, adapter_table(summary.adapters)] if summary.adapters else tables
 
 
@@ -142,6 +186,15 @@ def markdown(summary: Summary) -> str:
         title = title_of(row, summary.rows)
         rows.append([title, *row.labels[1:], costs[0], *cells, *costs[1:]])
     text = _markdown(header, rows, labels=len(summary.headers))
+    if compared := compared_rows(summary):
+        header = [f"{summary.headers[0]}, less {title_of_reference(summary)}"]
+        header += [f"{name} Δ R@{k}" for name in summary.sets for k in KS]
+        rows = [
+            [title_of(row, summary.rows)]
+            + [difference_words(each) for by_k in differences.values() for each in by_k]
+            for row, differences in compared
+        ]
+        text += "\n" + _markdown(header, rows, labels=1)
     if summary.adapters:
         text += "\n" + _markdown(ADAPTERS, list(map(adapter_cells, summary.adapters)), labels=1)
     return text + "".join(f"\n{note}\n" for note in summary.notes)
@@ -156,7 +209,7 @@ def _markdown(header: Sequence[str], rows: list[list[str]], *, labels: int) -> s
 _COLUMNS = (
     *("name", "grouping", "set", "k", "recall", "standard_deviation", "low", "high", "seeds"),
     *("dimension", "speed", "images_per_second", "parameters", "trained", "training"),
-    "training_seconds",
+    *("training_seconds", "difference", "difference_low", "difference_high", "verdict"),
 )
 
 
@@ -171,9 +224,14 @@ def comma_separated(summary: Summary) -> str:
         costs += (row.trained, row.training, _absolute(row))
         for name, recalls in row.recalls.items():
             for k, recall in recalls.items():
+                difference = None if row.differences is None else row.differences[name][k]
+                if difference is None:
+                    differs = (None,) * 4
+                else:
+                    differs = (difference.mean, *difference.interval, difference.verdict)
                 values = (recall.mean, recall.spread, *recall.interval, len(recall.by_seed))
                 texts = map(no_formula, (*row.labels, row.name, row.grouping, name))
-                writer.writerow([*texts, k, *values, *costs])
+                writer.writerow([*texts, k, *values, *costs, *differs])
     return text.getvalue()
 
 
@@ -193,7 +251,20 @@ def as_json(summary: Summary) -> dict[str, Any]:
                     for k, recall in recalls.items()
                 }
                 for name, recalls in row.recalls.items()
-            }
+            },
+            "differences": None
+            if row.differences is None
+            else {
+                name: {
+                    f"R@{k}": {
+                        "mean": each.mean,
+                        "interval": list(each.interval),
+                        "verdict": each.verdict,
+                    }
+                    for k, each in by_k.items()
+                }
+                for name, by_k in row.differences.items()
+            },
         }
         for row in summary.rows
     ]

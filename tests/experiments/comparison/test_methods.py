@@ -7,7 +7,7 @@ import pytest
 
 from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.data.augmentations import AUGMENTATIONS
-from crisalad_jax.experiments.comparison import METHODS, ComparisonConfig, compare, prepare, runner
+from crisalad_jax.experiments.comparison import METHODS, ComparisonConfig, compare, ledger, prepare
 from crisalad_jax.experiments.comparison.ablation import row_training
 from crisalad_jax.experiments.comparison.methods import method_of, method_training, training_with
 from crisalad_jax.experiments.comparison.plan import file_name
@@ -112,7 +112,7 @@ def test_a_plug_ins_part_from_training_to_the_table(settings, tmp_path, monkeypa
         monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
     exec(compile(PLUGIN, "plugin.py", "exec"), {"__name__": "plugin"})
     name, out, lines = "aggregator:average", tmp_path / "out", []
-    monkeypatch.setattr(runner, "source_digest", lambda part: "first")
+    monkeypatch.setattr(ledger, "source_digest", lambda part: "first")
     config = ComparisonConfig(**settings | {"names": (name,), "seeds": 1, "epochs": 1})
     summary = compare(config, out, say=lines.append, quiet=True)
     assert lines[0] == "1 to compare, tiny, what is trained starts from nothing"
@@ -121,6 +121,6 @@ def test_a_plug_ins_part_from_training_to_the_table(settings, tmp_path, monkeypa
     assert (out / "crisalad+aggregator-average" / "seed-0" / "run" / "last.safetensors").is_file()
     assert json.loads((out / "results.json").read_text())["rows"][0]["name"] == name
     assert (out / "index.html").is_file()
-    monkeypatch.setattr(runner, "source_digest", lambda part: "second")
+    monkeypatch.setattr(ledger, "source_digest", lambda part: "second")
     with pytest.raises(InputError, match="aggregator average: found changed since this compar"):
         compare(config, out, quiet=True)

@@ -1,8 +1,10 @@
 """Comparisons that are carried out, interrupted, and gone on with."""
 
+import contextlib
 import dataclasses
 import json
 import shutil
+import socket
 import statistics
 import types
 
@@ -26,6 +28,7 @@ from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.utils import locks, temporaries
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
 from tests.cli.test_cli import fails, succeeds
@@ -188,8 +191,8 @@ def test_a_result_of_another_set(finished, flags, capfd):
 
 
 def test_another_comparison_is_refused(finished, flags, capfd):
-    words = (finished, "holds another comparison: seeds: found 3, expected 2")
-    fails(capfd, *flags, "--seeds", 3, "--out", finished, words=words)
+    words = (finished, "holds another comparison: epochs: was 3, is 4; give the same to go on")
+    fails(capfd, *flags, "--epochs", 4, "--out", finished, words=words)
 
 
 def test_weights_that_change_behind_their_name_are_refused(
@@ -303,11 +306,102 @@ def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
 
     monkeypatch.setattr(runner, "evaluate", noted)
     monkeypatch.delattr(runner, "fit")
-    (finished / "config.json").unlink()
     config = ComparisonConfig(**settings | {"names": ("crisalad", "ranked"), "rerank": 5})
-    runner.write_json(finished / "config.json", runner.to_plain(config))
     summary = run(config, finished)
     assert seen == [(0, "parsed by-name:5"), (1, "parsed by-name:5")]
     first, second = summary.rows
     assert first.recalls == second.recalls
     assert (first.speed, second.speed, second.training) == (1, 1, 1)
+
+
+def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
+    finished, flags, shared, capfd, tmp_path, monkeypatch
+):
+    """In any order of the sets; a reordered command does nothing."""
+    village = tmp_path / "village"
+    shutil.copytree(shared / "town", village)
+    trained, evaluated = [], []
+    fit, evaluate_ = runner.fit, runner.evaluate
+    monkeypatch.setattr(
+        runner, "fit", lambda config, *a, **o: trained.append(config.seed) or fit(config, *a, **o)
+    )
+
+    def noted(params, model, benchmark, **options):
+        evaluated.append((benchmark.root.name, options["seed"]))
+        return evaluate_(params, model, benchmark, **options)
+
+    monkeypatch.setattr(runner, "evaluate", noted)
+    before = stamps(finished)
+    more = ("--test", village, shared / "town", "--seeds", 3)
+    succeeds(capfd, *flags, *more, "--out", finished)
+    assert trained == [2]
+    assert evaluated == [("village", 0), ("village", 1), ("village", 2), ("town", 2)]
+    after = stamps(finished)
+    changed = {str(path) for path in before if after[path] != before[path]}
+    assert changed == {"config.json", "behind.json", "results.json"}
+    succeeds(capfd, *flags, "--out", finished)  # a part of it, as at the beginning
+    succeeds(capfd, *flags, "--test", shared / "town", village, "--seeds", 3, "--out", finished)
+    assert (len(trained), len(evaluated)) == (1, 4)
+    assert stamps(finished).keys() == after.keys()
+    (row,) = json.loads((finished / "results.json").read_text())["rows"]
+    first, second = row["recalls"].values()
+    assert first == second
+    assert len(first["R@1"]["by_seed"]) == 3
+
+
+def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
+    """It holds seed 0, and ends it while this one waits; seed 1 is done here, and only that."""
+    prepared = comparison.prepare(config)
+    for seed in (0, 1):
+        (finished / "crisalad" / f"seed-{seed}" / "test-0.json").rename(finished / f"{seed}.json")
+    one, lines = [], []
+
+    def done(seed):
+        (finished / f"{seed}.json").rename(finished / "crisalad" / f"seed-{seed}" / "test-0.json")
+
+    monkeypatch.setattr(runner, "_one", lambda p, o, n, v, seed, *_: one.append(seed) or done(seed))
+    with contextlib.ExitStack() as other:
+        other.enter_context(locks.one_writer(finished / "crisalad" / "seed-0"))
+
+        def ended(seconds):
+            done(0)
+            other.close()
+
+        monkeypatch.setattr(runner.time, "sleep", ended)
+        runner.take_runs(prepared, finished, say=lines.append)
+    assert one == [1]
+    assert lines == [
+        "crisalad, seed 1: method 1 of 1, 0 of 2 runs done",
+        "waiting for the runs of other processes",
+    ]
+
+
+def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
+    """Its lock's file is left, and the kernel has released the lock."""
+    lock = finished / "crisalad" / "seed-0" / temporaries.LOCK
+    lock.write_text(f"process 1 on {socket.gethostname()}\n")
+    (finished / "crisalad" / "seed-0" / "test-0.json").unlink()
+    monkeypatch.delattr(runner, "fit")
+    assert not runner._has_neighbours(finished)
+    runner.take_runs(comparison.prepare(config), finished, say=print)
+    assert not lock.exists()
+
+
+def test_a_run_beside_others_tells_no_training_time(finished, flags, capfd):
+    """Of a process of this host; another host's is no neighbour."""
+    with locks.one_writer(finished / "crisalad" / "seed-1"):
+        lock = finished / "crisalad" / "seed-1" / temporaries.LOCK
+        assert not runner._has_neighbours(finished)  # it is this process's own
+        lock.write_text(f"process 1 on {socket.gethostname()}\n")
+        assert runner._has_neighbours(finished)
+        lock.write_text("process 1 on elsewhere\n")
+        assert not runner._has_neighbours(finished)
+    path = finished / "crisalad" / "seed-1" / "training.json"
+    write_json(path, read_json(path, "a record") | {"beside": True})
+    told = succeeds(capfd, *flags, "--out", finished)
+    assert (
+        "Trained beside others on one device, so that no training time is told: CriSALAD." in told
+    )
+    assert "| beside others |" in (finished / "table.md").read_text()
+    (row,) = json.loads((finished / "results.json").read_text())["rows"]
+    assert (row["training"], row["training_seconds"], row["beside"]) == (None, None, True)

@@ -6,9 +6,11 @@ import json
 
 import numpy as np
 import pytest
+import rich.console
 
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.experiments.comparison import AdapterCost, Recall, Row, Summary, tables
+from crisalad_jax.experiments.comparison.paired import Difference
 from crisalad_jax.experiments.comparison.summary import recall_of
 from crisalad_jax.experiments.comparison.timing import Race, race
 from crisalad_jax.utils.errors import InputError
@@ -102,6 +104,7 @@ def test_csv_has_a_line_for_each_number():
         **{"seeds": "2", "dimension": "8448", "speed": "1.25", "images_per_second": ""},
         **{"parameters": "1000000", "trained": "10000", "training": "0.5"},
         "training_seconds": "",  # on a CPU
+        **dict.fromkeys(("difference", "difference_low", "difference_high", "verdict"), ""),
     }
     assert lines[-1]["standard_deviation"] == lines[-1]["training"] == ""
 
@@ -156,3 +159,61 @@ def test_races_are_run_in_turns():
 def test_ratios_are_of_one_round():
     raced = Race({"slow": [2.0, 40.0, 9.0], "fast": [1.0, 10.0, 3.0]})
     assert raced.slower("slow", "fast") == (3.0, 2.0, 4.0)
+
+
+BETTER = Difference(0.0449, Interval(0.004, 0.0861))
+UNTOLD = Difference(-0.0001, Interval(-0.1, 0.1))
+WORSE = Difference(-0.25, Interval(-0.5, -0.01))
+COMPARED = SUMMARY._replace(
+    sets={"town": None},
+    rows=[
+        row("first", "single", ONE),
+        row("other", "single", LONE, differences={"town": {1: BETTER, 5: UNTOLD, 10: WORSE}}),
+    ],
+)
+
+
+def test_differences_in_markdown():
+    assert tables.markdown(COMPARED).splitlines()[5:8] == [
+        "| method, less First | town Δ R@1 | town Δ R@5 | town Δ R@10 |",
+        "| --- | ---: | ---: | ---: |",
+        "| Other | +4.5 (+0.4 to +8.6), better | +0.0 (-10.0 to +10.0), not told apart "
+        "| -25.0 (-50.0 to -1.0), worse |",
+    ]
+
+
+def test_differences_in_csv_and_json():
+    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(COMPARED))))
+    assert [line["verdict"] for line in lines] == [
+        *("", "", ""),
+        *("better", "not told apart", "worse"),
+    ]
+    assert (lines[3]["difference"], lines[3]["difference_low"]) == ("0.0449", "0.004")
+    assert lines[3]["difference_high"] == "0.0861"
+    first, second = json.loads(json.dumps(tables.as_json(COMPARED._replace(sets={}))))["rows"]
+    assert first["differences"] is None
+    assert second["differences"]["town"]["R@10"] == {
+        "mean": -0.25,
+        "interval": [-0.5, -0.01],
+        "verdict": "worse",
+    }
+
+
+def test_differences_in_the_terminal(capsys):
+    console = rich.console.Console(width=120)
+    for table in tables.terminal_tables(COMPARED):
+        console.print(table)
+    printed = capsys.readouterr().out
+    assert "method, less First" in printed
+    assert "+4.5 (+0.4 to +8.6), better" in printed
+
+
+def test_no_differences_of_a_single_row():
+    alone = SUMMARY._replace(rows=SUMMARY.rows[:1])
+    assert len(tables.terminal_tables(alone)) == 2
+    assert "less" not in tables.markdown(alone)
+
+
+def test_a_run_beside_others_has_a_word_for_its_time():
+    beside = row("first", "single", ONE, training=None, training_seconds=None, beside=True)
+    assert tables.costs_of(beside)[-1] == "beside others"

@@ -5,9 +5,11 @@ fields.
 """
 
 import ast
+import contextlib
 import dataclasses
 import functools
 import inspect
+import io
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -16,6 +18,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 import tyro
 
 from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.utils.errors import InputError
 
 _NAME = "part_name"
 
@@ -103,6 +106,59 @@ def type_of(flags: Flags) -> tuple[type, Any]:
     made = dataclasses.make_dataclass(flags.kind.__name__, fields, frozen=True)
     made.__doc__ = flags.kind.__doc__
     return made, made()
+
+
+def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str) -> Any:
+    """Change a configuration by flags, with the checks that a command line meets.
+
+    Args:
+        config: what the flags change.
+        arguments: a command line of flags and values, a truth value as True or False.
+        preset: the size of the model, which parts come in.
+        what: beginning of messages.
+
+    Returns:
+        A configuration of the same class.
+
+    Raises:
+        InputError: no such flag or part, or a value that does not fit; one line.
+    """
+    complaint = io.StringIO()
+    try:
+        flags = choose_parts(flags_of(config), arguments, preset)
+        kind, default = type_of(flags)
+        with contextlib.redirect_stderr(complaint):
+            parsed = tyro.cli(
+                kind,
+                prog=what,
+                args=arguments,
+                default=default,
+                add_help=False,
+                config=(tyro.conf.FlagConversionOff,),
+            )
+        return config_of(flags, parsed)
+    except SystemExit as stop:
+        raise InputError(f"{what}: {unboxed(complaint.getvalue())}") from stop
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from error
+
+
+# Beginnings of the parts of tyro's boxes that repeat the first one.
+_ASIDES = ("Argument help", "Got errors", "For full")
+
+
+def unboxed(box: str) -> str:
+    """Extract the text of tyro's boxes, without frames, help texts and footer."""
+    sections = [[]]
+    # The title is dropped. Without UTF-8 on stdout, the frame is of spaces and hyphens.
+    for line in box.splitlines()[1:]:
+        row = line[2:].rstrip("│ ")
+        if not row.strip("─╯-"):
+            sections.append([])
+        elif not row.startswith(" " * 5):
+            sections[-1].append(row.strip())
+    texts = [" ".join(rows) for rows in sections]
+    return "; ".join(t for t in texts if t and not t.startswith(_ASIDES))
 
 
 def parse_settings(
