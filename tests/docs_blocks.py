@@ -9,6 +9,7 @@ a bash block is parsed, and nothing of it is done.
 
 import contextlib
 import importlib
+import itertools
 import os
 import pathlib
 import re
@@ -60,6 +61,8 @@ def load(file: str, code: str, page: str, line: int) -> dict:
 def parse(command: str) -> None:
     """Parse one command as the command line would."""
     _, verb, *given = shlex.split(command, comments=True)
+    # What follows is the shell's: a pipe, or a file for the output.
+    given = list(itertools.takewhile(lambda argument: argument not in ("|", ">"), given))
     given = [argument for argument in given if argument not in ("--help", "--help-all")]
     cli._load_plugins(given)
 
