@@ -13,6 +13,7 @@ from jaxtyping import Float, Int64
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
+from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
@@ -51,6 +52,7 @@ def evaluate(
     cache: ImageCache | None = None,
     observe: Observe | None = None,
     rerank: Reranking | None = None,
+    precision: float | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
     r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
@@ -73,6 +75,8 @@ def evaluate(
         cache: of decoded images.
         observe: is given the descriptors of each grouping, of its first seed, while they are there.
         rerank: a second stage; each grouping has a result without and then one with it.
+        precision: asks each result for its `operating_point`: the similarity from which first
+            retrievals are right with this precision, and the recall that is left.
         quiet: no progress bars.
 
     Returns:
@@ -80,8 +84,8 @@ def evaluate(
 
     Raises:
         InputError: parameters of another configuration, no ground truth, an image cannot be read,
-            components that are not for this model or make no unit vectors, or what
-            `parse_groupings`, `check_grouping`, `Reranking.check` and `Reranker` raise.
+            components that are not for this model or make no unit vectors, such a precision, or
+            what `parse_groupings`, `check_grouping`, `Reranking.check` and `Reranker` raise.
 
     Example:
         >>> import jax, shutil
@@ -99,6 +103,8 @@ def evaluate(
     """
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
+    if precision is not None:
+        check_precision(precision)
     if pca is not None:
         pca.check(config.descriptor_dim, "model")
     if rerank is not None:
@@ -160,6 +166,7 @@ def evaluate(
                         database_share=database_share,
                         is_random=is_random,
                         rerank=label,
+                        precision=precision,
                     )
                 )
     return results
