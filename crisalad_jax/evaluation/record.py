@@ -117,8 +117,9 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
     if points:
         notes.append(
             "Similarity to ask for: first retrievals from it on are right with the precision asked "
-            "for, on these queries, on which it was chosen. A query without a positive is an unknown "
-            "place, and wrong when answered. Sure of: one-sided bound by Clopper and Pearson."
+            "for, on these queries, on which it was chosen. A query without a positive is an "
+            "unknown place, and wrong when answered. 95 % sure of: the lower bound of that "
+            "precision by Clopper and Pearson."
         )
         notes += [f"{name}: {words}." for name, point in points.items() for words in caveats(point)]
     return notes

@@ -20,6 +20,7 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.manifest import (
     DESCRIPTION,
     SEGMENTS,
@@ -82,6 +83,8 @@ class Map:
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self._store = store
+        self.calibration: Calibration | None = None
+        """What `calibrate` measured; None where it did not, or the map is open for appending."""
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
@@ -130,6 +133,7 @@ class Map:
             raise InputError(f"{folder}: found a map without images, expected at least one")
         opened = cls._opened(folder, description)
         try:
+            opened.calibration = read_calibration(folder, description.model)
             if verify and description.store == "files":
                 opened.verify()
         except BaseException:
@@ -228,6 +232,19 @@ class Map:
             raise InputError(f"{self.folder}: found a map without images, expected at least one")
         self._check_descriptors("queries", queries)
         return self._store.search(queries, min(k, len(self)), len(self))
+
+    def similarities(self, queries: Float32[np.ndarray, "q d"]) -> Float32[np.ndarray, "q n"]:
+        """Compute the similarities of queries to all images, in the order of the images.
+
+        Args:
+            queries: unit descriptors, of the map's model.
+
+        Raises:
+            InputError: as `search`.
+        """
+        self._check_descriptors("queries", queries)
+        parts = [queries @ part.astype(np.float32, copy=False).T for part in self.descriptors]
+        return np.concatenate(parts, axis=1)
 
     def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
         length = self.description.descriptor_length
@@ -347,6 +364,7 @@ class Map:
             "model": description.model,
             "weights": description.weights,
             "created": description.created,
+            "calibration": None if self.calibration is None else to_plain(self.calibration),
             "verified": verify,
         }
 

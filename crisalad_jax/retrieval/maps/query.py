@@ -7,15 +7,19 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.build import describe_alone
+from crisalad_jax.retrieval.maps.calibration import check_min_similarity
+from crisalad_jax.retrieval.maps.follow import Follower
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.progress import progress_bar
@@ -33,6 +37,8 @@ class Answer(NamedTuple):
     """Cosine of the two descriptors."""
     image: MapImage
     """The image: its name, and where it was taken."""
+    probability: float | None = None
+    """Probability that the camera is there; None without a filter."""
 
 
 class Answers(NamedTuple):
@@ -46,16 +52,31 @@ class Answers(NamedTuple):
     """All images of the map, by number."""
     axes: tuple[str, str] | None
     """Axes of a position's two numbers; None where no image has a position."""
+    min_similarity: float | None = None
+    """The similarity that a best answer must have; None where any counts."""
+    probabilities: Float64[np.ndarray, "query k"] | None = None
+    """Probability of each answer that the camera is there; None without a filter."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, " query"]:
+        """Whether each query shows a place of the map: its best answer is similar enough."""
+        best = self.neighbours.similarities[:, 0].astype(np.float64)
+        return best >= (-np.inf if self.min_similarity is None else self.min_similarity)
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
-        for query, indices, similarities in zip(self.queries, *self.neighbours, strict=True):
-            pairs = zip(indices, similarities, strict=True)
+        for i, (query, *columns) in enumerate(zip(self.queries, *self.neighbours, strict=True)):
+            near = None if self.probabilities is None else self.probabilities[i]
             yield (
                 query,
                 [
-                    Answer(rank, float(similarity), self.images[index])
-                    for rank, (index, similarity) in enumerate(pairs, 1)
+                    Answer(
+                        rank + 1,
+                        float(similarity),
+                        self.images[index],
+                        None if near is None else float(near[rank]),
+                    )
+                    for rank, (index, similarity) in enumerate(zip(*columns, strict=True))
                 ],
             )
 
@@ -73,6 +94,8 @@ def query(
     *,
     k: int = 5,
     batch_size: int = 16,
+    min_similarity: float | None = None,
+    sequence: BayesFilter | None = None,
     quiet: bool = False,
 ) -> Answers:
     """Find the images of a map that are most similar to others.
@@ -83,6 +106,10 @@ def query(
         images: an image file, a folder, or a list of these.
         k: number of answers to each query.
         batch_size: number of queries described at once, each as if it were alone.
+        min_similarity: a query whose best answer is less similar is of an unknown place; see
+            `Answers.known`. None is what `calibrate` measured, and any where it did not; -1 is any.
+        sequence: a filter over the map's images in their order, where queries are consecutive
+            frames of one camera; None takes every query for itself.
         quiet: whether to show no progress bar.
 
     Returns:
@@ -108,6 +135,11 @@ def query(
     check_grouping((), batch_size, seed=0)
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
+    if min_similarity is not None:
+        check_min_similarity(min_similarity)
+        min_similarity = min_similarity if min_similarity > -1 else None
+    elif places.calibration is not None:
+        min_similarity = places.calibration.min_similarity
     paths = _listed(images)
     batch_size = useful_batch_size(batch_size, len(paths))
     places.check_params(params)
@@ -116,7 +148,9 @@ def query(
         check_params(params, config)
     except InputError as error:
         raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
+    follower = None if sequence is None else Follower(places, sequence)
     parts: list[Neighbours] = []
+    probabilities: list[np.ndarray] = []
     waiting: list[np.ndarray] = []
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
@@ -125,10 +159,17 @@ def query(
             described += len(part.indices)
             bar.advance(len(part.indices))
             if sum(map(len, waiting)) >= AT_ONCE or described == len(paths):
-                parts.append(places.search(np.concatenate(waiting), k))
+                found = np.concatenate(waiting)
+                if follower is None:
+                    parts.append(places.search(found, k))
+                else:
+                    followed = follower.answer(found, k)
+                    parts.append(followed.neighbours)
+                    probabilities.append(followed.probabilities)
                 waiting.clear()
     neighbours = Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
-    return Answers(paths, neighbours, places.images, places.axes)
+    near = np.concatenate(probabilities) if probabilities else None
+    return Answers(paths, neighbours, places.images, places.axes, min_similarity, near)
 
 
 def _listed(images: Any) -> list[pathlib.Path]:
@@ -142,9 +183,11 @@ def _listed(images: Any) -> list[pathlib.Path]:
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
+    Where answers must have a similarity, the line says whether the query is of a `known` place; the
+    answers of an unknown one are listed all the same.
     Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
     """
-    for path, ranked in answers.rows():
+    for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
         neighbours = [
             {
                 "rank": answer.rank,
@@ -152,9 +195,12 @@ def json_lines(answers: Answers) -> Iterator[str]:
                 "similarity": round(answer.similarity, 6),
                 "position": answers.position(answer.image),
             }
+            | ({} if answer.probability is None else {"probability": round(answer.probability, 6)})
             for answer in ranked
         ]
         line = {"query": path.as_posix(), "neighbours": neighbours}
+        if answers.min_similarity is not None:
+            line["known"] = bool(known)
         text = json.dumps(line, ensure_ascii=False)
         yield text if text.isprintable() else json.dumps(line)
 
