@@ -1,7 +1,6 @@
 """Answers of a map to consecutive frames of one camera, by a filter over its images in order."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -25,7 +24,9 @@ class Follower:
         common = [part.astype(np.float64) @ mean for part in places.descriptors]
         self.state: SequenceState = bayes.start(np.concatenate(common))
 
-    def answer(self, descriptors: Float32[np.ndarray, "frame d"], k: int) -> "Followed":
+    def answer(
+        self, descriptors: Float32[np.ndarray, "frame d"], k: int
+    ) -> tuple[Neighbours, Float64[np.ndarray, "frame k"]]:
         """Take the next frames into account, and rank the map's images at each of them.
 
         Args:
@@ -33,14 +34,14 @@ class Follower:
             k: images for each frame; all where there are fewer.
 
         Returns:
-            The images that the camera is most probably at, the most probable first.
+            The images that the camera is most probably at, best first, and their probabilities.
 
         Raises:
             InputError: what `Map.similarities` raises.
         """
         rows = [self._ranked(row, k) for row in self._similarities(descriptors)]
         numbers, similarities, probabilities = map(np.stack, zip(*rows, strict=True))
-        return Followed(Neighbours(numbers, similarities), probabilities)
+        return Neighbours(numbers, similarities), probabilities
 
     def _ranked(self, row: Float32[np.ndarray, " place"], k: int) -> tuple[np.ndarray, ...]:
         self.state = self._filter.step(self.state, row)
@@ -55,11 +56,3 @@ class Follower:
         step = max(1, _NUMBERS // len(self._map))
         for start in range(0, len(descriptors), step):
             yield from self._map.similarities(descriptors[start : start + step])
-
-
-class Followed(NamedTuple):
-    """Images of a map at each of some frames, the most probable first."""
-
-    neighbours: Neighbours
-    probabilities: Float64[np.ndarray, "frame k"]
-    """Probability that the camera is there."""

@@ -66,7 +66,7 @@ class Answers(NamedTuple):
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
         for i, (query, *columns) in enumerate(zip(self.queries, *self.neighbours, strict=True)):
-            near = None if self.probabilities is None else self.probabilities[i]
+            chances = None if self.probabilities is None else self.probabilities[i]
             yield (
                 query,
                 [
@@ -74,7 +74,7 @@ class Answers(NamedTuple):
                         rank + 1,
                         float(similarity),
                         self.images[index],
-                        None if near is None else float(near[rank]),
+                        None if chances is None else float(chances[rank]),
                     )
                     for rank, (index, similarity) in enumerate(zip(*columns, strict=True))
                 ],
@@ -163,13 +163,13 @@ def query(
                 if follower is None:
                     parts.append(places.search(found, k))
                 else:
-                    followed = follower.answer(found, k)
-                    parts.append(followed.neighbours)
-                    probabilities.append(followed.probabilities)
+                    followed, near = follower.answer(found, k)
+                    parts.append(followed)
+                    probabilities.append(near)
                 waiting.clear()
     neighbours = Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
-    near = np.concatenate(probabilities) if probabilities else None
-    return Answers(paths, neighbours, places.images, places.axes, min_similarity, near)
+    joined = np.concatenate(probabilities) if probabilities else None
+    return Answers(paths, neighbours, places.images, places.axes, min_similarity, joined)
 
 
 def _listed(images: Any) -> list[pathlib.Path]:
