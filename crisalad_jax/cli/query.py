@@ -36,8 +36,8 @@ class Query:
     k: int = 5
     """Answers to each query."""
     min_similarity: float | None = None
-    """A query whose best answer is less similar is of an unknown place; by default what `crisalad
-    calibrate` measured for this map, and -1 answers every query."""
+    """A query to which no image is that similar is of an unknown place; by default what `crisalad
+    calibrate` measured for this map. -1 answers every query."""
     sequence: Literal["bayes"] | None = None
     """The queries are consecutive frames of one camera: bayes weighs those so far, by a filter over
     the map's images in their order (docs/maps.md)."""

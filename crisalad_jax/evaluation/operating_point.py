@@ -165,9 +165,11 @@ def caveats(point: OperatingPoint) -> list[str]:
         ]
     if point.lower_bound >= point.asked:
         return []
-    enough = needed(point.asked)
-    return [
+    sure = (
         f"rests on few queries: {measured}, which shows a precision of at least "
         f"{100 * point.lower_bound:.1f} % (95 % confidence)"
-        + ("" if enough is None else f"; {asked} takes {enough} answers, all of them right")
-    ]
+    )
+    enough = needed(point.asked)
+    if point.right == point.answered and enough is not None:
+        sure += f"; {asked} takes {enough} answers, all of them right"
+    return [sure]

@@ -83,6 +83,8 @@ def test_how_many_answers_a_precision_takes():
     many = OperatingPoint(0.9, 0.5, 29, 29, 40, 0, 0)
     assert caveats(many) == []
     (words,) = caveats(many._replace(answered=28, right=28))
+    (mixed,) = caveats(OperatingPoint(0.3, 0.5, 53, 16, 111, 0, 0))
+    assert mixed.endswith("which shows a precision of at least 19.9 % (95 % confidence)")
     assert words.startswith("rests on few queries: 28 of 28 answers were right, which shows a")
     assert words.endswith(
         "at least 89.9 % (95 % confidence); 90 % takes 29 answers, all of them right"

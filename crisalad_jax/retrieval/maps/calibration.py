@@ -19,7 +19,7 @@ class Calibration:
     """The contents of calibration.json: an operating point, and what it was measured on."""
 
     min_similarity: float
-    """A query whose best answer is less similar shows no place of the map."""
+    """A query to which no image of the map is that similar shows no place of the map."""
     precision: float
     """The precision that was asked for, as a fraction."""
     answered: int

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Crisalad, check_params
@@ -15,7 +15,7 @@ from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.build import describe_alone
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
-from crisalad_jax.retrieval.maps.follow import Follower
+from crisalad_jax.retrieval.maps.follow import Followed, Follower
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours
@@ -56,12 +56,16 @@ class Answers(NamedTuple):
     """The similarity that a best answer must have; None where any counts."""
     probabilities: Float64[np.ndarray, "query k"] | None = None
     """Probability of each answer that the camera is there; None without a filter."""
+    best: Float32[np.ndarray, " query"] | None = None
+    """Similarity of the most similar image of the map, where a filter may have chosen another; None
+    without a filter, where it is the first answer's."""
 
     @property
     def known(self) -> Bool[np.ndarray, " query"]:
-        """Whether each query shows a place of the map: its best answer is similar enough."""
-        best = self.neighbours.similarities[:, 0].astype(np.float64)
-        return best >= (-np.inf if self.min_similarity is None else self.min_similarity)
+        """Whether each query shows a place of the map: the most similar image is similar enough."""
+        best = self.neighbours.similarities[:, 0] if self.best is None else self.best
+        least = -np.inf if self.min_similarity is None else self.min_similarity
+        return best.astype(np.float64) >= least  # float32 would round the least similarity
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
@@ -106,7 +110,7 @@ def query(
         images: an image file, a folder, or a list of these.
         k: number of answers to each query.
         batch_size: number of queries described at once, each as if it were alone.
-        min_similarity: a query whose best answer is less similar is of an unknown place; see
+        min_similarity: a query to which no image is that similar is of an unknown place; see
             `Answers.known`. None is what `calibrate` measured, and any where it did not; -1 is any.
         sequence: a filter over the map's images in their order, where queries are consecutive
             frames of one camera; None takes every query for itself.
@@ -149,8 +153,7 @@ def query(
     except InputError as error:
         raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
     follower = None if sequence is None else Follower(places, sequence)
-    parts: list[Neighbours] = []
-    probabilities: list[np.ndarray] = []
+    parts: list[Neighbours | Followed] = []
     waiting: list[np.ndarray] = []
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
@@ -160,16 +163,13 @@ def query(
             bar.advance(len(part.indices))
             if sum(map(len, waiting)) >= AT_ONCE or described == len(paths):
                 found = np.concatenate(waiting)
-                if follower is None:
-                    parts.append(places.search(found, k))
-                else:
-                    followed, near = follower.answer(found, k)
-                    parts.append(followed)
-                    probabilities.append(near)
+                parts.append(
+                    places.search(found, k) if follower is None else follower.answer(found, k)
+                )
                 waiting.clear()
-    neighbours = Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
-    joined = np.concatenate(probabilities) if probabilities else None
-    return Answers(paths, neighbours, places.images, places.axes, min_similarity, joined)
+    indices, similarities, *filtered = map(np.concatenate, zip(*parts, strict=True))
+    neighbours = Neighbours(indices, similarities)
+    return Answers(paths, neighbours, places.images, places.axes, min_similarity, *filtered)
 
 
 def _listed(images: Any) -> list[pathlib.Path]:

@@ -262,6 +262,12 @@ def test_a_followed_camera_is_that_of_the_filter(made, params, queries, monkeypa
     chosen = np.take_along_axis(similarities, found.neighbours.indices, axis=1)
     np.testing.assert_allclose(found.neighbours.similarities, chosen, atol=1e-6)  # float32
     assert (np.diff(found.probabilities, axis=1) <= 0).all()
+    # A frame is known by the image that is most similar, which need not be the answer.
+    best = similarities.max(axis=1)
+    np.testing.assert_allclose(found.best, best, atol=1e-6)  # float32
+    between = float(np.sort(best)[:2].mean())
+    known = found._replace(min_similarity=between).known
+    assert known.tolist() == (best > between).tolist()
     (_, first), *_ = found.rows()
     assert [answer.probability for answer in first] == found.probabilities[0].tolist()
     line = json.loads(next(json_lines(found)))
