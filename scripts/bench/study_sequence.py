@@ -33,7 +33,6 @@ FILTERS = {
     "reach 4": BayesFilter(reach=4),
     "sharpness 1": BayesFilter(sharpness=1),
     "sharpness 4": BayesFilter(sharpness=4),
-    "jump 0.1": BayesFilter(jump=0.1),
 }
 """The filter as it is by default, and with one setting changed."""
 
@@ -96,6 +95,7 @@ def measure(benchmark: Benchmark, sides: Sides) -> dict[str, float]:
     similarities, common = queries @ database.T, database @ database.mean(axis=0)
     best = {"single frames": similarities.argmax(axis=1)}
     best |= {name: each.follow(similarities, common).places for name, each in FILTERS.items()}
+    best["reversed"] = FILTERS["filter"].follow(similarities[::-1], common).places[::-1]
     truth = benchmark.ground_truth()
     found = {name: 100 * recalls(one[:, None], truth, (1,))[1] for name, one in best.items()}
     surest = np.argsort(-similarities.max(axis=1), kind="stable")[: round(SURE * len(queries))]
@@ -108,7 +108,8 @@ def measure(benchmark: Benchmark, sides: Sides) -> dict[str, float]:
 def study(benchmarks: list[Benchmark], weights: list[pathlib.Path]) -> Study:
     """Measure all models on all sets."""
     rows, values = [], []
-    columns = ["single frames", "filter", "gain", "single frames, surest", "filter, surest"]
+    columns = ["single frames", "filter", "gain", "reversed"]
+    columns += ["single frames, surest", "filter, surest"]
     columns += [name for name in FILTERS if name != "filter"]
     for benchmark in benchmarks:
         for model, sides in descriptors(benchmark, weights):
@@ -120,6 +121,7 @@ def study(benchmarks: list[Benchmark], weights: list[pathlib.Path]) -> Study:
             rows.append((name, model, *(gain if c == "gain" else cells[c] for c in columns)))
     caption = (
         "Recall@1 in percent: of single frames, of the filter as it is by default, and the gain; "
+        "reversed: of the filter, asked from the last frame to the first; "
         f"surest: of the {100 * SURE:.0f} % of the frames to which some image is most similar; "
         "then of the filter with one setting changed."
     )

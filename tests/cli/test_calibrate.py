@@ -36,7 +36,7 @@ def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd):
     assert (value["precision"], value["database"], value["unknown"]) == (0.6, 7, 1)
     assert value["right"] / value["answered"] >= 0.6
 
-    assert f"calibration  min_similarity {least}, precision 0.6," in succeeds(
+    assert f"calibration min_similarity {least}, precision 0.6," in succeeds(
         capfd, "info", "--map", folder
     )
     answers = tmp_path / "answers.jsonl"

@@ -137,5 +137,7 @@ def test_evaluate_gives_each_result_its_point(params, benchmark):
     truth = benchmark.ground_truth()
     for without, result in zip(plain, results, strict=True):
         assert without.operating_point is None
-        assert result.operating_point == operating_point(*result.neighbours, truth, 0.5)
-        assert (result.recalls, result.operating_point.unknown) == (without.recalls, 1)
+        point = result.operating_point
+        assert point is not None
+        assert point == operating_point(*result.neighbours, truth, 0.5)
+        assert (result.recalls, point.unknown) == (without.recalls, 1)

@@ -264,6 +264,7 @@ def test_a_followed_camera_is_that_of_the_filter(made, params, queries, monkeypa
     assert (np.diff(found.probabilities, axis=1) <= 0).all()
     # A frame is known by the image that is most similar, which need not be the answer.
     best = similarities.max(axis=1)
+    assert found.best is not None
     np.testing.assert_allclose(found.best, best, atol=1e-6)  # float32
     between = float(np.sort(best)[:2].mean())
     known = found._replace(min_similarity=between).known
