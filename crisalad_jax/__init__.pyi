@@ -23,7 +23,9 @@ from crisalad_jax.data.places import read_places as read_places
 from crisalad_jax.data.query_set import QuerySet as QuerySet
 from crisalad_jax.data.query_set import read_query_set as read_query_set
 from crisalad_jax.data.resize import resize_image as resize_image
+from crisalad_jax.evaluation.calibrate import calibrate as calibrate
 from crisalad_jax.evaluation.evaluate import evaluate as evaluate
+from crisalad_jax.evaluation.operating_point import operating_point as operating_point
 from crisalad_jax.experiments.comparison import compare as compare
 from crisalad_jax.experiments.train import train as train
 from crisalad_jax.losses import Loss as Loss
@@ -68,6 +70,7 @@ from crisalad_jax.retrieval.pca import fit_pca as fit_pca
 from crisalad_jax.retrieval.pca import load_pca as load_pca
 from crisalad_jax.retrieval.photographs import prepare_image as prepare_image
 from crisalad_jax.retrieval.search import search as search
+from crisalad_jax.retrieval.sequence import BayesFilter as BayesFilter
 from crisalad_jax.serve import serve_map as serve_map
 from crisalad_jax.sinkhorn import SinkhornConfig as SinkhornConfig
 from crisalad_jax.sinkhorn import register_dustbin as register_dustbin

@@ -8,7 +8,7 @@ from typing import Any
 
 from crisalad_jax.cli.common import check_json, console, talk_beside, write_or_print_json
 from crisalad_jax.cli.train import defaults
-from crisalad_jax.config.flags import parse_settings
+from crisalad_jax.config.flags import parse_settings, with_settings
 from crisalad_jax.utils.errors import InputError
 
 COMMON = (

@@ -15,9 +15,10 @@ from crisalad_jax.cli.common import (
     talk_beside,
     write_or_print_json,
 )
-from crisalad_jax.cli.tables import grouping_table
+from crisalad_jax.cli.tables import grouping_table, points_table
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
 from crisalad_jax.evaluation.similarity import FirstSimilarities
 from crisalad_jax.nn.config import ModelConfig
@@ -100,6 +101,9 @@ class Evaluate:
     (docs/methods.md). Adds a row to each of the table."""
     rerank_weights: pathlib.Path | None = None
     """Model that makes these features, as --weights; by default the first stage's."""
+    precision: float | None = None
+    """Also print the similarity to ask for so that this share of the accepted first retrievals is
+    right, such as 0.99, and the recall that is left."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -132,6 +136,8 @@ def run(arguments: Evaluate) -> None:
     groupings = arguments.grouping.split(",")
     parse_groupings(groupings)
     check_grouping((), arguments.batch_size, arguments.seed, arguments.seeds)
+    if arguments.precision is not None:
+        check_precision(arguments.precision)
     _check_files(arguments)
     talk_beside(arguments.json)
     if arguments.rerank is not None:
@@ -177,6 +183,7 @@ def run(arguments: Evaluate) -> None:
         observe=None if arguments.report is None else similarities,
         rerank=rerank,
         on_bad_image=arguments.on_bad_image,
+        precision=arguments.precision,
         quiet=arguments.quiet,
     )
     settings = evaluation_settings(
@@ -191,6 +198,8 @@ def run(arguments: Evaluate) -> None:
         rerank_weights=arguments.rerank_weights,
     )
     console.print(grouping_table(results))
+    if points := {each.label: each.operating_point for each in results if each.operating_point}:
+        console.print(points_table(points))
     for note in table_notes(results, settings):
         say(note)
     readable = results[0].skipped.rest_of(benchmark)

@@ -93,5 +93,12 @@ def _map(folder: pathlib.Path, arguments: Info) -> dict[str, Any]:
     with Map.open(folder, verify=False) as places:
         summary = places.summary(verify=arguments.verify)
     width = max(map(len, summary))
-    say("\n".join(f"{name:<{width}}  {value}" for name, value in summary.items()))
+    say("\n".join(f"{name:<{width}}  {_words(value)}" for name, value in summary.items()))
     return summary
+
+
+def _words(value: Any) -> str:
+    """Write a value of a map's summary in one line; what a map remembers is an object."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {each}" for name, each in value.items())
+    return str(value)

@@ -11,7 +11,8 @@ from crisalad_jax.cli import live
 from crisalad_jax.cli.common import STDOUT, console, find_given, say, talk_beside
 from crisalad_jax.cli.tables import answers_table
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import json_lines, query, write_answers
+from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_target, real_path
 
@@ -63,6 +64,14 @@ class Query:
     """The model that made the map, as a file or a published name; by default where it was then."""
     k: int = 5
     """Answers to each query."""
+    min_similarity: float | None = None
+    """A query to which no image is that similar is of an unknown place; by default what `crisalad
+    calibrate` measured for this map. -1 answers every query."""
+    sequence: Literal["bayes"] | None = None
+    """The queries are consecutive frames of one camera: bayes weighs those so far, by a filter over
+    the map's images in their order (docs/maps.md)."""
+    sequence_reach: int | None = None
+    """Images of the map that the camera moves between two frames, at most; by default 2."""
     json: pathlib.Path | None = None
     """File for the answers, a line of JSON for each query; - prints them."""
     gallery: pathlib.Path | None = None
@@ -92,6 +101,7 @@ def run(arguments: Query) -> None:
     file = None if arguments.json == STDOUT else arguments.json
     talk_beside(arguments.json)
     _check_files(file, arguments)
+    sequence = _sequence(arguments)
     with Map.open(arguments.map, verify=arguments.verify) as places:
         answers = query(
             places,
@@ -102,13 +112,15 @@ def run(arguments: Query) -> None:
             window=arguments.window,
             batch_size=arguments.batch_size,
             on_bad_image=arguments.on_bad_image,
+            min_similarity=arguments.min_similarity,
+            sequence=sequence,
             quiet=arguments.quiet,
         )
     if answers.unreadable:
         say(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
-    of = f"in a map of {len(answers.images)} images"
+    of = f"in a map of {len(answers.images)} images{_unknown(answers)}"
     if arguments.json is None and arguments.gallery is None:
-        title = f"{arguments.map}, {len(answers.images)} images"
+        title = f"{arguments.map}, {len(answers.images)} images{unknown}"
         console.print(answers_table(answers, title))
     elif file is None and arguments.json is not None:
         for line in json_lines(answers):
@@ -132,6 +144,24 @@ def run(arguments: Query) -> None:
         say(f"{arguments.gallery}: {shown}{len(answers.queries)} queries {of}")
     if file is not None:
         say(f"{file}: {len(answers.queries)} queries {of}")
+
+
+def _sequence(arguments: Query) -> BayesFilter | None:
+    """Make the filter that the flags ask for; None where they ask for none."""
+    reach = arguments.sequence_reach
+    if arguments.sequence is not None:
+        return BayesFilter() if reach is None else BayesFilter(reach=reach)
+    if reach is not None:
+        raise InputError("--sequence-reach: found without --sequence bayes, expected both")
+    return None
+
+
+def _unknown(answers: Answers) -> str:
+    """Say how many queries are of unknown places; nothing where any similarity counts."""
+    if answers.min_similarity is None:
+        return ""
+    count, least = int((~answers.known).sum()), f"{answers.min_similarity:.9g}"
+    return f"; {count} of {len(answers.queries)} unknown, below similarity {least}"
 
 
 def _check_files(file: pathlib.Path | None, arguments: Query) -> None:

@@ -1,7 +1,7 @@
 """Tables that the commands print."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import rich.box
 from rich.table import Table
@@ -10,6 +10,7 @@ from rich.text import Text
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import Published
 from crisalad_jax.checkpoints.published.base import GITHUB
+from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.training.summary import ModelSummary
@@ -42,6 +43,30 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
             f"{_spread(spread.recall_at_full_precision)}",
         )
         table.add_row(*map(Text, cells))
+    return table
+
+
+def points_table(points: Mapping[str, OperatingPoint]) -> Table:
+    """Make a table of operating points by name: the similarity to ask for, and what that leaves."""
+    table = Table()
+    table.add_column("queries/\ndatabase", no_wrap=True)
+    for name in (
+        "similarity\nto ask for",
+        "precision\n95 % sure of",
+        "recall left,\nof all queries",
+        "right of\nanswered",
+        "unknown places\nanswered",
+    ):
+        table.add_column(name, justify="right")
+    for name, point in points.items():
+        cells = (
+            f"{point.min_similarity:.9g}" if point.reached else "none",
+            f"{percent(point.precision)}\n{percent(point.lower_bound)}",
+            f"{percent(point.recall)}\n{point.right} of {point.queries}" if point.reached else "-",
+            f"{point.right} of {point.answered}",
+            f"{point.unknown_answered} of {point.unknown}",
+        )
+        table.add_row(*map(Text, (name.replace(" + ", "\n+ "), *cells)))
     return table
 
 
@@ -112,23 +137,28 @@ def _model_cells(model: Published) -> tuple[str, ...]:
 
 
 def answers_table(answers: Answers, title: str = "") -> Table:
-    """Make a table of answers for the terminal."""
+    """Make a table of answers for the terminal; a query of an unknown place has one row."""
+    followed = answers.probabilities is not None
     table = Table(title=printable(title), title_justify="left")
     table.add_column("query", overflow="fold")
     table.add_column("rank", justify="right")
     table.add_column("name", overflow="fold")
     table.add_column("similarity", justify="right", no_wrap=True)
+    if followed:
+        table.add_column("probability", justify="right", no_wrap=True)
     table.add_column(", ".join(answers.axes or ("position",)), justify="right", overflow="fold")
-    for path, ranked in answers.rows():
-        for answer in ranked:
-            position = answers.position(answer.image)
+    for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
+        shown = ranked if known else ranked[:1]
+        for answer in shown:
+            position = answers.position(answer.image) if known else None
             cells = (
                 path.as_posix() if answer.rank == 1 else "",
-                str(answer.rank),
-                answer.image.name,
+                str(answer.rank) if known else "-",
+                answer.image.name if known else "unknown",
                 f"{answer.similarity:.3f}",
+                *([f"{answer.probability:.3f}"] if followed else []),
                 "-" if position is None else ", ".join(f"{v:.9g}" for v in position.values()),
             )
             # `Text` keeps square brackets in a name from being markup.
-            table.add_row(*map(Text, map(printable, cells)), end_section=answer.rank == len(ranked))
+            table.add_row(*map(Text, map(printable, cells)), end_section=answer.rank == len(shown))
     return table

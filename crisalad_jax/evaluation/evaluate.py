@@ -13,6 +13,7 @@ from jaxtyping import Float, Int64
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
+from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
@@ -52,6 +53,7 @@ def evaluate(
     observe: Observe | None = None,
     rerank: Reranking | None = None,
     on_bad_image: OnBadImage = "stop",
+    precision: float | None = None,
     quiet: bool = False,
 ) -> list[GroupingResult]:
     r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
@@ -76,6 +78,8 @@ def evaluate(
         rerank: a second stage; each grouping has a result without and then one with it.
         on_bad_image: "stop" at an unreadable image, or "skip" it: the results are then of the set
             without it (`GroupingResult.skipped`).
+        precision: asks each result for its `operating_point`: the similarity from which first
+            retrievals are right with this precision, and the recall that is left.
         quiet: no progress bars.
 
     Returns:
@@ -83,9 +87,9 @@ def evaluate(
 
     Raises:
         InputError: parameters of another configuration, no ground truth, an image cannot be read
-            or none of a side,
-            components that are not for this model or make no unit vectors, or what
-            `parse_groupings`, `check_grouping`, `Reranking.check` and `Reranker` raise.
+            or none of a side, components that are not for this model or make no unit vectors, such
+            a precision, or what `parse_groupings`, `check_grouping`, `Reranking.check` and `Reranker`
+            raise.
 
     Example:
         >>> import jax, shutil
@@ -103,6 +107,8 @@ def evaluate(
     """
     parsed = parse_groupings(groupings)
     check_grouping((), batch_size, seed, seeds)
+    if precision is not None:
+        check_precision(precision)
     if pca is not None:
         pca.check(config.descriptor_dim, "model")
     if rerank is not None:
@@ -176,6 +182,7 @@ def evaluate(
                         is_random=is_random,
                         rerank=label,
                         skipped=skipped,
+                        precision=precision,
                     )
                 )
     return results

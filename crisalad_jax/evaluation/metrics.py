@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int, Int64
 
 from crisalad_jax.utils.errors import InputError
 
@@ -133,6 +133,25 @@ class PrecisionRecall(NamedTuple):
     """The largest recall without a wrong retrieval; 0 where the most similar one is wrong."""
 
 
+def accepted(
+    similarities: Float[np.ndarray, " q"], right: Bool[np.ndarray, " q"]
+) -> tuple[Float[np.ndarray, " q"], Int64[np.ndarray, " t"], Int64[np.ndarray, " t"]]:
+    """Accept queries by the similarity of their first retrieval, strictest threshold first.
+
+    Args:
+        similarities: those of the first retrievals.
+        right: which first retrievals are right.
+
+    Returns:
+        The similarities from the highest on; and for each threshold the index in them of the last
+        accepted query, and the number of accepted queries that are right.
+    """
+    order = np.argsort(-similarities, kind="stable")
+    ordered = similarities[order]
+    last = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
+    return ordered, last, np.cumsum(right[order])[last]
+
+
 def precision_recall(
     indices: Int[np.ndarray, "q k"],
     similarities: Float[np.ndarray, "q k"],
@@ -160,10 +179,7 @@ def precision_recall(
     answerable = sum(np.size(wanted) > 0 for wanted in positives)
     if not answerable:
         return None
-    order = np.argsort(-similarities[:, 0], kind="stable")
-    ordered = similarities[order, 0]
-    last = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
-    accepted_right = np.cumsum(right[order])[last]
+    ordered, last, accepted_right = accepted(similarities[:, 0], right)
     precision = accepted_right / (last + 1)
     recall = accepted_right / answerable
     return PrecisionRecall(

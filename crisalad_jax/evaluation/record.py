@@ -7,6 +7,7 @@ from typing import Any
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.evaluate import same_place_rule
+from crisalad_jax.evaluation.operating_point import caveats
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, to_json
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import Grouping, grouping_words
@@ -135,4 +136,13 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
             f"+ {label}: the first {label.partition(':')[2]} retrievals by its scores, which stand "
             "for similarities in AP and R at 100 % P."
         )
+    points = {each.label: each.operating_point for each in results if each.operating_point}
+    if points:
+        notes.append(
+            "Similarity to ask for: first retrievals from it on are right with the precision asked "
+            "for, on these queries, on which it was chosen. A query without a positive is an "
+            "unknown place, and wrong when answered. 95 % sure of: the lower bound of that "
+            "precision by Clopper and Pearson."
+        )
+        notes += [f"{name}: {words}." for name, point in points.items() for words in caveats(point)]
     return notes

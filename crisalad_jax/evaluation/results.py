@@ -17,6 +17,8 @@ from crisalad_jax.evaluation.metrics import (
     recalls,
     right_retrievals,
 )
+from crisalad_jax.evaluation.operating_point import OperatingPoint, operating_point
+from crisalad_jax.evaluation.operating_point import to_json as point_json
 from crisalad_jax.retrieval.grouping import Grouping
 from crisalad_jax.retrieval.search import Neighbours
 
@@ -84,6 +86,8 @@ class GroupingResult(NamedTuple):
     similarities of the retrievals that it re-ranked. None is the first stage alone."""
     skipped: Skipped = _NONE
     """The unreadable images that were left out, the same under every grouping."""
+    operating_point: OperatingPoint | None = None
+    """The similarity that leaves the asked precision, of the first seed; None if none was asked."""
 
     @property
     def label(self) -> str:
@@ -102,6 +106,7 @@ def summarise(
     is_random: bool,
     rerank: str | None = None,
     skipped: Skipped = _NONE,
+    precision: float | None = None,
 ) -> GroupingResult:
     """Summarise the rankings of one grouping as its result.
 
@@ -115,9 +120,10 @@ def summarise(
         is_random: whether the rankings differ by their seeds.
         rerank: as in `GroupingResult`.
         skipped: likewise.
+        precision: of the operating point; None for no such point.
 
     Raises:
-        InputError: what `recalls` raises.
+        InputError: what `recalls` and `operating_point` raise.
     """
     first = next(iter(rankings.values()))
     rights = [right_retrievals(each.indices, positives) for each in rankings.values()]
@@ -146,6 +152,9 @@ def summarise(
         by_seed=dict(zip(rankings, scores, strict=True)) if is_random else {},
         rerank=rerank,
         skipped=skipped,
+        operating_point=None
+        if precision is None
+        else operating_point(*first, positives, precision),
     )
 
 
@@ -172,7 +181,7 @@ def to_json(result: GroupingResult) -> dict[str, Any]:
     if result.grouping != ANY:
         grouping = Grouping.parse(result.grouping)
         sides = grouping.queries, grouping.database
-    curve = result.precision_recall
+    curve, point = result.precision_recall, result.operating_point
     return {
         "grouping": result.grouping,
         "rerank": result.rerank,
@@ -190,7 +199,7 @@ def to_json(result: GroupingResult) -> dict[str, Any]:
         else {
             name: getattr(curve, name).tolist() for name in ("thresholds", "precision", "recall")
         },
-    }
+    } | ({} if point is None else {"operating_point": point_json(point)})
 
 
 def _scores_json(scores: Scores) -> dict[str, Any]:

@@ -145,7 +145,7 @@ def test_no_command_prints_the_usage(capfd):
     [
         (
             "tran --data d --out o",
-            "command: found 'tran', expected one of ablate, compare, compile-check",
+            "command: found 'tran', expected one of ablate, calibrate, compare",
         ),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
         ("train --data d --out o --preset b16", "preset: found 'b16'"),

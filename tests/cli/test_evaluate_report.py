@@ -17,10 +17,12 @@ def test_the_page_holds_the_numbers_of_the_json(
         capfd,
         *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
         *("--batch-size", BATCH, "--grouping", "single,sequential", "--quiet"),
-        *("--report", tmp_path / "page", "--json", tmp_path / "found.json"),
+        *("--report", tmp_path / "page", "--json", tmp_path / "found.json", "--precision", 0.6),
     )
+    assert "similarity" in said
     assert f"report: {tmp_path}/page/index.html" in said
-    page = Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
+    page_text = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
+    page = Page(page_text)
     results = json.loads((tmp_path / "found.json").read_text())["results"]
     assert [e["text"] for e in page.all("th", scope="row")] == ["single", "sequential"]
     cells = iter(e["text"] for e in page.all("td"))
@@ -32,6 +34,18 @@ def test_the_page_holds_the_numbers_of_the_json(
         assert next(cells) == " / ".join(words)
         for name in ("average_precision", "recall_at_full_precision"):
             assert next(cells) == f"{100 * result[name]:.1f}"
+        point = result["operating_point"]
+        assert (point["asked"], point["reached"]) == (
+            0.6,
+            point["right"] / point["answered"] >= 0.6,
+        )
+        similarity = f"similarity from {point['min_similarity']:.9g}"
+        assert next(cells) == f"{100 * point['right'] / 5:.1f}{similarity}"
+        # Five queries are few, as the terminal and the page say.
+        assert f"{point['min_similarity']:.9g}" in said
+        words = f"{result['grouping']}: rests on few queries: {point['right']} of "
+        assert words in said
+        assert words in page_text
     assert next(cells, None) is None
     names = {e["id"] for e in page.all("section")}
     assert {"recall", "map", "transport", "similarities", "settings"} <= names

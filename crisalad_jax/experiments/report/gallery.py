@@ -207,6 +207,10 @@ def answers_gallery(
     indices, similarities = (part[:, :columns] for part in answers.neighbours)
     used, places = np.unique(indices, return_inverse=True)
     images = [answers.images[number] for number in used]
+    asked = [
+        path.as_posix() if known else f"unknown: {path.as_posix()}"
+        for path, known in zip(answers.queries, answers.known, strict=True)
+    ]
     prediction_gallery(
         path,
         answers.queries,
@@ -216,7 +220,7 @@ def answers_gallery(
         None,
         rows=rows,
         columns=columns,
-        names=([path.as_posix() for path in answers.queries], [image.name for image in images]),
+        names=(asked, [image.name for image in images]),
         title=title,
     )
 

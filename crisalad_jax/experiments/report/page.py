@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.operating_point import OperatingPoint, caveats
 from crisalad_jax.evaluation.results import ANY, GroupingResult, percent
 from crisalad_jax.experiments.report import sections
 from crisalad_jax.experiments.report.query_selection import Verdicts, choose_shown
@@ -149,7 +150,18 @@ def _table(groupings: Sequence[GroupingResult]) -> tuple[list[str], list[list[_C
             headers.append(header)
             for row, value in zip(rows, values, strict=True):
                 row.append(_Cell("\N{EN DASH}" if value is None else percent(value)))
+    points = [g.operating_point for g in groupings]
+    if asked := next((f"{100 * point.asked:g}" for point in points if point is not None), None):
+        headers.append(f"at {asked} %")
+        for row, point in zip(rows, points, strict=True):
+            row.append(_Cell("\N{EN DASH}") if point is None else _point_cell(point))
     return headers, rows
+
+
+def _point_cell(point: OperatingPoint) -> _Cell:
+    if not point.reached:
+        return _Cell("\N{EN DASH}", f"highest precision {percent(point.precision)}")
+    return _Cell(percent(point.recall), f"similarity from {point.min_similarity:.9g}")
 
 
 def _meanings(groupings: Sequence[GroupingResult]) -> list[tuple[str, str]]:
@@ -175,6 +187,15 @@ def _notes(groupings: Sequence[GroupingResult]) -> str:
         )
     if any(g.average_precision is not None for g in groupings):
         notes.append("AP: the area under precision and recall of the first retrievals.")
+    asked = next((g.operating_point.asked for g in groupings if g.operating_point), None)
+    if asked is not None:
+        notes.append(
+            f"At {100 * asked:g} %: the share of all queries that is answered rightly, where first "
+            "retrievals from the similarity below it on are answers, and so many of them are right."
+        )
+    for g in groupings:
+        if g.operating_point is not None:
+            notes += [f"{g.label}: {words}." for words in caveats(g.operating_point)]
     return " ".join(notes)
 
 

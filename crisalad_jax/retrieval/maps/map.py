@@ -24,6 +24,7 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.alone import describe_images
 from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.manifest import (
     DESCRIPTION,
     SEGMENTS,
@@ -64,6 +65,8 @@ class Answer(NamedTuple):
     """Cosine of the two descriptors."""
     image: MapImage
     """The image: its name, and where it was taken."""
+    probability: float | None = None
+    """Probability that the camera is there; None without a filter."""
 
 
 class _Segment(NamedTuple):
@@ -100,6 +103,8 @@ class Map:
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self._store = store
         self._close = weakref.finalize(self, store.close)
+        self.calibration: Calibration | None = None
+        """What `calibrate` measured; None where it did not, or the map is open for appending."""
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
@@ -149,6 +154,7 @@ class Map:
             raise InputError(f"{folder}: found a map without images, expected at least one")
         opened = cls._opened(folder, description)
         try:
+            opened.calibration = read_calibration(folder, description.model)
             if verify and description.store == "files":
                 opened.verify()
         except BaseException:
@@ -297,6 +303,19 @@ class Map:
             for rank, (number, similarity) in enumerate(pairs, 1)
         ]
 
+    def similarities(self, queries: Float32[np.ndarray, "q d"]) -> Float32[np.ndarray, "q n"]:
+        """Compute the similarities of queries to all images, in the order of the images.
+
+        Args:
+            queries: unit descriptors, of the map's model.
+
+        Raises:
+            InputError: as `search`.
+        """
+        self._check_descriptors("queries", queries)
+        parts = [queries @ part.astype(np.float32, copy=False).T for part in self.descriptors]
+        return np.concatenate(parts, axis=1)
+
     def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
         length = self.description.descriptor_length
         if descriptors.ndim != 2 or not len(descriptors) or descriptors.shape[1] != length:
@@ -415,6 +434,7 @@ class Map:
             "model": description.model,
             "weights": description.weights,
             "created": description.created,
+            "calibration": None if self.calibration is None else to_plain(self.calibration),
             "verified": verify,
         }
 

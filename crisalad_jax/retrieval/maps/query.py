@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float32, Float64
 
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import open_source
@@ -16,9 +17,12 @@ from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.alone import Described, describe_alone
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.maps.calibration import check_min_similarity
+from crisalad_jax.retrieval.maps.follow import Followed, Follower
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
 from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.retrieval.windows import check_window, describe_windows
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
@@ -41,16 +45,35 @@ class Answers(NamedTuple):
     """Axes of a position's two numbers; None where no image has a position."""
     unreadable: Sequence[pathlib.Path] = ()
     """Image files that could not be read, which have no answers."""
+    min_similarity: float | None = None
+    """The similarity that a best answer must have; None where any counts."""
+    probabilities: Float64[np.ndarray, "query k"] | None = None
+    """Probability of each answer that the camera is there; None without a filter."""
+    best: Float32[np.ndarray, " query"] | None = None
+    """Similarity of the most similar image of the map, where a filter may have chosen another; None
+    without a filter, where it is the first answer's."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, " query"]:
+        """Whether each query shows a place of the map: the most similar image is similar enough."""
+        best = self.neighbours.similarities[:, 0] if self.best is None else self.best
+        least = -np.inf if self.min_similarity is None else self.min_similarity
+        return best.astype(np.float64) >= least  # float32 would round the least similarity
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
-        for query, indices, similarities in zip(self.queries, *self.neighbours, strict=True):
-            pairs = zip(indices, similarities, strict=True)
+        for i, (query, *columns) in enumerate(zip(self.queries, *self.neighbours, strict=True)):
+            chances = None if self.probabilities is None else self.probabilities[i]
             yield (
                 query,
                 [
-                    Answer(rank, float(similarity), self.images[index])
-                    for rank, (index, similarity) in enumerate(pairs, 1)
+                    Answer(
+                        rank + 1,
+                        float(similarity),
+                        self.images[index],
+                        None if chances is None else float(chances[rank]),
+                    )
+                    for rank, (index, similarity) in enumerate(zip(*columns, strict=True))
                 ],
             )
 
@@ -69,6 +92,8 @@ def query(
     window: int = 1,
     batch_size: int = 16,
     on_bad_image: OnBadImage = "stop",
+    min_similarity: float | None = None,
+    sequence: BayesFilter | None = None,
     quiet: bool = False,
 ) -> Answers:
     """Find the images of a map that are most similar to others.
@@ -84,6 +109,10 @@ def query(
             as a moving camera has them. 1 describes each alone, as a map's images are.
         batch_size: number of queries described at once, each as if it were alone.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
+        min_similarity: a query to which no image is that similar is of an unknown place; see
+            `Answers.known`. None is what `calibrate` measured, and any where it did not; -1 is any.
+        sequence: a filter over the map's images in their order, where queries are consecutive
+            frames of one camera; None takes every query for itself.
         quiet: whether to show no progress bar.
 
     Returns:
@@ -109,6 +138,11 @@ def query(
     check_grouping((), batch_size, seed=0)
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
+    if min_similarity is not None:
+        check_min_similarity(min_similarity)
+        min_similarity = min_similarity if min_similarity > -1 else None
+    elif places.calibration is not None:
+        min_similarity = places.calibration.min_similarity
     sources = _listed(images, fps)
     paths = [path for source in sources for path in source]
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -119,7 +153,8 @@ def query(
         check_params(params, config)
     except InputError as error:
         raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
-    parts: list[Neighbours] = []
+    follower = None if sequence is None else Follower(places, sequence)
+    parts: list[Neighbours | Followed] = []
     waiting: list[np.ndarray] = []
     unreadable: list[pathlib.Path] = []
     described = 0
@@ -136,12 +171,18 @@ def query(
                 raise InputError(f"images: found {len(paths)}, none of them readable")
             count = sum(map(len, waiting))
             if count >= AT_ONCE or (count and described == len(paths)):
-                parts.append(places.search(np.concatenate(waiting), k))
+                found = np.concatenate(waiting)
+                parts.append(
+                    places.search(found, k) if follower is None else follower.answer(found, k)
+                )
                 waiting.clear()
-    neighbours = Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
+    indices, similarities, *filtered = map(np.concatenate, zip(*parts, strict=True))
+    neighbours = Neighbours(indices, similarities)
     lost = set(unreadable)
     readable = [path for path in paths if path not in lost]
-    return Answers(readable, neighbours, places.images, places.axes, unreadable)
+    return Answers(
+        readable, neighbours, places.images, places.axes, unreadable, min_similarity, *filtered
+    )
 
 
 def _described(
@@ -192,30 +233,34 @@ def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, 
 
 def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any]:
     """Return an answer's rank, name, similarity and position, as JSON has them."""
+    probable = {} if answer.probability is None else {"probability": round(answer.probability, 6)}
     return {
         "rank": answer.rank,
         "name": answer.image.name,
         "similarity": round(answer.similarity, 6),
         "position": position_fields(answer.image, axes),
+        **probable,
     }
 
 
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
-    Frames of videos have a `time` in seconds, too. Where a name has letters that no text shows, or
-    bytes that are no UTF-8, they are escaped.
+    Frames of videos have a `time` in seconds, too. Where answers must have a similarity, the line
+    says whether the query is of a `known` place; the answers of an unknown one are listed all the
+    same. Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
     """
     return map(json_text, json_rows(answers))
 
 
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     """Yield what `json_lines` writes of each query."""
-    for path, ranked in answers.rows():
+    for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
         neighbours = [
             answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in ranked
         ]
-        yield {"query": path.as_posix(), **_time(path), "neighbours": neighbours}
+        row = {"query": path.as_posix(), **_time(path), "neighbours": neighbours}
+        yield row if answers.min_similarity is None else row | {"known": bool(known)}
 
 
 def _time(name: str | os.PathLike[str]) -> dict[str, float]:

@@ -1,0 +1,113 @@
+"""Calibration of a map: from which similarity on its answers are right to a precision."""
+
+import datetime
+
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.operating_point import OperatingPoint, caveats, check_precision
+from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.locks import next_writer
+
+
+def calibrate(
+    places: Map,
+    params: Crisalad,
+    benchmark: Benchmark,
+    precision: float = 0.99,
+    *,
+    batch_size: int = 16,
+    cache: ImageCache | None = None,
+    quiet: bool = False,
+) -> Calibration:
+    """Measure from which similarity on answers are right, and let a map remember it.
+
+    The set is evaluated with the map's model and image size, every image alone, as `query` does.
+    The map's own images are not looked at. So the set's database should be of the map's places or
+    of places like them, about as many, and its queries like those that the map will be asked. They
+    should show unknown places too, which count as wrong when answered.
+
+    Args:
+        places: the map, open. It remembers the result in its folder, in place of an earlier one.
+        params: parameters of the model that made the map (`Map.load_params`).
+        benchmark: the set, such as `open_benchmark` makes.
+        precision: share of the answers that must be right, above 0 to 1.
+        batch_size: images described at once, each as if it were alone.
+        cache: of decoded images.
+        quiet: no progress bars.
+
+    Returns:
+        What the map remembers from now on.
+
+    Raises:
+        InputError: no similarity reaches the precision, and the map stays as it was; parameters of
+            another model; or what `evaluate` raises.
+
+    Example:
+        >>> import jax, shutil
+        >>> from crisalad_jax import PRESETS, index, init_crisalad, open_benchmark, save_weights
+        >>> for side in ("queries", "database"):
+        ...     _ = shutil.copytree(pictures, folder / "set" / side)
+        >>> lines = ["query,database", *(f"{number}.png,{number}.png" for number in range(4))]
+        >>> _ = (folder / "set" / "ground_truth.csv").write_text("\\n".join(lines))
+        >>> benchmark = open_benchmark(folder / "set", layout="folders")
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> weights = folder / "weights.safetensors"
+        >>> save_weights(weights, params, config)
+        >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+        >>> with Map.open(folder / "map") as places:
+        ...     found = calibrate(places, params, benchmark, precision=0.9, quiet=True)
+        >>> found.right, found.answered
+        (4, 4)
+    """
+    check_precision(precision)
+    places.check_params(params)
+    (result,) = evaluate(
+        params,
+        places.description.config,
+        benchmark,
+        groupings=["single"],
+        batch_size=batch_size,
+        cache=cache,
+        precision=precision,
+        quiet=quiet,
+    )
+    point = result.operating_point
+    assert point is not None  # asked for above
+    if not point.reached:
+        raise InputError(f"precision: {caveats(point)[0]}, on {benchmark.name}")
+    calibration = Calibration(
+        min_similarity=point.min_similarity,
+        precision=precision,
+        answered=point.answered,
+        right=point.right,
+        queries=point.queries,
+        unknown=point.unknown,
+        unknown_answered=point.unknown_answered,
+        database=len(benchmark.database),
+        benchmark=benchmark.name,
+        rule=benchmark.rule,
+        model=places.description.model,
+        created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    )
+    with next_writer(places.folder):  # an addition removes temporary files beside the description
+        write_calibration(places.folder, calibration)
+    places.calibration = calibration
+    return calibration
+
+
+def operating_point_of(calibration: Calibration) -> OperatingPoint:
+    """Return the operating point that a map remembers."""
+    return OperatingPoint(
+        asked=calibration.precision,
+        min_similarity=calibration.min_similarity,
+        answered=calibration.answered,
+        right=calibration.right,
+        queries=calibration.queries,
+        unknown=calibration.unknown,
+        unknown_answered=calibration.unknown_answered,
+    )

@@ -1,0 +1,175 @@
+"""The similarity to ask of a first retrieval, so that accepted ones are right to a precision."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.stats
+from jaxtyping import Float, Int
+
+from crisalad_jax.evaluation.metrics import accepted, right_retrievals
+from crisalad_jax.utils.errors import InputError
+
+CONFIDENCE = 0.95
+"""Confidence of the lower bound of a precision."""
+
+
+class OperatingPoint(NamedTuple):
+    """What accepting first retrievals from a similarity on gives, measured on some queries.
+
+    If no similarity reaches the asked precision, this is the point of the highest precision, and
+    `reached` is False.
+    """
+
+    asked: float
+    """The precision asked for, as a fraction."""
+    min_similarity: float
+    """A first retrieval is accepted at this similarity or above it."""
+    answered: int
+    """Number of queries whose first retrieval is accepted."""
+    right: int
+    """Number of these whose first retrieval is right."""
+    queries: int
+    """Number of all queries."""
+    unknown: int
+    """Number of queries without a positive: places that the database does not have."""
+    unknown_answered: int
+    """Number of these that are accepted all the same, each of them wrongly."""
+
+    @property
+    def precision(self) -> float:
+        """Share of the accepted first retrievals that are right."""
+        return self.right / self.answered
+
+    @property
+    def lower_bound(self) -> float:
+        """Lower end of the one-sided 95 % interval of the precision by Clopper and Pearson 1934.
+
+        Queries count as independent, and the similarity as given beforehand. It was chosen on the
+        same queries, so that the bound is somewhat too high.
+        """
+        if not self.right:
+            return 0.0
+        wrong = self.answered - self.right
+        return float(scipy.stats.beta.ppf(1 - CONFIDENCE, self.right, wrong + 1))
+
+    @property
+    def recall(self) -> float:
+        """Share of all queries that are accepted and right."""
+        return self.right / self.queries
+
+    @property
+    def reached(self) -> bool:
+        """Whether the measured precision is at least the asked one."""
+        return self.precision >= self.asked
+
+
+def check_precision(precision: float) -> None:
+    """Raise InputError unless a precision is above 0 and at most 1."""
+    if not 0 < precision <= 1:
+        raise InputError(
+            f"precision: found {precision}, expected a fraction above 0 and at most 1, as 0.99"
+        )
+
+
+def operating_point(
+    indices: Int[np.ndarray, "q k"],
+    similarities: Float[np.ndarray, "q k"],
+    positives: Sequence[Int[np.ndarray, " _"]],
+    precision: float,
+) -> OperatingPoint:
+    """Choose the similarity that leaves the most recall at a precision.
+
+    These are thresholds of the curve of `precision_recall`. Queries of equal similarity are
+    accepted together. A query without positives is wrong whenever it is accepted, and recall is of
+    all queries, so that it is Recall@1 where everything is accepted.
+
+    Args:
+        indices: database indices of each query's neighbours, best first; only the first counts.
+        similarities: those of `indices`.
+        positives: the database indices that are right for each query, possibly none.
+        precision: share of the accepted first retrievals that must be right, above 0 to 1.
+
+    Returns:
+        The lowest such similarity, rounded down as far as it accepts the same queries; where no
+        similarity reaches the precision, the one of the highest precision.
+
+    Raises:
+        InputError: such a precision, or what `right_retrievals` raises.
+
+    Example:
+        >>> import numpy as np
+        >>> similarities = np.array([[0.9], [0.8], [0.7], [0.6]])
+        >>> positives = [np.array([0]), np.array([0]), np.array([]), np.array([0])]
+        >>> point = operating_point(np.zeros((4, 1), int), similarities, positives, 0.99)
+        >>> point.min_similarity, point.answered, point.recall
+        (0.8, 2, 0.5)
+    """
+    check_precision(precision)
+    right = right_retrievals(indices[:, :1], positives)[:, 0]
+    known = np.array([np.size(wanted) > 0 for wanted in positives])
+    ordered, last, accepted_right = accepted(similarities[:, 0], right)
+    precisions = accepted_right / (last + 1)
+    enough = np.flatnonzero(precisions >= precision)
+    best = precisions == precisions.max()
+    place = int(enough[-1] if len(enough) else np.flatnonzero(best)[-1])
+    chosen, answered = float(ordered[last[place]]), int(last[place]) + 1
+    below = float(ordered[answered]) if answered < len(ordered) else -math.inf
+    return OperatingPoint(
+        asked=precision,
+        min_similarity=_rounded_down(chosen, below),
+        answered=answered,
+        right=int(accepted_right[place]),
+        queries=len(right),
+        unknown=int((~known).sum()),
+        unknown_answered=int((~known & (similarities[:, 0] >= chosen)).sum()),
+    )
+
+
+def _rounded_down(value: float, below: float) -> float:
+    """Round down to the fewest decimals, three or more, that stay above the next lower value."""
+    if math.isfinite(value):
+        for power in (10.0**decimals for decimals in range(3, 16)):
+            rounded = math.floor(value * power) / power
+            if below < rounded <= value:
+                return rounded
+    return value
+
+
+def to_json(point: OperatingPoint) -> dict[str, Any]:
+    """Put an operating point into JSON values by name."""
+    names = ("precision", "lower_bound", "recall", "reached")
+    return point._asdict() | {name: getattr(point, name) for name in names}
+
+
+def needed(precision: float) -> int | None:
+    """Return how many accepted queries, all right, a lower bound of `precision` takes.
+
+    None at a precision of 1, which no number of queries shows.
+    """
+    return None if precision == 1 else math.ceil(math.log(1 - CONFIDENCE) / math.log(precision))
+
+
+def caveats(point: OperatingPoint) -> list[str]:
+    """Say in sentences what an operating point does not show; none where it shows what was asked.
+
+    Each is of at most one line, and begins with a small letter, to stand behind a name.
+    """
+    asked = f"{100 * point.asked:g} %"
+    measured = f"{point.right} of {point.answered} answers were right"
+    if not point.reached:
+        return [
+            f"no similarity reaches a precision of {asked}; the highest is "
+            f"{100 * point.precision:.1f} % ({measured})"
+        ]
+    if point.lower_bound >= point.asked:
+        return []
+    sure = (
+        f"rests on few queries: {measured}, which shows a precision of at least "
+        f"{100 * point.lower_bound:.1f} % (95 % confidence)"
+    )
+    enough = needed(point.asked)
+    if point.right == point.answered and enough is not None:
+        sure += f"; {asked} takes {enough} answers, all of them right"
+    return [sure]

@@ -1,0 +1,83 @@
+"""A map's calibration: the similarity from which its answers count, and how it was measured."""
+
+import dataclasses
+import pathlib
+
+from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.retrieval.maps.manifest import write_record
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json
+
+CALIBRATION = "calibration.json"
+"""Name of the file, beside the map's description; versions before it do not look for it."""
+FORMAT = 1
+"""Version of the file that this package writes, and the newest that it reads."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """The contents of calibration.json: an operating point, and what it was measured on."""
+
+    min_similarity: float
+    """A query to which no image of the map is that similar shows no place of the map."""
+    precision: float
+    """The precision that was asked for, as a fraction."""
+    answered: int
+    """Number of queries that were answered, of which `right` rightly."""
+    right: int
+    queries: int
+    """Number of all queries of the set."""
+    unknown: int
+    """Number of queries without a positive, of which `unknown_answered` were answered."""
+    unknown_answered: int
+    database: int
+    """Number of images that the queries were compared with."""
+    benchmark: str
+    """Name of the evaluation set."""
+    rule: str
+    """What counted as right."""
+    model: str
+    """The `model_hash` of the map, and so of the descriptors that were compared."""
+    created: str = ""
+    format: int = FORMAT
+
+
+def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
+    """Read what the map in `folder` remembers; None where it was never calibrated.
+
+    Raises:
+        InputError: the file is damaged, of a newer version, or of another model than the map's.
+    """
+    path = folder / CALIBRATION
+    if not path.exists():
+        return None
+    value = read_json(path, "a map's calibration", quiet=True)
+    version = value.get("format") if isinstance(value, dict) else None
+    if type(version) is int and version > FORMAT:
+        raise InputError(
+            f"{path}: found format {version}, expected at most {FORMAT}: it is of a newer "
+            "crisalad-jax"
+        )
+    calibration = from_plain(Calibration, value, source=str(path))
+    check_min_similarity(calibration.min_similarity, str(path))
+    if calibration.model != model:
+        raise InputError(
+            f"{path}: found a calibration of model {calibration.model[:12]}, expected "
+            f"{model[:12]}, which made the map: remove the file, or calibrate again"
+        )
+    return calibration
+
+
+def write_calibration(folder: pathlib.Path, calibration: Calibration) -> None:
+    """Write what the map in `folder` is to remember, in place of what it did.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    write_record(folder / CALIBRATION, to_plain(calibration), indent=2)
+
+
+def check_min_similarity(value: float, source: str = "min_similarity") -> None:
+    """Raise InputError unless a similarity is a cosine."""
+    if not -1 <= value <= 1:
+        raise InputError(f"{source}: found similarity {value}, expected one from -1 to 1")

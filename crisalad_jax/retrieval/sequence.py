@@ -1,0 +1,176 @@
+"""Sequence evidence: a discrete Bayes filter over the images of a map, in their order.
+
+The state is the number of the image at which the camera is. Frames of a query come one after the
+other; each moves the belief by a model of motion, and weighs it by the similarities of the frame
+to all images. The idea is of Xu, Suenderhauf and Milford 2021, "Probabilistic Visual Place
+Recognition for Hierarchical Localization" (RA-L); the likelihood here is another one.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64, Int64
+
+from crisalad_jax.config.checks import check_types
+from crisalad_jax.utils.errors import InputError
+
+_PRIOR_FRAMES = 10
+"""Number of frames that the map's own mean counts for in the mean of the frames so far."""
+
+
+class SequenceState(NamedTuple):
+    """What a filter knows after some frames."""
+
+    belief: Float64[np.ndarray, " place"]
+    """Probability that the camera is at each image of the map."""
+    common: Float64[np.ndarray, " place"]
+    """Similarity of each image to the mean descriptor of the map."""
+    seen: Float64[np.ndarray, " place"]
+    """Sum of the similarities of the frames so far to each image."""
+    frames: int
+    """Number of frames so far."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BayesFilter:
+    """A discrete Bayes filter over the images of a map, for consecutive frames of one camera.
+
+    Motion: from one frame to the next the camera moves by at most `reach` images of the map,
+    either way, each step as likely; with probability `jump` it may be anywhere. Evidence: the
+    likelihood of an image is exp(`sharpness` * z), where z is its similarity to the frame in
+    standard deviations from the mean over the map. So it does not depend on how close together a
+    model's similarities lie.
+
+    Where `adapt` is true, similarities are those of descriptors from which the mean of their side
+    was taken: of the map, and of the frames so far. That takes away what all frames of a day have
+    in common, such as its light (Schubert, Neubert and Protzel 2020, "Unsupervised Learning Methods
+    for Visual Place Recognition in Discretely and Continuously Changing Environments", ICRA). The
+    map's mean counts for ten frames in the second mean, until more are there.
+
+    Args:
+        reach: images of the map between two frames, at most.
+        jump: probability that a frame is anywhere, above 0 and below 1.
+        sharpness: weight of a frame against the frames before it.
+        adapt: whether the mean of each side is taken away.
+
+    Raises:
+        InputError: a number out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> places = np.eye(5)  # descriptors of five images that have nothing in common
+        >>> frames = places[[1, 2, 3]]
+        >>> common = places @ places.mean(axis=0)
+        >>> BayesFilter(reach=1).follow(frames @ places.T, common).places
+        array([1, 2, 3])
+    """
+
+    reach: int = 2
+    jump: float = 0.01
+    sharpness: float = 2.0
+    adapt: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the types and ranges."""
+        check_types(self)
+        for name, fits, expected in (
+            ("reach", self.reach >= 1, "at least 1"),
+            ("jump", 0 < self.jump < 1, "above 0 and below 1"),
+            ("sharpness", 0 < self.sharpness < np.inf, "above 0"),
+        ):
+            if not fits:
+                value = getattr(self, name)
+                raise InputError(f"BayesFilter.{name}: found {value}, expected {expected}")
+
+    def start(self, common: Float[np.ndarray, " place"]) -> SequenceState:
+        """Begin a sequence anywhere in a map.
+
+        Args:
+            common: similarity of each image to the mean descriptor of the map.
+
+        Returns:
+            The state before the first frame.
+        """
+        common = common.astype(np.float64)
+        count = len(common)
+        return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0)
+
+    def predict(self, belief: Float64[np.ndarray, " place"]) -> Float64[np.ndarray, " place"]:
+        """Move a belief from one frame to the next, by the model of motion."""
+        # At the ends of the map fewer images are in reach, which share what leaves an image.
+        spread = belief / self._window(np.ones(len(belief)))
+        return (1 - self.jump) * self._window(spread) + self.jump / len(belief)
+
+    def step(
+        self, state: SequenceState, similarities: Float[np.ndarray, " place"]
+    ) -> SequenceState:
+        """Take the next frame into account.
+
+        Args:
+            state: after the frame before.
+            similarities: of the frame to every image of the map: cosines of descriptors.
+
+        Returns:
+            The state after this frame.
+        """
+        row = similarities.astype(np.float64)
+        seen, frames = state.seen + row, state.frames + 1
+        if self.adapt:
+            mean = (seen + _PRIOR_FRAMES * state.common) / (frames + _PRIOR_FRAMES)
+            row = _without_means(row, mean, state.common)
+        deviation = row.std()
+        evidence = self.sharpness * (row - row.max()) / (deviation if deviation > 0 else 1)
+        belief = self.predict(state.belief) * np.exp(evidence)
+        return SequenceState(belief / belief.sum(), state.common, seen, frames)
+
+    def follow(
+        self,
+        similarities: Float[np.ndarray, "frame place"],
+        common: Float[np.ndarray, " place"],
+    ) -> "Followed":
+        """Follow a camera through all frames of a sequence.
+
+        Args:
+            similarities: of every frame, in order, to every image of the map.
+            common: as in `start`.
+
+        Returns:
+            The best place at each frame, from this frame and those before it.
+        """
+        state, places, probabilities = self.start(common), [], []
+        for row in similarities:
+            state = self.step(state, row)
+            places.append(int(state.belief.argmax()))
+            probabilities.append(state.belief.max())
+        return Followed(np.array(places, np.int64), np.array(probabilities))
+
+    def _window(self, values: Float64[np.ndarray, " place"]) -> Float64[np.ndarray, " place"]:
+        """Sum values within `reach` of each place."""
+        reach = min(self.reach, len(values) - 1)
+        return np.convolve(values, np.ones(2 * reach + 1))[reach : reach + len(values)]
+
+
+class Followed(NamedTuple):
+    """Where a camera was at each frame of a sequence."""
+
+    places: Int64[np.ndarray, " frame"]
+    """Number of the most probable image of the map."""
+    probabilities: Float64[np.ndarray, " frame"]
+    """Probability that the camera is there; images beside it share what they have in common."""
+
+
+def _without_means(
+    row: Float64[np.ndarray, " place"],
+    mean: Float64[np.ndarray, " place"],
+    common: Float64[np.ndarray, " place"],
+) -> Float64[np.ndarray, " place"]:
+    """Compute similarities of a frame without its side's mean to images without the map's.
+
+    With unit descriptors d of the map, their mean m, a frame q and the mean f of the frames, it is
+    (d - m) . (q - f) / |d - m|. No descriptor is needed: `row` is d . q, `mean` d . f, `common`
+    d . m, and the average over the map of each of the three is its product with m.
+    """
+    products = (row - row.mean()) - (mean - mean.mean())
+    lengths = np.sqrt(np.maximum(1 - 2 * common + common.mean(), 0))
+    return products / np.maximum(lengths, 1e-6)  # an image that is the mean itself says nothing
