@@ -2,14 +2,18 @@
 
 import dataclasses
 import pathlib
+from typing import Literal
 
-from crisalad_jax.cli.common import console, find_given, say
+from crisalad_jax.cli.common import console, find_given, give_json, prepare_json, say
 from crisalad_jax.cli.tables import points_table
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
 from crisalad_jax.evaluation.operating_point import caveats, check_precision
 from crisalad_jax.retrieval.maps.calibration import CALIBRATION
 from crisalad_jax.retrieval.maps.map import Map
+
+EXAMPLE = "crisalad calibrate --map corridor.map --data corridor-set --precision 0.99"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +52,10 @@ class Calibrate:
     """How many frames a positive may be away, for two plain folders of the same moments."""
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or leave it out and say so."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
     verify: bool = True
     """Check the map's descriptors against their checksums; --no-verify skips that, where files are
     huge."""
@@ -61,6 +69,7 @@ class Calibrate:
 
 def run(arguments: Calibrate) -> None:
     """Calibrate the map, and print what it remembers."""
+    prepare_json(arguments.json)
     check_precision(arguments.precision)
     with Map.open(arguments.map, verify=arguments.verify) as places:
         params = places.load_params(find_given(arguments.weights, quiet=arguments.quiet))
@@ -84,6 +93,7 @@ def run(arguments: Calibrate) -> None:
             benchmark,
             arguments.precision,
             batch_size=arguments.batch_size,
+            on_bad_image=arguments.on_bad_image,
             quiet=arguments.quiet,
         )
     point = operating_point_of(calibration)
@@ -94,3 +104,4 @@ def run(arguments: Calibrate) -> None:
         f"{arguments.map / CALIBRATION}: answers below similarity {point.min_similarity:.9g} are "
         "unknown from now on"
     )
+    give_json(arguments.json, to_plain(calibration))

@@ -18,6 +18,8 @@ COMMON = (
     "grouping",
     "batch-size",
     "rerank",
+    "reference",
+    "jobs",
     "page",
     "json",
     "on-bad-image",

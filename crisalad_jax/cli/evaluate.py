@@ -41,7 +41,7 @@ COMMON = (
     "images",
     "queries",
     "radius",
-    "frames",
+    "precision",
     "pca",
     "rerank",
     "report",

@@ -31,6 +31,8 @@ COMMON = (
     "window",
     "weights",
     "k",
+    "min-similarity",
+    "sequence",
     "json",
     "gallery",
     "map-images",

@@ -10,6 +10,8 @@ from crisalad_jax.cli.common import find_given, say
 from crisalad_jax.serve import serve_map
 from crisalad_jax.serve.access import read_token
 
+EXAMPLE = "crisalad serve corridor.map --port 8000"
+
 
 @dataclasses.dataclass(frozen=True)
 class Serve:

@@ -3,7 +3,7 @@
 import datetime
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.operating_point import OperatingPoint, caveats, check_precision
 from crisalad_jax.nn.model import Crisalad
@@ -20,6 +20,7 @@ def calibrate(
     precision: float = 0.99,
     *,
     batch_size: int = 16,
+    on_bad_image: OnBadImage = "stop",
     cache: ImageCache | None = None,
     quiet: bool = False,
 ) -> Calibration:
@@ -36,6 +37,7 @@ def calibrate(
         benchmark: the set, such as `open_benchmark` makes.
         precision: share of the answers that must be right, above 0 to 1.
         batch_size: images described at once, each as if it were alone.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
         cache: of decoded images.
         quiet: no progress bars.
 
@@ -72,6 +74,7 @@ def calibrate(
         benchmark,
         groupings=["single"],
         batch_size=batch_size,
+        on_bad_image=on_bad_image,
         cache=cache,
         precision=precision,
         quiet=quiet,

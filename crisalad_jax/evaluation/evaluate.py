@@ -88,8 +88,8 @@ def evaluate(
     Raises:
         InputError: parameters of another configuration, no ground truth, an image cannot be read
             or none of a side, components that are not for this model or make no unit vectors, such
-            a precision, or what `parse_groupings`, `check_grouping`, `Reranking.check` and `Reranker`
-            raise.
+            a precision, or what `parse_groupings`, `check_grouping`, `Reranking.check` and
+            `Reranker` raise.
 
     Example:
         >>> import jax, shutil

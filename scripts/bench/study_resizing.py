@@ -29,7 +29,7 @@ def _pillow(path: pathlib.Path, height: int, width: int) -> np.ndarray:
 
 def _opencv(interpolation: int) -> Resize:
     def resize(path: pathlib.Path, height: int, width: int) -> np.ndarray:
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+        image = np.asarray(cv2.imread(str(path), cv2.IMREAD_COLOR_RGB))
         return cv2.resize(image, (width, height), interpolation=interpolation)
 
     return resize
