@@ -8,6 +8,7 @@ from crisalad_jax.cli.common import STDOUT, find_given
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import printable
 from crisalad_jax.utils.signals import defer_signals
@@ -34,6 +35,7 @@ def run(arguments: "Query") -> None:
             f"--json: found {arguments.json} with {name}, expected -: answers go to the standard "
             "output as they come"
         )
+    sequence = sequence_of(arguments)
     with contextlib.ExitStack() as stack:
         # First, for its errors: loading a model takes seconds.
         if arguments.watch is not None:
@@ -58,6 +60,8 @@ def run(arguments: "Query") -> None:
             source,
             k=arguments.k,
             window=arguments.window,
+            min_similarity=arguments.min_similarity,
+            sequence=sequence,
             ready=ready,
             check=state.check,
         )
@@ -68,6 +72,16 @@ def run(arguments: "Query") -> None:
         finally:
             dropped = f"; {source.dropped} frames passed over" if source.dropped else ""
             _say(f"{latency_words(latencies)}{dropped}")
+
+
+def sequence_of(arguments: "Query") -> BayesFilter | None:
+    """Make the filter that the flags ask for; None where they ask for none."""
+    reach = arguments.sequence_reach
+    if arguments.sequence is not None:
+        return BayesFilter() if reach is None else BayesFilter(reach=reach)
+    if reach is not None:
+        raise InputError("--sequence-reach: found without --sequence bayes, expected both")
+    return None
 
 
 def _say(line: str) -> None:

@@ -12,7 +12,6 @@ from crisalad_jax.cli.common import STDOUT, console, find_given, say, talk_besid
 from crisalad_jax.cli.tables import answers_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
-from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_target, real_path
 
@@ -103,7 +102,7 @@ def run(arguments: Query) -> None:
     file = None if arguments.json == STDOUT else arguments.json
     talk_beside(arguments.json)
     _check_files(file, arguments)
-    sequence = _sequence(arguments)
+    sequence = live.sequence_of(arguments)
     with Map.open(arguments.map, verify=arguments.verify) as places:
         answers = query(
             places,
@@ -146,16 +145,6 @@ def run(arguments: Query) -> None:
         say(f"{arguments.gallery}: {shown}{len(answers.queries)} queries {of}")
     if file is not None:
         say(f"{file}: {len(answers.queries)} queries {of}")
-
-
-def _sequence(arguments: Query) -> BayesFilter | None:
-    """Make the filter that the flags ask for; None where they ask for none."""
-    reach = arguments.sequence_reach
-    if arguments.sequence is not None:
-        return BayesFilter() if reach is None else BayesFilter(reach=reach)
-    if reach is not None:
-        raise InputError("--sequence-reach: found without --sequence bayes, expected both")
-    return None
 
 
 def _unknown(answers: Answers) -> str:

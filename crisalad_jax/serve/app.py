@@ -57,6 +57,8 @@ class Located:
     """The most similar images of the map, best first."""
 
     neighbours: list[Neighbour]
+    known: bool | None
+    """Whether the picture shows a place of the map, as far as the map is calibrated; else null."""
     latency_ms: float
     """From the last byte of the picture to the answer."""
 
@@ -212,8 +214,8 @@ def make_app(
         with room.taken():
             data, name = await _picture(request, max_bytes)
             start = time.perf_counter()
-            found = await service.locate(data, name, k)
-        return Located([Neighbour(**each) for each in found], _milliseconds(start))
+            found, known = await service.locate(data, name, k)
+        return Located([Neighbour(**each) for each in found], known, _milliseconds(start))
 
     @app.post(
         "/images",

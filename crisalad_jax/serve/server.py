@@ -142,8 +142,9 @@ def _opened(folder: str | os.PathLike[str], *, append: bool, verify: bool) -> It
         if not append:
             yield places
             return
-        description = places.description
+        description, calibration = places.description, places.calibration
     with open_for_appending(folder, description) as places:
+        places.calibration = calibration
         yield places
 
 

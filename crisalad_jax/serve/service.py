@@ -12,7 +12,7 @@ import numpy as np
 
 from crisalad_jax.data.images import decode_image, read_image
 from crisalad_jax.data.resize import Pixels, resize_image
-from crisalad_jax.retrieval.maps.query import answer_fields, position_fields
+from crisalad_jax.retrieval.maps.query import answer_fields, asked_similarity, position_fields
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.serve.names import check_new_name
 from crisalad_jax.serve.worker import ADDED, Addition, Found, MapWorker, Question
@@ -80,7 +80,9 @@ class MapService:
             "appends": self.appends,
         }
 
-    async def locate(self, data: bytes, name: str, k: int) -> list[dict[str, Any]]:
+    async def locate(
+        self, data: bytes, name: str, k: int
+    ) -> tuple[list[dict[str, Any]], bool | None]:
         """Find the k most similar images of the map to a picture.
 
         Args:
@@ -89,7 +91,8 @@ class MapService:
             k: number of answers.
 
         Returns:
-            Fields of each answer as `crisalad query --json` has them, and its number.
+            Fields of each answer as `crisalad query --json` has them, and its number; and whether
+            the picture shows a place of the map, None where that is not calibrated.
 
         Raises:
             InputError: the bytes are no picture that can be read.
@@ -98,8 +101,12 @@ class MapService:
         picture = await self._prepared(data, name)
         work = Question(picture, k)
         found: list[Found] = await asyncio.wrap_future(self._worker.submit(work))
-        axes = self._worker.places.axes
-        return [{**answer_fields(answer, axes), "number": number} for number, answer in found]
+        places = self._worker.places
+        fields = [
+            {**answer_fields(answer, places.axes), "number": number} for number, answer in found
+        ]
+        least = asked_similarity(places, None)
+        return fields, None if least is None else found[0][1].similarity >= least
 
     async def append(
         self,

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import read_image
+from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import answer_fields, query
 from crisalad_jax.serve.worker import ADDED
@@ -66,6 +67,18 @@ def test_many_clients_get_the_answers_of_query(service, pictures, expected):
         assert reply.status == 200
         assert_answers(reply.json["neighbours"], expected[name])
         assert reply.json["latency_ms"] > 0
+
+
+def test_a_calibrated_map_knows_what_it_does_not_know(own_map, params, pictures, expected):
+    best = {name: ranked[0]["similarity"] for name, ranked in expected.items()}
+    low, high = sorted(best.values())[1:3]
+    with Map.open(own_map) as places:
+        model = places.description.model
+    write_calibration(own_map, Calibration((low + high) / 2, 0.9, 1, 1, 1, 0, 0, 7, "", "", model))
+    with serving(own_map, params) as service:
+        for path in pictures:
+            reply = service.ask("POST", "/locate", path.read_bytes())
+            assert reply.json["known"] == (best[path.name] >= high)
 
 
 def test_a_form_is_as_good_as_a_body(service, pictures, expected):

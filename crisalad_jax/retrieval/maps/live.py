@@ -10,8 +10,11 @@ import numpy as np
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.live import Frame
 from crisalad_jax.nn.model import Crisalad, check_params
+from crisalad_jax.retrieval.maps.follow import Follower
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import Answers, json_rows, json_text
+from crisalad_jax.retrieval.maps.query import Answers, asked_similarity, json_rows, json_text
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.retrieval.windows import FrameDescriber, check_window
 from crisalad_jax.utils.errors import InputError
 
@@ -41,7 +44,7 @@ class LiveAnswer(NamedTuple):
         """Return the answer as one line of JSON."""
         (row,) = json_rows(self.answers)
         more = {"time": round(self.time, 3), "latency_ms": round(self.latency_ms, 1)}
-        return json_text({"query": row["query"], **more, "neighbours": row["neighbours"]})
+        return json_text({"query": row.pop("query")} | more | row)
 
 
 def query_live(
@@ -51,6 +54,8 @@ def query_live(
     *,
     k: int = 5,
     window: int = 1,
+    min_similarity: float | None = None,
+    sequence: BayesFilter | None = None,
     ready: Callable[[], None] = lambda: None,
     check: Callable[[], None] = lambda: None,
 ) -> Iterator[LiveAnswer]:
@@ -65,6 +70,8 @@ def query_live(
         k: number of answers to each frame.
         window: frames that are described together: each with those just answered before it. 1
             describes each alone, as a map's images are.
+        min_similarity: see `query`.
+        sequence: see `query`; frames that were passed over count for nothing.
         ready: called when the first frame can be answered.
         check: called several times a second; it may raise, to end this.
 
@@ -96,6 +103,8 @@ def query_live(
     check_window(config, window)
     places.check_params(params)
     check_params(params, config)
+    least = asked_similarity(places, min_similarity)
+    follower = None if sequence is None else Follower(places, sequence)
     describer = FrameDescriber(params, config, window)
 
     def answers() -> Iterator[LiveAnswer]:
@@ -104,8 +113,21 @@ def query_live(
         describer.forget()
         ready()
         for frame in source.frames(check):
-            neighbours = places.search(describer(frame.image), k)
-            found = Answers([pathlib.Path(frame.name)], neighbours, places.images, places.axes)
+            described = describer(frame.image)
+            if follower is None:
+                neighbours, filtered = places.search(described, k), ()
+            else:
+                numbers, similarities, *filtered = follower.answer(described, k)
+                neighbours = Neighbours(numbers, similarities)
+            found = Answers(
+                [pathlib.Path(frame.name)],
+                neighbours,
+                places.images,
+                places.axes,
+                (),
+                least,
+                *filtered,
+            )
             latency = time.perf_counter() - frame.taken
             yield LiveAnswer(found, frame.time, 1000 * latency)
 

@@ -138,11 +138,7 @@ def query(
     check_grouping((), batch_size, seed=0)
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
-    if min_similarity is not None:
-        check_min_similarity(min_similarity)
-        min_similarity = min_similarity if min_similarity > -1 else None
-    elif places.calibration is not None:
-        min_similarity = places.calibration.min_similarity
+    min_similarity = asked_similarity(places, min_similarity)
     sources = _listed(images, fps)
     paths = [path for source in sources for path in source]
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -183,6 +179,22 @@ def query(
     return Answers(
         readable, neighbours, places.images, places.axes, unreadable, min_similarity, *filtered
     )
+
+
+def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
+    """Return the similarity that best answers must have; None where any counts.
+
+    Args:
+        places: the map, which may remember one.
+        min_similarity: as of `query`.
+
+    Raises:
+        InputError: it is no cosine.
+    """
+    if min_similarity is None:
+        return None if places.calibration is None else places.calibration.min_similarity
+    check_min_similarity(min_similarity)
+    return min_similarity if min_similarity > -1 else None
 
 
 def _described(

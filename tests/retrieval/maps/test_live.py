@@ -13,6 +13,7 @@ from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import json_lines, query
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, write_video
 from tests.retrieval.maps.test_stores import ROUNDING
@@ -126,3 +127,23 @@ def test_what_is_refused(folder, params):
             query_live(places, params, Given([]), k=0)
         with pytest.raises(InputError, match="window: found 0, expected at least 1"):
             query_live(places, params, Given([]), window=0)
+
+
+def test_a_filter_and_a_least_similarity_are_those_of_query(folder, shared, params):
+    paths = list_images(shared / "town" / "images" / "test" / "queries")
+    with Map.open(folder) as places:
+        options = {"k": 2, "sequence": BayesFilter(reach=1)}
+        best = query(places, params, paths, k=1, batch_size=BATCH, quiet=True).neighbours
+        # Between two of the queries: rounding does not decide.
+        low, high = np.sort(best.similarities[:, 0])[[1, 2]]
+        options["min_similarity"] = float(low + high) / 2
+        expected = query(places, params, paths, batch_size=BATCH, quiet=True, **options)
+        found = list(query_live(places, params, Given(paths), **options))
+    lines = [json.loads(answer.json_line()) for answer in found]
+    for line, right in zip(lines, map(json.loads, json_lines(expected)), strict=True):
+        assert line["known"] == right["known"]
+        for one, other in zip(line["neighbours"], right["neighbours"], strict=True):
+            assert one["name"] == other["name"]
+            # Similarities of other batches, whose rounding the likelihood amplifies a little.
+            assert one["probability"] == pytest.approx(other["probability"], abs=1e-4)
+    assert [line["known"] for line in lines].count(False) == 2
