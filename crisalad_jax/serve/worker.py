@@ -81,6 +81,9 @@ class MapWorker:
             batch_size: largest number of pictures described together.
         """
         self.places, self._params, self._batch_size = places, params, batch_size
+        # Each is a program to compile before the first answer, so that they are few.
+        powers = (4**i for i in range(batch_size.bit_length()))
+        self._sizes = [*(size for size in powers if size < batch_size), batch_size]
         self._waiting: queue.SimpleQueue[_Waiting | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="map", daemon=True)
 
@@ -95,18 +98,15 @@ class MapWorker:
         self._thread.join()
 
     def compile(self, *, quiet: bool = False) -> None:
-        """Compile what describes one picture to `batch_size` of them, and search once.
+        """Compile what describes one picture, a few, and `batch_size` of them, and search once.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         config = self.places.description.config
         blank = prepare_image(np.zeros((*config.image_size, 3), np.uint8), config)
-        sizes = sorted(
-            {min(1 << i, self._batch_size) for i in range(self._batch_size.bit_length() + 1)}
-        )
-        with progress_bar("compiling", len(sizes), "programs", quiet=quiet) as bar:
-            for size in sizes:
+        with progress_bar("compiling", len(self._sizes), "programs", quiet=quiet) as bar:
+            for size in self._sizes:
                 descriptors = self._describe([blank] * size)
                 bar.advance(1)
         self.places.search(descriptors[:1], 1)
@@ -151,8 +151,13 @@ class MapWorker:
                     each.result.set_exception(MapFailedError(str(error)))
 
     def _describe(self, pictures: Sequence[Pixels]) -> Float32[np.ndarray, "n d"]:
+        count, padded = len(pictures), list(pictures)
+        if len({picture.shape for picture in pictures}) == 1:
+            size = next(size for size in self._sizes if size >= count)
+            padded += padded[:1] * (size - count)
         config = self.places.description.config
-        return describe_prepared(self._params, config, pictures, batch_size=self._batch_size)
+        described = describe_prepared(self._params, config, padded, batch_size=self._batch_size)
+        return described[:count]
 
     def _append(self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]) -> None:
         """Append the additions of a batch together, without those that the map does not take."""

@@ -27,8 +27,8 @@ LIMIT = 50_000
 """Largest body in bytes: the town's pictures have a tenth of it."""
 
 
-TOGETHER = 2
-"""Pictures described at once: few programs to compile, and the clients are many more."""
+TOGETHER = 3
+"""Pictures described at once: of 1 and 3 there are programs to compile, two are padded."""
 
 
 class Reply(NamedTuple):
