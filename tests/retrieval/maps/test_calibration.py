@@ -212,7 +212,7 @@ def hand_made(min_similarity: float | None, images) -> Answers:
     paths = [pathlib.Path("a.jpg"), pathlib.Path("b.jpg")]
     similarities = np.array([[0.9, 0.8], [0.3, 0.2]], np.float32)
     neighbours = Neighbours(np.array([[0, 1], [1, 0]]), similarities)
-    return Answers(paths, neighbours, images, ("east", "north"), min_similarity)
+    return Answers(paths, neighbours, images, ("east", "north"), min_similarity=min_similarity)
 
 
 def test_unknown_places_in_json_and_in_the_table(made):
