@@ -121,7 +121,7 @@ def run(arguments: Query) -> None:
         say(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
     of = f"in a map of {len(answers.images)} images{_unknown(answers)}"
     if arguments.json is None and arguments.gallery is None:
-        title = f"{arguments.map}, {len(answers.images)} images{unknown}"
+        title = f"{arguments.map}, {len(answers.images)} images{_unknown(answers)}"
         console.print(answers_table(answers, title))
     elif file is None and arguments.json is not None:
         for line in json_lines(answers):

@@ -47,7 +47,7 @@ class Neighbour:
     similarity: float
     """Cosine of the two descriptors."""
     position: dict[str, float] | None
-    """east and north in metres, or lat and lon in degrees."""
+    """east and north, or x and y, in metres, or lat and lon in degrees."""
     number: int
     """Its picture is at /images/{number}."""
 
@@ -230,11 +230,13 @@ def make_app(
         lon: Annotated[float | None, fastapi.Query(ge=-180, le=180)] = None,
         east: Annotated[float | None, fastapi.Query(ge=-MOST_METRES, le=MOST_METRES)] = None,
         north: Annotated[float | None, fastapi.Query(ge=-MOST_METRES, le=MOST_METRES)] = None,
+        x: Annotated[float | None, fastapi.Query(ge=-MOST_METRES, le=MOST_METRES)] = None,
+        y: Annotated[float | None, fastapi.Query(ge=-MOST_METRES, le=MOST_METRES)] = None,
     ) -> Appended:
         """Append a picture to the map, for good; answers see it from then on."""
         if not service.appends:
             raise RefusedError(403, "images: found a map that is only read, expected --append")
-        axes, position = _position(name, (east, north), (lat, lon))
+        axes, position = _position(name, (east, north), (lat, lon), (x, y))
         with room.taken():
             data, _ = await _picture(request, max_bytes)
             start = time.perf_counter()
@@ -297,16 +299,21 @@ async def _body(request: fastapi.Request, limit: int) -> bytes:
 
 
 def _position(
-    name: str, metres: tuple[float | None, float | None], degrees: tuple[float | None, float | None]
+    name: str, *pairs: tuple[float | None, float | None]
 ) -> tuple[tuple[str, str] | None, tuple[float, float] | None]:
-    """Return the position of a new image and its axes, by default what a name with @UTM says."""
+    """Return the position of a new image and its axes, by default what a name with @UTM says.
+
+    The pairs are what the request says along each of `AXES`.
+    """
     given = [
         (axes, (first, second))
-        for axes, (first, second) in zip(AXES, (metres, degrees), strict=True)
+        for axes, (first, second) in zip(AXES, pairs, strict=True)
         if first is not None and second is not None
     ]
-    if len(given) != 1 and any(each is not None for each in (*metres, *degrees)):
-        raise RefusedError(400, "position: expected east and north, or lat and lon, or none of it")
+    if len(given) != 1 and any(each is not None for pair in pairs for each in pair):
+        raise RefusedError(
+            400, "position: expected east and north, or lat and lon, or x and y, or none of it"
+        )
     if given:
         return given[0]
     position = utm_position(name.rpartition("/")[2])
