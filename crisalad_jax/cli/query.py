@@ -34,6 +34,8 @@ class Query:
     """The model that made the map, as a file or a published name; by default where it was then."""
     k: int = 5
     """Answers to each query."""
+    exact: bool = False
+    """Search exactly, although the map has an approximate search."""
     json: pathlib.Path | None = None
     """File for the answers, a line of JSON for each query; - prints them."""
     gallery: pathlib.Path | None = None
@@ -64,6 +66,7 @@ def run(arguments: Query) -> None:
             places.load_params(find_given(arguments.weights, quiet=arguments.quiet)),
             arguments.images,
             k=arguments.k,
+            exact=arguments.exact,
             batch_size=arguments.batch_size,
             quiet=arguments.quiet,
         )

@@ -127,5 +127,30 @@ class FileStore:
             )
         return Neighbours(numbers, similarities)
 
+    def similarities(
+        self, queries: Float32[np.ndarray, "q d"], numbers: Int64[np.ndarray, "q k"]
+    ) -> Float32[np.ndarray, "q k"]:
+        """Compute the exact similarities of queries to descriptors of these numbers.
+
+        Raises:
+            InputError: a file is damaged or gone.
+        """
+        queries = np.ascontiguousarray(queries, np.float32)
+        return self._exact(queries, numbers, list(self._counts)).similarities
+
+    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
+        """Read the descriptors of these numbers.
+
+        Raises:
+            InputError: a file is damaged or gone.
+        """
+        firsts = np.array(list(self._counts))
+        rows = np.empty((len(numbers), self._length), np.float32)
+        segments = np.searchsorted(firsts, numbers, side="right") - 1
+        for segment in np.unique(segments):
+            places, first = np.flatnonzero(segments == segment), firsts[segment]
+            rows[places] = self._open(int(first))[numbers[places] - first]
+        return rows
+
     def close(self) -> None:
         """Do nothing: no connection is open."""

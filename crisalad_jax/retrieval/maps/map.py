@@ -16,22 +16,30 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.weights import load_weights, model_hash
-from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.maps.approximate import (
+    Approximate,
+    build_approximate,
+    open_approximate,
+)
+from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.manifest import (
-    DESCRIPTION,
+    COMPONENTS,
     SEGMENTS,
     MapDescription,
     check_model,
     has_images,
     is_checked,
+    read_components,
     read_description,
     undone_without_images,
+    write_description,
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import Store, open_store
+from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
@@ -82,6 +90,9 @@ class Map:
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self._store = store
+        self.components = read_components(folder, description)
+        """The components that shorten descriptors, and those of queries; None is none."""
+        self._approximate: Approximate | None = None
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
@@ -132,6 +143,7 @@ class Map:
         try:
             if verify and description.store == "files":
                 opened.verify()
+            opened._approximate = open_approximate(folder, opened._segments, verify=verify)
         except BaseException:
             opened.close()
             raise
@@ -209,14 +221,18 @@ class Map:
         self.axes = self.axes or axes
         self._segments.append(segment)
 
-    def search(self, queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+    def search(
+        self, queries: Float32[np.ndarray, "q d"], k: int, *, exact: bool = False
+    ) -> Neighbours:
         """Find the k most similar images of each query, best first; all where there are fewer.
 
         Search is exact, by inner product; of equal similarities the earlier image stands first.
+        A map with an approximate search finds nearly all of them. Their similarities are exact.
 
         Args:
-            queries: unit descriptors, of the map's model.
+            queries: unit descriptors, of the map's model, shortened by its `components`.
             k: neighbours per query.
+            exact: whether to search exactly although the map has an approximate search.
 
         Raises:
             InputError: no queries, none in the map, descriptors that are no unit vectors of the
@@ -227,7 +243,35 @@ class Map:
         if not len(self):
             raise InputError(f"{self.folder}: found a map without images, expected at least one")
         self._check_descriptors("queries", queries)
-        return self._store.search(queries, min(k, len(self)), len(self))
+        k = min(k, len(self))
+        if self._approximate is not None and isinstance(self._store, FileStore) and not exact:
+            return self._approximate.search(self._store, queries, k, len(self))
+        return self._store.search(queries, k, len(self))
+
+    def build_search(self, kind: str, *, quiet: bool = True) -> float | None:
+        """Build the map's approximate search from its descriptors, where it is not there yet.
+
+        Args:
+            kind: "hnsw" or "ivf-pq"; "exact" removes what there is.
+            quiet: whether to show no progress bar.
+
+        Returns:
+            The share of the exact 10 nearest others that are found of 100 of its images; None of
+            an exact search.
+
+        Raises:
+            InputError: an unknown kind, too few images, or a map in Milvus.
+        """
+        self._approximate = build_approximate(
+            self.folder,
+            kind,
+            self._segments,
+            self._store,
+            lambda: self.descriptors,
+            self.description.descriptor_length,
+            quiet=quiet,
+        )
+        return None if self._approximate is None else self._approximate.recall
 
     def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
         length = self.description.descriptor_length
@@ -344,6 +388,8 @@ class Map:
             "resize": description.config.images_in_words,
             "grouping": description.grouping,
             "store": description.store,
+            "search": "exact" if self._approximate is None else self._approximate.kind,
+            "components": description.pca or "none",
             "model": description.model,
             "weights": description.weights,
             "created": description.created,
@@ -391,9 +437,11 @@ class Map:
 
 @contextlib.contextmanager
 def open_for_appending(
-    folder: str | os.PathLike[str], description: MapDescription
+    folder: str | os.PathLike[str],
+    description: MapDescription,
+    components: Pca | None = None,
 ) -> Iterator[Map]:
-    """Open the map with this description to append to it, or make it.
+    """Open the map with this description to append to it, or make it, with its components.
 
     One process at a time may append; others may search meanwhile. A map that a kill left without
     images is made anew; one that an exception leaves without images is removed.
@@ -414,7 +462,9 @@ def open_for_appending(
         if existing != description:
             if has_images(folder):
                 raise InputError(f"{folder}: found another map than was expected here")
-            write_record(folder / DESCRIPTION, to_plain(description), indent=2)
+            if components is not None:
+                save_pca(folder / COMPONENTS, components)
+            write_description(folder, description)
         yield stack.enter_context(Map._opened(folder, description))
 
 

@@ -72,6 +72,7 @@ def query(
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     k: int = 5,
+    exact: bool = False,
     batch_size: int = 16,
     quiet: bool = False,
 ) -> Answers:
@@ -82,6 +83,7 @@ def query(
         params: parameters of the model that made the map (`Map.load_params`).
         images: an image file, a folder, or a list of these.
         k: number of answers to each query.
+        exact: whether to search exactly although the map has an approximate search.
         batch_size: number of queries described at once, each as if it were alone.
         quiet: whether to show no progress bar.
 
@@ -120,12 +122,15 @@ def query(
     waiting: list[np.ndarray] = []
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
-        for part in describe_alone(params, config, paths, batch_size=batch_size):
+        stream = describe_alone(
+            params, config, paths, batch_size=batch_size, components=places.components
+        )
+        for part in stream:
             waiting.append(part.descriptors)
             described += len(part.indices)
             bar.advance(len(part.indices))
             if sum(map(len, waiting)) >= AT_ONCE or described == len(paths):
-                parts.append(places.search(np.concatenate(waiting), k))
+                parts.append(places.search(np.concatenate(waiting), k, exact=exact))
                 waiting.clear()
     neighbours = Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
     return Answers(paths, neighbours, places.images, places.axes)
