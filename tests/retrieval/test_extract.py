@@ -177,3 +177,19 @@ def test_memory_does_not_grow_with_the_images(params, town, expected, tmp_path, 
     assert held == [1] * (len(expected) // BATCH)
     assert is_mapped(found.descriptors)
     np.testing.assert_array_equal(found.descriptors, expected)
+
+
+def test_a_part_without_a_readable_image_is_left_out(params, town, tmp_path, monkeypatch):
+    """Its tokens are in no file; the others' descriptors are those of a set in memory."""
+    monkeypatch.setattr(partial, "SEGMENT", BATCH)
+    bad = [tmp_path / f"{i}.jpg" for i in range(BATCH)]
+    for path in bad:
+        path.write_bytes(b"no image")
+    listed = list_images(town)
+    paths = [*listed[:BATCH], *bad, *listed[BATCH:]]
+    for grouping in ("single", "window"):
+        options = {"on_bad_image": "skip", "grouping": grouping}
+        found = run(params, paths, tmp_path / "d.npy", **options)
+        expected = run(params, paths, **options)
+        assert found.skipped == [path.as_posix() for path in bad]
+        np.testing.assert_array_equal(found.descriptors, expected.descriptors)
