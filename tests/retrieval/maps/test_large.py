@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def test_a_join_that_is_cut_short_goes_on(shared, params, database, whole, tmp_p
     run(shared, params, database, out, share="0/2")
     real = shared_module._add
 
-    def cut(target: Map, *rest: object) -> None:
+    def cut(target: Map, *rest: Any) -> None:
         real(target, *rest)
         raise KeyboardInterrupt
 
