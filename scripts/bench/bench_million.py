@@ -175,7 +175,7 @@ def study(arguments: argparse.Namespace, folder: pathlib.Path) -> Study:
     table = [
         (
             value["search"],
-            f"{value['build']:.2f}" if "build" in value else "-",
+            f"{value['build']:.2f}" if "build" in value else "none",
             f"{value['bytes'] / 1e9:.2f}" if value["bytes"] else "-",
             f"{value['memory'] / 1e9:.2f}",
             f"{value['recall']:.4f}",
@@ -185,15 +185,18 @@ def study(arguments: argparse.Namespace, folder: pathlib.Path) -> Study:
         )
         for value in values
     ]
+    header = HEADER
+    if not arguments.build:
+        header, table = (HEADER[0], *HEADER[2:]), [(row[0], *row[2:]) for row in table]
     caption = (
         f"A map of {rows:,} descriptors of {length} numbers in {arguments.dtype} "
         f"({size / 1e9:.2f} GB of files, {VIEWS} views of a place), asked for {K} neighbours of "
         f"one query and of {arguments.queries}; {measured(arguments.rounds)}. Building and "
-        "queries: times as fast as plain FAISS, which has all descriptors in memory in float32. "
+        "queries are times as fast as plain FAISS, which has all descriptors in memory in float32. "
         "Index, and the most memory of ours, in GB."
     )
     found = {"rows": rows, "append_seconds": seconds, "segments": size, "searches": values}
-    return Study(Table(HEADER, table, caption, 1), found)
+    return Study(Table(header, table, caption, 1), found)
 
 
 def main() -> None:
