@@ -102,7 +102,7 @@ def run(arguments: Extract) -> None:
     if result.shares_left:
         say(
             f"{arguments.out}: share {arguments.share}: {len(result.names)} descriptors; "
-            f"{result.shares_left} shares are left, and the last one joins all"
+            f"shares still to be done: {result.shares_left}; the last one joins all"
         )
         return
     if result.pairs is not None:

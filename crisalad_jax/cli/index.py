@@ -84,7 +84,7 @@ def run(arguments: Index) -> None:
     if result.shares_left:
         say(
             f"{arguments.out}: share {arguments.share}: {result.added} images described; "
-            f"{result.shares_left} shares are left, and the last one joins all"
+            f"shares still to be done: {result.shares_left}; the last one joins all"
         )
     else:
         say(f"{arguments.out}: {'; '.join(_words(result))}")
@@ -109,6 +109,6 @@ def _words(result: Indexed) -> list[str]:
     if result.recall is not None:
         words.append(
             f"approximate search finds {100 * result.recall:.1f} % of the exact {NEIGHBOURS} "
-            f"nearest of {SAMPLE} images"
+            f"nearest of {min(SAMPLE, result.images)} images"
         )
     return [*words, f"images at {description.config.images_in_words}"]

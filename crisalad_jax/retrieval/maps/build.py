@@ -21,6 +21,7 @@ from crisalad_jax.retrieval.describe import group, tokens_in_batches, useful_bat
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.maps.approximate import SEARCHES
 from crisalad_jax.retrieval.maps.manifest import (
+    SHARES,
     MapDescription,
     check_model,
     describe_map,
@@ -362,7 +363,7 @@ def _index_share(
             there = len(paths) - len(_new_images(whole, images, paths)[2])
             stay = sum(whole.image(name) is not None for name in positions.of)
             known = len(whole)
-        if there == len(paths):
+        if there == len(paths) and not (shared.out / SHARES).exists():
             return Indexed(0, there, 0, stay, [], unmatched, known, shared.description)
     found = Indexed(0, there, 0, stay, [], unmatched, 0, shared.description)
 

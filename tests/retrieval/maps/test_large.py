@@ -106,6 +106,23 @@ def test_a_join_that_is_cut_short_goes_on(shared, params, database, whole, tmp_p
     assert not (out / "shares").exists()
 
 
+def test_a_kill_after_all_is_joined_leaves_nothing_undone(
+    shared, params, database, tmp_path, monkeypatch
+):
+    out = tmp_path / "map"
+    run(shared, params, database, out, share="0/2")
+
+    def cut(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Map, "build_search", cut)
+        with pytest.raises(KeyboardInterrupt):
+            run(shared, params, database, out, share="1/2", search="hnsw")
+    assert run(shared, params, database, out, share="1/2", search="hnsw").recall == 1.0
+    assert not (out / "shares").exists()
+
+
 @pytest.mark.parametrize(
     ("share", "words"),
     [
@@ -305,10 +322,12 @@ def test_the_command_line_says_what_is_recalled(shared, database, tmp_path, capf
 
     out = tmp_path / "map"
     said = succeeds(capfd, *command(shared, database, out, "--share", "0/2"))
-    assert "share 0/2: 4 images described; 1 shares are left, and the last one joins all" in said
+    assert (
+        "share 0/2: 4 images described; shares still to be done: 1; the last one joins all" in said
+    )
     said = succeeds(capfd, *command(shared, database, out, "--share", "1/2", "--search", "hnsw"))
     assert "7 images added, 7 with positions" in said
-    assert "approximate search finds 100.0 % of the exact 10 nearest of 100 images" in said
+    assert "approximate search finds 100.0 % of the exact 10 nearest of 7 images" in said
     lines = [
         succeeds(capfd, *ask(out, list_images(database)[0], "--json", "-", *more))
         for more in ((), ("--exact",))
