@@ -68,6 +68,9 @@ class Extract:
     """Pairs of each image; never with itself."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
+    share: str | None = None
+    """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
+    joins all. Of the grouping single."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
     verify: bool = True
@@ -94,6 +97,7 @@ def run(arguments: Extract) -> None:
         pairs=arguments.pairs,
         database=arguments.database,
         k=arguments.k,
+        share=arguments.share,
     )
     weights = find_weights(arguments.weights, quiet=arguments.quiet)
     params, config, _ = load_model(
@@ -118,10 +122,17 @@ def run(arguments: Extract) -> None:
         database=arguments.database,
         k=arguments.k,
         pca=arguments.pca,
+        share=arguments.share,
         on_bad_image=arguments.on_bad_image,
         verify=arguments.verify,
         quiet=arguments.quiet,
     )
+    if result.shares_left:
+        say(
+            f"{arguments.out}: share {arguments.share}: {len(result.names)} descriptors; "
+            f"shares still to be done: {result.shares_left}; the last one joins all"
+        )
+        return
     if result.pairs is not None:
         say(f"{arguments.pairs}: {len(result.pairs)} pairs")
     skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""

@@ -7,6 +7,7 @@ from typing import Literal
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import give_json, prepare_json, say
+from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
 
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
@@ -34,6 +35,14 @@ class Index:
     map's, and of a new map files."""
     dtype: Literal["float32", "float16"] | None = None
     """What files keep descriptors as, by default the map's, and in a new map float32."""
+    pca: pathlib.Path | None = None
+    """Components of `crisalad pca`, for shorter descriptors; the map keeps a copy, which queries
+    use."""
+    search: Literal["exact", "hnsw", "ivf-pq"] | None = None
+    """Build an approximate search, and print what it recalls; exact removes it (docs/large.md)."""
+    share: str | None = None
+    """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
+    joins all."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the map's, and of a new map
     the model's."""
@@ -74,11 +83,20 @@ def run(arguments: Index) -> None:
         positions=arguments.positions,
         store=arguments.store,
         dtype=arguments.dtype,
+        pca=arguments.pca,
+        search=arguments.search,
+        share=arguments.share,
         batch_size=arguments.batch_size,
         on_bad_image=arguments.on_bad_image,
         quiet=arguments.quiet,
     )
-    say(f"{arguments.out}: {'; '.join(_words(result))}")
+    if result.shares_left:
+        say(
+            f"{arguments.out}: share {arguments.share}: {result.added} images described; "
+            f"shares still to be done: {result.shares_left}; the last one joins all"
+        )
+    else:
+        say(f"{arguments.out}: {'; '.join(_words(result))}")
     description = result.description
     counts = {name: value for name, value in result._asdict().items() if name != "description"}
     give_json(
@@ -109,4 +127,9 @@ def _words(result: Indexed) -> list[str]:
         words.append(f"{len(result.unreadable)} unreadable left out")
     length, store = description.descriptor_length, description.store
     words.append(f"{result.images} descriptors of {length} numbers ({store})")
+    if result.recall is not None:
+        words.append(
+            f"approximate search finds {100 * result.recall:.1f} % of the exact {NEIGHBOURS} "
+            f"nearest of {min(SAMPLE, result.images)} images"
+        )
     return [*words, f"images at {description.config.images_in_words}"]

@@ -73,6 +73,8 @@ class Query:
     the map's images in their order (docs/maps.md)."""
     sequence_reach: int | None = None
     """Images of the map that the camera moves between two frames, at most; by default 2."""
+    exact: bool = False
+    """Search exactly, although the map has an approximate search."""
     json: pathlib.Path | None = None
     """File for the answers, a line of JSON for each query; - prints them."""
     gallery: pathlib.Path | None = None
@@ -111,6 +113,7 @@ def run(arguments: Query) -> None:
             k=arguments.k,
             fps=1.0 if arguments.fps is None else arguments.fps,
             window=arguments.window,
+            exact=arguments.exact,
             batch_size=arguments.batch_size,
             on_bad_image=arguments.on_bad_image,
             min_similarity=arguments.min_similarity,

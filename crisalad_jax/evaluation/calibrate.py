@@ -26,7 +26,8 @@ def calibrate(
 ) -> Calibration:
     """Measure from which similarity on answers are right, and let a map remember it.
 
-    The set is evaluated with the map's model and image size, every image alone, as `query` does.
+    The set is evaluated with the map's model, image size and components, every image alone, as
+    `query` does.
     The map's own images are not looked at. So the set's database should be of the map's places or
     of places like them, about as many, and its queries like those that the map will be asked. They
     should show unknown places too, which count as wrong when answered.
@@ -73,6 +74,7 @@ def calibrate(
         places.description.config,
         benchmark,
         groupings=["single"],
+        pca=places.components,
         batch_size=batch_size,
         on_bad_image=on_bad_image,
         cache=cache,

@@ -14,6 +14,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
 from crisalad_jax.retrieval.describe import group, tokens_in_batches, useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
@@ -36,11 +37,13 @@ def describe_alone(
     *,
     batch_size: int,
     on_bad_image: OnBadImage = "stop",
+    components: Pca | None = None,
 ) -> Iterator[Described]:
     """Describe images in order, each as if it were alone, and yield batch by batch.
 
     The descriptors equal those of the grouping `single` (`retrieval.describe.group`). Two batches
-    are in memory, and the images that are read ahead.
+    are in memory, and the images that are read ahead. Components shorten whole batches, so that no
+    descriptor's bits depend on the batch's others.
 
     Raises:
         InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
@@ -50,6 +53,8 @@ def describe_alone(
     )
     for tokens, batch in stream:
         descriptors = group(params, config, tokens, "single", batch_size=batch_size)
+        if components is not None and batch.valid.any():
+            descriptors = components.apply(descriptors)
         unreadable = (batch.indices >= 0) & ~batch.valid
         yield Described(
             batch.indices[batch.valid], descriptors[batch.valid], batch.indices[unreadable]

@@ -3,12 +3,12 @@
 import functools
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Int64
 
 from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage
 from crisalad_jax.nn.config import ModelConfig
@@ -33,6 +33,23 @@ class FolderTokens(NamedTuple):
     global_tokens: Float[np.ndarray, "image global_dim"]
     local: Float[np.ndarray, "image token dim"]
     readable: Bool[np.ndarray, " image"]
+
+    def of(self, images: Int64[np.ndarray, " n"]) -> Tokens:
+        """Return the tokens of some images, by number."""
+        return Tokens(jnp.asarray(self.global_tokens[images]), jnp.asarray(self.local[images]))
+
+
+class HeldTokens(Protocol):
+    """The tokens of many images, in memory or in files."""
+
+    @property
+    def readable(self) -> Bool[np.ndarray, " image"]:
+        """Whether each image could be read."""
+        ...
+
+    def of(self, images: Int64[np.ndarray, " n"]) -> Tokens:
+        """Return the tokens of some images, by number."""
+        ...
 
 
 def useful_batch_size(batch_size: int, images: int) -> int:
@@ -110,7 +127,7 @@ def tokens_in_batches(
 def group(
     params: Crisalad,
     config: ModelConfig,
-    folder: FolderTokens,
+    folder: HeldTokens,
     grouping: str,
     *,
     batch_size: int,
@@ -125,9 +142,31 @@ def group(
     Raises:
         InputError: what `check_grouping` raises.
     """
+    descriptors = np.empty((len(folder.readable), config.descriptor_dim), np.float32)
+    options = {"batch_size": batch_size, "seed": seed, "label": label, "quiet": quiet}
+    for images, rows in described(params, config, folder, grouping, **options):
+        descriptors[images] = rows
+    return descriptors
+
+
+def described(
+    params: Crisalad,
+    config: ModelConfig,
+    folder: HeldTokens,
+    grouping: str,
+    *,
+    batch_size: int,
+    seed: int = 0,
+    label: str = "images",
+    quiet: bool = True,
+) -> Iterator[tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n descriptor"]]]:
+    """Yield the descriptors of `group` some at a time, each lot with its images' numbers.
+
+    Raises:
+        InputError: what `check_grouping` raises.
+    """
     count = len(folder.readable)
     batches = batches_of(count, grouping, batch_size, seed)
-    descriptors = np.empty((count, config.descriptor_dim), np.float32)
     # A window gives one descriptor, so `batch_size` windows are computed at a time.
     step = batch_size if grouping == "window" else 1
     # The other groupings take little time compared with the backbone: they need no bar.
@@ -136,23 +175,22 @@ def group(
         for start in range(0, len(batches.images), step):
             part = batches.part(start, start + step)
             relate_part = _relate_windows if grouping == "window" else _relate_batch
-            rows = part.images[part.kept]
-            descriptors[rows] = relate_part(params, config, folder, part)
-            bar.advance(len(rows))
-    return descriptors
+            images = part.images[part.kept]
+            yield images, relate_part(params, config, folder, part)
+            bar.advance(len(images))
 
 
 def _relate_batch(
-    params: Crisalad, config: ModelConfig, folder: FolderTokens, batch: Batches
+    params: Crisalad, config: ModelConfig, folder: HeldTokens, batch: Batches
 ) -> Float[np.ndarray, "image descriptor"]:
     """Describe the images of one batch."""
     (images,), (kept_places,), (mask,) = batch.images, batch.kept, batch.looks(folder.readable)
-    tokens = Tokens(jnp.asarray(folder.global_tokens[images]), jnp.asarray(folder.local[images]))
+    tokens = folder.of(images)
     return np.asarray(attend_across_images(params, tokens, config, mask=mask))[kept_places]
 
 
 def _relate_windows(
-    params: Crisalad, config: ModelConfig, folder: FolderTokens, windows: Batches
+    params: Crisalad, config: ModelConfig, folder: HeldTokens, windows: Batches
 ) -> Float[np.ndarray, "window descriptor"]:
     """Describe the last image of each of some windows."""
     width = windows.images.shape[1]
@@ -163,7 +201,7 @@ def _relate_windows(
     rows = np.arange(width) % len(windows.images)
     descriptors = _relate_last(
         params,
-        Tokens(jnp.asarray(folder.global_tokens[images]), jnp.asarray(folder.local[images])),
+        folder.of(images),
         places.reshape(windows.images.shape)[rows],
         windows.looks(folder.readable)[rows],
         config,

@@ -10,10 +10,10 @@ import io
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import IO, Any
+from typing import IO, Any, Self
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.data.images import check_lines
@@ -23,6 +23,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
     atomic_path,
     check_source,
+    npy_header,
     read_json,
     read_text,
     told_of,
@@ -70,6 +71,7 @@ def write_descriptors(
     record: Mapping[str, Any] | None = None,
     *,
     within: pathlib.Path | None = None,
+    written: pathlib.Path | None = None,
 ) -> None:
     """Write descriptors, their images' names and a record of both.
 
@@ -83,14 +85,17 @@ def write_descriptors(
         names: of the images.
         record: how they were made, as JSON values.
         within: a folder for temporary files, see `files.atomic_path`.
+        written: a .npy file of the descriptors on the same disk, which may be moved, not copied.
 
     Raises:
         InputError: another suffix, a name twice in a .h5, or a file that cannot be written.
     """
     check_suffix(path)
     path = pathlib.Path(path)
-    write = {".npy": _write_npy, ".h5": _write_h5}[path.suffix]
-    write(path, descriptors, names, dict(record or {}), within)
+    if path.suffix == ".npy":
+        _write_npy(path, descriptors, names, dict(record or {}), within, written)
+    else:
+        _write_h5(path, descriptors, names, dict(record or {}), within)
 
 
 def _write_npy(
@@ -99,18 +104,53 @@ def _write_npy(
     names: Sequence[str],
     record: dict[str, Any],
     within: pathlib.Path | None,
+    written: pathlib.Path | None,
 ) -> None:
     # The files that are entered last are renamed first.
     with (
         atomic_path(path, within) as array,
         atomic_path(_names_of(path), within) as listed,
-        atomic_path(record_of(path), within) as written,
+        atomic_path(record_of(path), within) as recorded,
     ):
         with told_of(path):
-            write_npy(array, descriptors)
+            if written is None:
+                write_npy(array, descriptors)
+            else:
+                os.replace(written, array)
         listed.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
         digests = {"descriptors": sha256_of(array), "names": sha256_of(listed)}
-        write_json(written, {_DIGESTS: digests} | record)
+        write_json(recorded, {_DIGESTS: digests} | record)
+
+
+class RowFile:
+    """A .npy file of float32 rows, which are written in any order, some at a time.
+
+    A memory map would end the process where the disk gets full; this raises OSError.
+    """
+
+    def __init__(self, path: pathlib.Path, count: int, length: int) -> None:
+        """Make the file for so many rows of so many numbers."""
+        header = npy_header(np.dtype(np.float32), (count, length))
+        self._origin, self._row = len(header), 4 * length
+        self._file = path.open("wb")
+        self._file.write(header)
+
+    def write(
+        self, places: Int[np.ndarray, " n"], rows: Float32[np.ndarray, "n descriptor"]
+    ) -> None:
+        """Write rows at these places."""
+        runs = np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) != 1) + 1)
+        for run in runs if len(places) else ():
+            self._file.seek(self._origin + self._row * int(places[run[0]]))
+            self._file.write(np.ascontiguousarray(rows[run]).data)
+
+    def __enter__(self) -> Self:
+        """Return the file itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file."""
+        self._file.close()
 
 
 def _write_h5(

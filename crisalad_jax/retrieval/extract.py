@@ -1,11 +1,10 @@
 """Descriptors of a folder or a list of images, in files or in memory."""
 
 import contextlib
-import functools
 import os
 import pathlib
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import check_lines
@@ -14,8 +13,8 @@ from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.model import Crisalad, check_params
-from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
-from crisalad_jax.retrieval.describe import group, read_tokens, useful_batch_size
+from crisalad_jax.retrieval.chunks import check_all_rows
+from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
     check_suffix,
@@ -25,25 +24,21 @@ from crisalad_jax.retrieval.descriptor_files import (
 )
 from crisalad_jax.retrieval.grouping import check_grouping
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
-from crisalad_jax.retrieval.partial import partial_folder, read_tokens_partly
-from crisalad_jax.retrieval.pca import Pca, load_pca
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
+from crisalad_jax.retrieval.sets import (
+    DescribedSet,
+    Extracted,
+    SharedSet,
+    Work,
+    describe_set,
+    extract_share,
+    open_work,
+)
+from crisalad_jax.retrieval.shares import Share, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_target, real_path
 
 StrPath = str | os.PathLike[str]
-
-
-class Extracted(NamedTuple):
-    """The descriptors of a set of images."""
-
-    names: list[str]
-    """Names of the images that could be read, in order."""
-    descriptors: Descriptors
-    """Their descriptors, float32."""
-    skipped: list[str]
-    """Names of the images that could not be read."""
-    pairs: list[tuple[str, str]] | None
-    """Each image with those most similar to it, best first; None where no pairs were asked for."""
 
 
 def extract(
@@ -62,6 +57,7 @@ def extract(
     database: StrPath | None = None,
     k: int = 20,
     pca: StrPath | Pca | None = None,
+    share: str | None = None,
     on_bad_image: OnBadImage = "stop",
     verify: bool = True,
     quiet: bool = False,
@@ -69,6 +65,7 @@ def extract(
     """Describe images, and write the descriptors where they are asked for.
 
     With `out`, the same call resumes after a kill, and one process at a time may write there.
+    Tokens and descriptors are then in files, and a few hundred images' in memory.
 
     Args:
         params: the model's parameters.
@@ -88,6 +85,8 @@ def extract(
         database: descriptors, .h5 or .npy, of the images to pair these with; None is these.
         k: number of pairs of each image.
         pca: components that shorten the descriptors, or a file of them.
+        share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
+            same folders take the others, and the last one to end joins all.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         verify: whether to check the bytes of `database` and `pca` against their checksums.
         quiet: whether to show no progress bar.
@@ -118,59 +117,71 @@ def extract(
         pairs=pairs,
         database=database,
         k=k,
+        share=share,
     )
     components = _components(pca, config, weights, unit=pairs is not None, verify=verify)
     paths, names = _listed(images, root, fps)
     length = config.descriptor_dim if components is None else len(components.components)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
     batch_size = useful_batch_size(batch_size, len(paths))
-    folder = None
-    with contextlib.ExitStack() as stack:
-        if out is None:
-            read = functools.partial(read_tokens, label="images")
-        else:
-            folder = stack.enter_context(partial_folder(pathlib.Path(out)))
-            read = functools.partial(read_tokens_partly, folder)
-        tokens = read(
-            params=params,
-            config=config,
-            paths=paths,
+    record = {
+        "weights": None if weights is None else str(weights),
+        "images": _source(images),
+        "grouping": grouping,
+        "batch_size": batch_size,
+        "seed": seed,
+        "pca": _words(pca),
+        "model": to_plain(config),
+    }
+    if any(frame_time(path) is not None for path in paths):
+        record["fps"] = fps
+
+    def describe(paths: Sequence[pathlib.Path], names: Sequence[str], work: Work) -> DescribedSet:
+        return describe_set(
+            params,
+            config,
+            paths,
+            names,
+            work,
+            source=_source(images),
+            components=components,
+            grouping=grouping,
             batch_size=batch_size,
+            seed=seed,
             on_bad_image=on_bad_image,
             quiet=quiet,
         )
-        if not tokens.readable.any():
-            raise InputError(f"{_source(images)}: found {len(paths)} images, none of them readable")
-        descriptors = group(
-            params, config, tokens, grouping, batch_size=batch_size, seed=seed, quiet=quiet
-        )[tokens.readable]
-        source = f"{_source(images)}: descriptors"
-        check_rows(descriptors, source, range(len(descriptors)), unit=config.unit_length)
-        if components is not None:
-            descriptors = components.apply(descriptors)
-        readable = [name for name, ok in zip(names, tokens.readable, strict=True) if ok]
-        skipped = [name for name, ok in zip(names, tokens.readable, strict=True) if not ok]
-        record = {
-            "weights": None if weights is None else str(weights),
-            "images": _source(images),
-            "grouping": grouping,
-            "batch_size": batch_size,
-            "seed": seed,
-            "pca": _words(pca),
-            "skipped": skipped,
-            "model": to_plain(config),
-        }
-        if any(frame_time(path) is not None for path in paths):
-            record["fps"] = fps
+
+    def finish(found: DescribedSet, work: Work, more: Mapping[str, Any]) -> Extracted:
         nearest = None
         with contextlib.ExitStack() as staged:  # so that pairs and descriptors appear, or none
             if pairs is not None:
-                between = others or (readable, descriptors)
-                nearest = nearest_pairs(readable, descriptors, *between, k=k)
+                between = others or (found.names, found.descriptors)
+                nearest = nearest_pairs(found.names, found.descriptors, *between, k=k)
                 write_pairs(staged.enter_context(atomic_path(pairs)), nearest)
             if out is not None:
-                write_descriptors(out, descriptors, readable, record, within=folder)
-    return Extracted(readable, descriptors, skipped, nearest)
+                whole = record | {"skipped": found.skipped, **more}
+                write_descriptors(
+                    out,
+                    found.descriptors,
+                    found.names,
+                    whole,
+                    within=work.folder,
+                    written=found.written,
+                )
+        return Extracted(found.names, found.descriptors, found.skipped, nearest)
+
+    if share is None or out is None:
+        with open_work(out) as work:
+            return finish(describe(paths, names, work), work, {})
+    settings = record | {"pca": None if components is None else pca_hash(components)}
+    del settings["weights"], settings["images"]  # hosts may call them by other names
+    shared = SharedSet(
+        pathlib.Path(out), Share.parse(share), digest_of(params, config, names, settings)
+    )
+    return extract_share(
+        shared, paths, names, batch_size=batch_size, record=record, describe=describe, finish=finish
+    )
 
 
 def check_extraction(
@@ -182,6 +193,7 @@ def check_extraction(
     pairs: StrPath | None = None,
     database: StrPath | None = None,
     k: int = 20,
+    share: str | None = None,
 ) -> None:
     """Check what can be checked of an extraction before a model is loaded.
 
@@ -193,9 +205,11 @@ def check_extraction(
         pairs: a file for hloc's pairs.
         database: descriptors of the images to pair these with.
         k: number of pairs of each image.
+        share: one share of the images.
 
     Raises:
-        InputError: an unknown suffix or grouping; a file that cannot be made, or that would take
+        InputError: an unknown suffix or grouping; a share of a grouping other than "single", or
+            of nothing that is written; a file that cannot be made, or that would take
             the place of another; a number out of range; or a database without pairs.
 
     Example:
@@ -214,6 +228,13 @@ def check_extraction(
     check_grouping([grouping], batch_size, seed)
     if pairs is not None and k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
+    if share is not None:
+        Share.parse(share)
+        if grouping != "single" or out is None:
+            found = f"grouping {grouping}" if out is not None else "no file to write"
+            raise InputError(
+                f"share: found {found}, expected images that are described alone, into a file"
+            )
 
 
 def _components(

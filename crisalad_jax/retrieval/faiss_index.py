@@ -10,14 +10,15 @@ import itertools
 import math
 import os
 import pathlib
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, NamedTuple
 
 import faiss as _faiss
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, pieces, sample
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, check_rows, pieces, sample
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.checksums import append_checksum, check_appended
 from crisalad_jax.utils.errors import InputError
@@ -124,16 +125,82 @@ def build(
         InputError: an unknown kind; an array that is empty or no matrix; rows that are not finite
             or not of unit length; too few to train from.
     """
-    choose("kind", kind, KINDS)
     database = as_rows(database, "database")
     count, length = database.shape
-    index = _graph(length, seed) if kind == "hnsw" else _trained_lists(database, seed)
-    size = max(1, _CHUNK_BYTES // (4 * length))
-    buffer = np.empty((min(size, count), length), WIDE)
-    with progress_bar(kind, count, "rows", quiet=quiet) as bar:
+    buffer = np.empty((min(_rows_at_once(length), count), length), WIDE)
+
+    def rows() -> Iterator[Float32[np.ndarray, "rows d"]]:
         for block in blocks(database, "database", itertools.repeat(buffer)):
-            index.add(block.rows[: block.valid])
-            bar.advance(block.valid)
+            yield block.rows[: block.valid]
+
+    def some(places: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m d"]:
+        return np.concatenate(list(pieces(database, "database", _rows_at_once(length), places)))
+
+    return _built(kind, count, length, rows, some, seed, quiet)
+
+
+def build_from(
+    kind: Kind,
+    count: int,
+    length: int,
+    rows: Callable[[], Iterator[Float[np.ndarray, "rows d"]]],
+    *,
+    seed: int = 0,
+    quiet: bool = True,
+) -> Index:
+    """Build an index as `build` does, of descriptors that come in parts, from the first on.
+
+    Args:
+        kind: of `KINDS`.
+        count: number of descriptors.
+        length: numbers in each.
+        rows: yields unit descriptors; it is called twice where an index is trained.
+        seed: as of `build`.
+        quiet: no progress bar.
+
+    Raises:
+        InputError: what `build` raises.
+    """
+
+    def wide() -> Iterator[Float32[np.ndarray, "rows d"]]:
+        start = 0
+        for part in rows():
+            part = np.ascontiguousarray(part, WIDE)
+            check_rows(part, "database", range(start, start + len(part)), unit=True)
+            yield part
+            start += len(part)
+
+    def some(places: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m d"]:
+        start, chosen = 0, []
+        for part in rows():
+            first, end = np.searchsorted(places, [start, start + len(part)])
+            chosen.append(np.asarray(part[places[first:end] - start], WIDE))
+            start += len(part)
+        return np.concatenate(chosen)
+
+    return _built(kind, count, length, wide, some, seed, quiet)
+
+
+def _rows_at_once(length: int) -> int:
+    return max(1, _CHUNK_BYTES // (4 * length))
+
+
+def _built(
+    kind: Kind,
+    count: int,
+    length: int,
+    rows: Callable[[], Iterator[Float32[np.ndarray, "rows d"]]],
+    some: Callable[[Int[np.ndarray, " m"]], Float32[np.ndarray, "m d"]],
+    seed: int,
+    quiet: bool,
+) -> Index:
+    """Build an index from its rows, and from those at some places to train it."""
+    choose("kind", kind, KINDS)
+    index = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, some, seed)
+    with progress_bar(kind, count, "rows", quiet=quiet) as bar:
+        for part in rows():
+            index.add(part)
+            bar.advance(len(part))
     return Index(kind, index)
 
 
@@ -144,8 +211,12 @@ def _graph(length: int, seed: int) -> Any:
     return index
 
 
-def _trained_lists(database: Float[np.ndarray, "n d"], seed: int) -> Any:
-    count, length = database.shape
+def _trained_lists(
+    count: int,
+    length: int,
+    some: Callable[[Int[np.ndarray, " m"]], Float32[np.ndarray, "m d"]],
+    seed: int,
+) -> Any:
     if count < LEAST_ROWS:
         raise InputError(
             f"database: found {count} descriptors, expected at least {LEAST_ROWS} to train an "
@@ -162,9 +233,7 @@ def _trained_lists(database: Float[np.ndarray, "n d"], seed: int) -> Any:
     # The centroids are unit vectors, for they are compared by inner products.
     index.cp.spherical = True
     index.cp.seed = index.pq.cp.seed = seed
-    size = max(1, _CHUNK_BYTES // (4 * length))
-    places = sample(count, trained_from, seed)
-    index.train(np.concatenate(list(pieces(database, "database", size, places))))
+    index.train(some(sample(count, trained_from, seed)))
     return index
 
 

@@ -6,9 +6,12 @@ import json
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+import safetensors
+from jaxtyping import Bool, Int64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.checkpoints.weights import model_hash
@@ -17,6 +20,7 @@ from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.video import file_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.retrieval.describe import FolderTokens, tokens_in_batches
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
@@ -73,10 +77,11 @@ def read_tokens_partly(
     batch_size: int,
     on_bad_image: OnBadImage = "stop",
     quiet: bool = False,
-) -> FolderTokens:
-    """Extract the tokens of images in order, as `describe.read_tokens`, and keep them in files.
+) -> "StoredTokens":
+    """Extract the tokens of images in order, as `describe.read_tokens`, into files of the folder.
 
-    What the folder holds of the same images and model is read, and not computed again.
+    What the folder holds of the same images and model is not computed again. One file's tokens are
+    in memory, whatever the number of images.
 
     Raises:
         InputError: an image cannot be read, and `on_bad_image` is "stop"; or a full disk.
@@ -84,8 +89,12 @@ def read_tokens_partly(
     _begin(folder, _plan(params, config, batch_size))
     # Whole batches, so that the same images are computed together after a kill.
     size = -(-SEGMENT // batch_size) * batch_size
-    parts = list(_read(folder, paths, size, on_bad_image))
-    done = sum(len(part.readable) for part in parts)
+    readable: list[np.ndarray] = []
+    like: FolderTokens | None = None
+    for part in _read(folder, paths, size, on_bad_image):
+        readable.append(part.readable)
+        like = like or _shape_of(part)
+    done = sum(map(len, readable))
     with progress_bar("images", len(paths), "images", quiet=quiet, done=done) as bar:
         while done < len(paths):
             batches = []
@@ -104,9 +113,46 @@ def read_tokens_partly(
                 arrays = {name: np.ascontiguousarray(leaf) for name, leaf in part._asdict().items()}
                 value = {"images": _digest(paths[done : done + size])}
                 write_sealed(_path(folder, done), arrays, FORMAT, value)
-            parts.append(part)
+            readable.append(part.readable)
+            like = like or _shape_of(part)
             done += len(part.readable)
-    return _joined(parts)
+    if like is None:
+        raise ValueError("found no images, expected at least one")
+    return StoredTokens(folder, size, like, np.concatenate(readable))
+
+
+class StoredTokens(NamedTuple):
+    """Tokens of many images in a folder's files, read when they are asked for."""
+
+    folder: pathlib.Path
+    size: int
+    """Number of images in each file."""
+    like: FolderTokens
+    """No images' tokens, of the files' shapes and types."""
+    readable: Bool[np.ndarray, " image"]
+    """Whether each image could be read."""
+
+    def of(self, images: Int64[np.ndarray, " n"]) -> Tokens:
+        """Read the tokens of some images, by number; zeros where no image of a file was read."""
+        global_tokens, local = (
+            np.zeros((len(images), *leaf.shape[1:]), leaf.dtype) for leaf in self.like[:2]
+        )
+        files = images // self.size * self.size
+        for first in np.unique(files):
+            path = _path(self.folder, int(first))
+            if not path.exists():
+                continue
+            with safetensors.safe_open(path, framework="numpy") as file:
+                for name, leaf in (("global_tokens", global_tokens), ("local", local)):
+                    stored = file.get_slice(name)
+                    for place in np.flatnonzero(files == first):
+                        row = int(images[place] - first)
+                        leaf[place] = stored[row : row + 1][0]
+        return Tokens(jnp.asarray(global_tokens), jnp.asarray(local))
+
+
+def _shape_of(part: FolderTokens) -> FolderTokens:
+    return FolderTokens(*(leaf[:0].copy() for leaf in part))
 
 
 def _joined(parts: Sequence[FolderTokens]) -> FolderTokens:

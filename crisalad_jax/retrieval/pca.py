@@ -1,7 +1,9 @@
 """Principal components of descriptors: fewer numbers each, with or without whitening."""
 
 import dataclasses
+import hashlib
 import itertools
+import json
 import os
 import pathlib
 from collections.abc import Iterator
@@ -73,10 +75,24 @@ class Pca(NamedTuple):
                 rows that are not finite; where they are to be unit vectors, one that lies at the
                 mean.
         """
+        reduced = np.empty((len(descriptors), len(self.components)), np.float32)
+        start = 0
+        for part in self.parts(descriptors):
+            reduced[start : start + len(part)] = part
+            start += len(part)
+        return reduced
+
+    def parts(
+        self, descriptors: Float[np.ndarray, "n d"]
+    ) -> Iterator[Float32[np.ndarray, "rows dim"]]:
+        """Yield the reduced descriptors of `apply` in order, a few thousand rows at a time.
+
+        Raises:
+            InputError: what `apply` raises.
+        """
         descriptors = as_rows(descriptors, "descriptors")
         self.check(descriptors.shape[1], "descriptors")
         scale = np.sqrt(self.variances) if self.config.whiten else np.float32(1)
-        reduced = np.empty((len(descriptors), len(self.components)), np.float32)
         start = 0
         for rows in pieces(descriptors, "descriptors", _rows_at_a_time(len(self.mean))):
             rows -= self.mean
@@ -89,9 +105,8 @@ class Pca(NamedTuple):
                         "one with a direction from there"
                     )
                 part /= lengths
-            reduced[start : start + len(rows)] = part
+            yield part
             start += len(rows)
-        return reduced
 
     def projection(self) -> tuple[Linear, ProjectionConfig]:
         """Return the same components as a model's last layer.
@@ -254,6 +269,14 @@ def _leading(
             f"{count} descriptors of length {length} about their mean"
         )
     return values, vectors
+
+
+def pca_hash(pca: Pca) -> str:
+    """Compute a digest of components: of their numbers, and of how they are applied."""
+    digest = hashlib.sha256(json.dumps(to_plain(pca.config), sort_keys=True).encode())
+    for name in _ARRAYS:
+        digest.update(np.ascontiguousarray(getattr(pca, name)).data)
+    return digest.hexdigest()
 
 
 def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:

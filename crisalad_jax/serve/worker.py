@@ -157,7 +157,7 @@ class MapWorker:
             padded += padded[:1] * (size - count)
         config = self.places.description.config
         described = describe_prepared(self._params, config, padded, batch_size=self._batch_size)
-        return described[:count]
+        return self.places.shorten(described)[:count]
 
     def _append(self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]) -> None:
         """Append the additions of a batch together, without those that the map does not take."""

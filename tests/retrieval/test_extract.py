@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import list_images
+from crisalad_jax.retrieval import partial
+from crisalad_jax.retrieval.chunks import is_mapped
 from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 from tests.conftest import BATCH, MODEL
 
 
@@ -112,6 +115,9 @@ def test_what_is_refused(params, images, options, words):
         ({"database": "d.h5"}, "--database: found without --pairs"),
         ({"pairs": "d.names.txt"}, "--pairs: found d.names.txt, which --out writes"),
         ({"pairs": "p.txt", "k": 0}, "k: found 0, expected at least 1"),
+        ({"share": "3/3"}, "share: found '3/3', expected INDEX/COUNT"),
+        ({"share": "0/3", "grouping": "window"}, "share: found grouping window, expected images"),
+        ({"share": "0/3", "out": None}, "share: found no file to write, expected images"),
     ],
 )
 def test_what_is_known_before_there_is_a_model(options, words, tmp_path, monkeypatch):
@@ -127,3 +133,63 @@ def test_a_descriptor_that_is_not_finite_is_not_written(params, town, tmp_path):
     with pytest.raises(InputError, match=r"descriptors: row 0 is not finite, expected finite unit"):
         run(broken, town, out)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".h5"])
+def test_shares_make_the_set_of_one_process(params, town, expected, tmp_path, suffix):
+    out, pairs = tmp_path / f"d{suffix}", tmp_path / "pairs.txt"
+    whole = run(params, town, pairs=tmp_path / "whole.txt", k=2)
+    for share in ("2/3", "0/3"):
+        part = run(params, town, out, share=share, pairs=pairs, k=2)
+        assert part.shares_left > 0
+        assert not out.exists()
+    assert part.names == whole.names[: len(part.names)]
+    found = run(params, town, out, share="1/3", pairs=pairs, k=2)
+    assert (found.shares_left, found.pairs) == (0, whole.pairs)
+    names, descriptors = read_descriptors(out)
+    by_name = dict(zip(names, descriptors, strict=True))
+    assert by_name.keys() == set(whole.names)
+    np.testing.assert_array_equal(np.stack([by_name[n] for n in whole.names]), expected)
+    if suffix == ".npy":
+        assert names == whole.names
+    names = {"d.names.txt"} if suffix == ".npy" else set()
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {out.name, f"{out.name}.json", "pairs.txt", "whole.txt", *names}
+    again = run(params, town, out, share="1/3")
+    assert (again.shares_left, set(again.names)) == (0, set(whole.names))
+
+
+def test_a_share_of_other_images_is_not_joined(params, town, tmp_path):
+    out, paths = tmp_path / "d.npy", list_images(town)
+    run(params, paths, out, share="0/2")
+    with pytest.warns(Note, match=r"0-of-2\.npy: found a share of other images or settings"):
+        assert run(params, paths[:-1], out, share="1/2").shares_left == 1
+    assert not out.exists()
+
+
+def test_memory_does_not_grow_with_the_images(params, town, expected, tmp_path, monkeypatch):
+    """Of a set in a file no more than one file's tokens are held, and the rows are mapped."""
+    held = []
+    real = partial._joined
+    monkeypatch.setattr(partial, "SEGMENT", BATCH)
+    monkeypatch.setattr(partial, "_joined", lambda parts: held.append(len(parts)) or real(parts))
+    found = run(params, town, tmp_path / "d.npy")
+    assert held == [1] * (len(expected) // BATCH)
+    assert is_mapped(found.descriptors)
+    np.testing.assert_array_equal(found.descriptors, expected)
+
+
+def test_a_part_without_a_readable_image_is_left_out(params, town, tmp_path, monkeypatch):
+    """Its tokens are in no file; the others' descriptors are those of a set in memory."""
+    monkeypatch.setattr(partial, "SEGMENT", BATCH)
+    bad = [tmp_path / f"{i}.jpg" for i in range(BATCH)]
+    for path in bad:
+        path.write_bytes(b"no image")
+    listed = list_images(town)
+    paths = [*listed[:BATCH], *bad, *listed[BATCH:]]
+    for grouping in ("single", "window"):
+        options = {"on_bad_image": "skip", "grouping": grouping}
+        found = run(params, paths, tmp_path / "d.npy", **options)
+        expected = run(params, paths, **options)
+        assert found.skipped == [path.as_posix() for path in bad]
+        np.testing.assert_array_equal(found.descriptors, expected.descriptors)

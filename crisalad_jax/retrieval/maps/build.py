@@ -4,31 +4,38 @@ import dataclasses
 import os
 import pathlib
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.config.checks import choose
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions, read_positions, utm_positions
-from crisalad_jax.data.sources import ImageSource, open_source
+from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.alone import Described, describe_alone
 from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.maps.approximate import SEARCHES
 from crisalad_jax.retrieval.maps.manifest import (
+    SHARES,
     MapDescription,
     check_model,
     describe_map,
     has_images,
+    read_components,
     read_description,
 )
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.shared import SharedMap
 from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
+from crisalad_jax.retrieval.shares import Share, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.notes import tell
@@ -56,6 +63,10 @@ class Indexed(NamedTuple):
     """Number of images that the map has now."""
     description: MapDescription
     """The map's description."""
+    recall: float | None = None
+    """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
+    shares_left: int = 0
+    """Number of shares that are not there yet; until then these are counts of one share."""
 
 
 def index_images(
@@ -88,19 +99,8 @@ def index_images(
             `Map.append` raises.
     """
     config = target.description.config
-    names, sizes, new, listed = [], [], [], set[str]()
-    for path in paths:
-        name, size = path.relative_to(root).as_posix(), file_of(path).stat().st_size
-        listed.add(name)
-        if (known := target.image(name)) is None:
-            names.append(name)
-            sizes.append(size)
-            new.append(path)
-        elif known.bytes != size:
-            raise InputError(
-                f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
-                f"{known.root}, expected new names for new pictures"
-            )
+    names, sizes, new = _new_images(target, root, paths)
+    listed = {path.relative_to(root).as_posix() for path in paths}
     target.axes_of(names, positions)  # checks them before any work
     stay = sum(target.image(name) is not None for name in positions.of)
     waiting: list[Described] = []
@@ -119,8 +119,14 @@ def index_images(
         waiting.clear()
 
     there = len(target)
-    batch_size = useful_batch_size(batch_size, len(paths))
-    stream = describe_alone(params, config, new, batch_size=batch_size, on_bad_image=on_bad_image)
+    stream = describe_alone(
+        params,
+        config,
+        new,
+        batch_size=batch_size,
+        on_bad_image=on_bad_image,
+        components=target.components,
+    )
     with progress_bar(
         "images", len(paths), "images", quiet=quiet, done=len(paths) - len(new)
     ) as bar:
@@ -144,6 +150,29 @@ def index_images(
     )
 
 
+def _new_images(
+    target: Map, root: pathlib.Path, paths: Sequence[pathlib.Path]
+) -> tuple[list[str], list[int], list[pathlib.Path]]:
+    """List names, sizes and paths of the images that a map does not have.
+
+    Raises:
+        InputError: a name in the map is of another picture here.
+    """
+    names, sizes, new = [], [], []
+    for path in paths:
+        name, size = path.relative_to(root).as_posix(), file_of(path).stat().st_size
+        if (known := target.image(name)) is None:
+            names.append(name)
+            sizes.append(size)
+            new.append(path)
+        elif known.bytes != size:
+            raise InputError(
+                f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
+                f"{known.root}, expected new names for new pictures"
+            )
+    return names, sizes, new
+
+
 def index(
     params: Crisalad,
     config: ModelConfig,
@@ -158,6 +187,9 @@ def index(
     positions: Positions | str | os.PathLike[str] | None = None,
     store: str | None = None,
     dtype: Literal["float32", "float16"] | None = None,
+    pca: Pca | str | os.PathLike[str] | None = None,
+    search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
+    share: str | None = None,
     batch_size: int = 16,
     on_bad_image: OnBadImage = "stop",
     quiet: bool = False,
@@ -182,6 +214,12 @@ def index(
             is a table; else what @UTM names say; else what the EXIF data of JPEGs says.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
         dtype: what files keep descriptors as. None is the map's, and of a new map "float32".
+        pca: components that shorten the descriptors, or a file of them, of which the map keeps a
+            copy. None is the map's, and of a new map none.
+        search: the approximate search that is built from the map's descriptors; "exact" removes
+            one. None leaves what there is, which is of no use once the map has grown.
+        share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
+            same folders take the others, and the last one to end joins all.
         batch_size: number of images described at once, each as if it were alone.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         quiet: whether to show no progress bar.
@@ -206,6 +244,9 @@ def index(
     """
     check_params(params, config)
     check_grouping((), batch_size, seed=0)
+    if search is not None:
+        choose("search", search, SEARCHES)
+    part = None if share is None else Share.parse(share)
     out = pathlib.Path(out)
     description = read_description(out)
     if not has_images(out):
@@ -213,6 +254,9 @@ def index(
     source = open_source(images, fps=fps)
     table = source.positions if positions is None else positions
     known = _positions(table, images, source.names)
+    by_exif = table is None and not known.of
+    components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
+    batch_size = useful_batch_size(batch_size, len(source.paths))
     if description is None:
         config = config.resized(image_size, resize)
         if compute_dtype is not None:
@@ -224,27 +268,123 @@ def index(
             out,
             store=store or "files",
             dtype=dtype or "float32",
+            pca=components,
         )
     else:
         check_model(description, out, model_hash(params, config), weights)
         way = config.preprocessing.changed_by(resize) if resize else None
-        _check_settings(description, out, image_size, way, compute_dtype, dtype, store)
-    with open_for_appending(out, description) as target:
-        if table is None and not known.of:
-            known = _by_exif(target, source)
-        result = index_images(
+        _check_settings(description, out, image_size, way, compute_dtype, dtype, store, components)
+        components = read_components(out, description)
+    if search not in (None, "exact") and description.store != "files":
+        raise InputError(
+            f"search: found {search}, expected exact, as {description.store} is searched by Milvus"
+        )
+    options: dict[str, Any] = {
+        "batch_size": batch_size,
+        "on_bad_image": on_bad_image,
+        "quiet": quiet,
+    }
+    if part is None:
+        with open_for_appending(out, description, components) as target:
+            if by_exif:
+                known = _by_exif(target, source.names, source.paths)
+            result = index_images(
+                target, params, source.root, source.paths, positions=known, **options
+            )
+            if not result.images:
+                raise InputError(
+                    f"{images}: found {len(source.paths)} images, none of them readable"
+                )
+            if search is not None:
+                result = result._replace(recall=target.build_search(search, quiet=quiet))
+    else:
+        settings = {"dtype": description.dtype, "pca": description.pca, "batch_size": batch_size}
+        digest = digest_of(params, description.config, source.names, settings)
+        shared = SharedMap(out, part, digest, description, components)
+        if by_exif:
+            mine = part.of(len(source.paths), batch_size)
+            with contextlib.ExitStack() as stack:
+                there = (
+                    stack.enter_context(Map.open(out, verify=False)) if has_images(out) else None
+                )
+                known = _by_exif(there, source.names[mine], source.paths[mine])
+        result = _index_share(
+            shared, params, source.root, source.paths, positions=known, search=search, **options
+        )
+    return result if table is not None else result._replace(stay=0)
+
+
+def _index_share(
+    shared: SharedMap,
+    params: Crisalad,
+    images: pathlib.Path,
+    paths: Sequence[pathlib.Path],
+    *,
+    positions: Positions,
+    batch_size: int,
+    search: str | None,
+    quiet: bool,
+    **options: Any,
+) -> Indexed:
+    """Index one share of the images in a map of its own; if it is the last one, join all.
+
+    Raises:
+        InputError: what `index_images`, `Share.of`, `SharedMap.describe` and `join` raise.
+    """
+    mine = paths[shared.share.of(len(paths), batch_size)]
+    stay, there = 0, 0
+    new = list(mine)
+    names = {path.relative_to(images).as_posix() for path in paths}
+    unmatched = [name for name in positions.of if name not in names]
+    if has_images(shared.out):
+        with Map.open(shared.out, verify=False) as whole:
+            whole.axes_of(names, positions)
+            new = _new_images(whole, images, mine)[2]
+            there = len(paths) - len(_new_images(whole, images, paths)[2])
+            stay = sum(whole.image(name) is not None for name in positions.of)
+            known = len(whole)
+        if there == len(paths) and not (shared.out / SHARES).exists():
+            return Indexed(0, there, 0, stay, [], unmatched, known, shared.description)
+    found = Indexed(0, there, 0, stay, [], unmatched, 0, shared.description)
+
+    def work(target: Map) -> dict[str, Any]:
+        nonlocal found
+        done = index_images(
             target,
             params,
-            source.root,
-            source.paths,
-            positions=known,
+            images,
+            new,
+            positions=positions,
             batch_size=batch_size,
-            on_bad_image=on_bad_image,
             quiet=quiet,
+            **options,
         )
-        if not result.images:
-            raise InputError(f"{images}: found {len(source.paths)} images, none of them readable")
-    return result if table is not None else result._replace(stay=0)
+        located = sum(image.position is not None for image in target.images)
+        found = found._replace(
+            added=len(target), positions=located, unreadable=done.unreadable, images=len(target)
+        )
+        return {"added": len(target), "positions": located, "unreadable": done.unreadable}
+
+    if shared.counts(shared.share) is None:
+        shared.describe(work)
+    if left := shared.left():
+        return found._replace(shares_left=left)
+
+    def finish(target: Map) -> None:
+        nonlocal found
+        if not len(target):
+            raise InputError(f"{images}: found {len(paths)} images, none of them readable")
+        recall = None if search is None else target.build_search(search, quiet=quiet)
+        found = found._replace(images=len(target), recall=recall)
+
+    counts = shared.join(finish, quiet=quiet)
+    if counts is None:
+        return found
+    return found._replace(
+        added=sum(each["added"] for each in counts),
+        positions=sum(each["positions"] for each in counts),
+        unreadable=[name for each in counts for name in each["unreadable"]],
+    )
 
 
 def _positions(
@@ -265,15 +405,15 @@ def _positions(
     return positions
 
 
-def _by_exif(target: Map, source: ImageSource) -> Positions:
+def _by_exif(target: Map | None, names: Sequence[str], paths: Sequence[pathlib.Path]) -> Positions:
     """Read where JPEGs that the map lacks were taken, if its own positions are in degrees too."""
     new = (
         (name, path)
-        for name, path in zip(source.names, source.paths, strict=True)
-        if target.image(name) is None and frame_time(path) is None
+        for name, path in zip(names, paths, strict=True)
+        if (target is None or target.image(name) is None) and frame_time(path) is None
     )
     found = exif_positions(new)
-    if found.of and target.axes not in (None, found.axes):
+    if target is not None and found.of and target.axes not in (None, found.axes):
         tell(
             f"{target.folder}: left out the EXIF positions of {len(found.of)} images, expected "
             f"{', '.join(target.axes or ())} as in the map"
@@ -290,6 +430,7 @@ def _check_settings(
     compute_dtype: str | None,
     dtype: str | None,
     store: str | None,
+    pca: Pca | None,
 ) -> None:
     """Check that the given settings agree with those of an existing map."""
     store = store and store_name(store, folder, description.dtype)
@@ -304,6 +445,7 @@ def _check_settings(
         ("compute dtype", compute_dtype, description.config.compute_dtype),
         ("dtype", dtype, description.dtype),
         ("store", store, description.store),
+        ("components", pca and pca_hash(pca)[:12], description.pca[:12] or "none"),
     ):
         if given is not None and given != there:
             raise InputError(f"{folder}: found {name} {given}, expected {there} as in the map")

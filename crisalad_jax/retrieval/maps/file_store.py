@@ -16,6 +16,11 @@ from crisalad_jax.utils.files import check_source, durable_path, npy_header, wri
 _SPARE = 16
 """Number of candidates beyond k, for products that float32 cannot tell apart."""
 
+_MAPPED = 8192
+"""Number of files that stay mapped, at most; Linux allows a process 65,530 mappings."""
+_READ_BYTES = 2**26
+"""Size of the rows that are ranked at a time."""
+
 
 class FileStore:
     """A `Store` in a folder of files, each named by the number of its first descriptor.
@@ -29,6 +34,8 @@ class FileStore:
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
         self._counts: dict[int, int] = {}
         """Number of descriptors in each file, by the number of its first, in ascending order."""
+        self._mapped: dict[int, np.ndarray] = {}
+        """Files that rows were read of one by one."""
 
     def _path(self, first: int) -> pathlib.Path:
         return self._folder / f"{first:010d}.npy"
@@ -127,5 +134,44 @@ class FileStore:
             )
         return Neighbours(numbers, similarities)
 
+    def similarities(
+        self, queries: Float32[np.ndarray, "q d"], numbers: Int64[np.ndarray, "q k"]
+    ) -> Float32[np.ndarray, "q k"]:
+        """Compute the exact similarities of queries to descriptors of these numbers.
+
+        Raises:
+            InputError: a file is damaged or gone.
+        """
+        queries = np.ascontiguousarray(queries, np.float32)
+        similarities = np.empty(numbers.shape, np.float32)
+        size = max(1, _READ_BYTES // (4 * self._length * numbers.shape[1]))
+        for start in range(0, len(queries), size):
+            some = numbers[start : start + size]
+            chosen, places = np.unique(some, return_inverse=True)
+            query = np.repeat(np.arange(len(some)), some.shape[1])
+            similarities[start : start + size] = exact_similarities(
+                queries[start : start + size], self.rows(chosen), query, places.ravel()
+            ).reshape(some.shape)
+        return similarities
+
+    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
+        """Read the descriptors of these numbers; their files stay mapped into memory.
+
+        Raises:
+            InputError: a file is damaged or gone.
+        """
+        firsts = np.array(list(self._counts))
+        rows = np.empty((len(numbers), self._length), np.float32)
+        segments = np.searchsorted(firsts, numbers, side="right") - 1
+        for segment in np.unique(segments):
+            places, first = np.flatnonzero(segments == segment), int(firsts[segment])
+            if first not in self._mapped:
+                if len(self._mapped) >= _MAPPED:
+                    self._mapped.clear()
+                self._mapped[first] = self._open(first).view(np.ndarray)
+            rows[places] = self._mapped[first][numbers[places] - first]
+        return rows
+
     def close(self) -> None:
-        """Do nothing: no connection is open."""
+        """Let go of files."""
+        self._mapped.clear()

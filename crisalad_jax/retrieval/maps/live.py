@@ -109,11 +109,11 @@ def query_live(
 
     def answers() -> Iterator[LiveAnswer]:
         blank = np.zeros((*(source.size or config.image_size), 3), np.uint8)
-        places.search(describer(blank), k)
+        places.search(places.shorten(describer(blank)), k)
         describer.forget()
         ready()
         for frame in source.frames(check):
-            described = describer(frame.image)
+            described = places.shorten(describer(frame.image))
             if follower is None:
                 neighbours, filtered = places.search(described, k), ()
             else:

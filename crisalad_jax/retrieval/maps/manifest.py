@@ -10,23 +10,27 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from crisalad_jax.checkpoints.weights import model_hash
-from crisalad_jax.config.io import from_plain
+from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.utils.checksums import sealed_json
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import durable_path, read_json, real_path
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.temporaries import LOCK, is_temporary, remove_temporaries
 
-FORMAT = 3
-"""Version of the format that this package writes, and the newest that it reads. Maps of format 2
+FORMAT = 4
+"""Newest version of the format that this package reads, and that of a map with components. Others
+are written as format 3, which earlier versions read. Maps of format 2
 have records without checksums; those of format 1 (package version 0.1) also have a hash of all
 fields that a model had then."""
 DESCRIPTION, SEGMENTS, LOCKS = "map.json", "segments", (LOCK, ".lock")
 """Names of the description, of the folder of additions, and of the locks for appending, today's
 first."""
+COMPONENTS, SHARES = "pca.safetensors", "shares"
+"""Names of the components that shorten descriptors, and of the folder of shares to be joined."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +53,10 @@ class MapDescription:
     collection: str = ""
     """Name of Milvus' collection of the descriptors."""
     created: str = ""
-    format: int = FORMAT
+    pca: str = ""
+    """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
+    none."""
+    format: int = 3
 
 
 def describe_map(
@@ -60,23 +67,62 @@ def describe_map(
     *,
     store: str = "files",
     dtype: str = "float32",
+    pca: Pca | None = None,
 ) -> MapDescription:
     """Make the description of a new map in `folder`, whose images this model will describe.
 
     Raises:
-        InputError: the model's descriptors are no unit vectors; what `store_name` raises.
+        InputError: the model's descriptors are no unit vectors, or its components make none or are
+            of another length; what `store_name` raises.
     """
     check_unit_length(config, str(weights))
+    if pca is not None:
+        pca.check(config.descriptor_dim, str(weights))
+        if not pca.config.renormalise:
+            raise InputError(
+                "pca: found components that leave lengths as they are, expected some that make "
+                "unit vectors, which maps compare by cosine"
+            )
     return MapDescription(
         model=model_hash(params, config),
         weights=str(real_path(weights)),
         config=config,
-        descriptor_length=config.descriptor_dim,
+        descriptor_length=config.descriptor_dim if pca is None else len(pca.components),
         store=store_name(store, folder, dtype),
         dtype=dtype,
         collection=f"crisalad_{uuid.uuid4().hex}",
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        pca="" if pca is None else pca_hash(pca),
+        format=3 if pca is None else FORMAT,
     )
+
+
+def write_description(folder: pathlib.Path, description: MapDescription) -> None:
+    """Write map.json, whole or not at all; a field that is not used is left out for old readers.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written to.
+    """
+    value = to_plain(description)
+    if not description.pca:
+        del value["pca"]
+    write_record(folder / DESCRIPTION, value, indent=2)
+
+
+def read_components(folder: pathlib.Path, description: MapDescription) -> Pca | None:
+    """Read the components of a map; None where it has none.
+
+    Raises:
+        InputError: the file is gone, damaged, or of other components.
+    """
+    if not description.pca:
+        return None
+    pca = load_pca(folder / COMPONENTS)
+    if pca_hash(pca) != description.pca:
+        raise InputError(
+            f"{folder / COMPONENTS}: found other components, expected those that {DESCRIPTION} says"
+        )
+    return pca
 
 
 def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
@@ -92,7 +138,7 @@ def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: found a file, expected a map's folder")
         # A process killed before it has made the map leaves its lock and temporary files behind.
-        others = sorted(_others(folder, *LOCKS, SEGMENTS))
+        others = sorted(_others(folder, *LOCKS, SEGMENTS, COMPONENTS, SHARES))
         if _others(folder / SEGMENTS):
             others.append(SEGMENTS)
         if others:
@@ -159,8 +205,8 @@ def _remove(folder: pathlib.Path) -> None:
     for path in segments.glob("[0-9]*.npy"):
         path.unlink()
     segments.rmdir()
-    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, *LOCKS}:
-        for name in (DESCRIPTION, *LOCKS):
+    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, COMPONENTS, *LOCKS}:
+        for name in (DESCRIPTION, COMPONENTS, *LOCKS):
             (folder / name).unlink(missing_ok=True)
         folder.rmdir()
 

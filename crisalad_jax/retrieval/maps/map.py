@@ -24,19 +24,28 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.alone import describe_images
 from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.maps.approximate import (
+    Approximate,
+    build_approximate,
+    open_approximate,
+)
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
+from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.manifest import (
-    DESCRIPTION,
+    COMPONENTS,
     SEGMENTS,
     MapDescription,
     check_model,
     has_images,
     is_checked,
+    read_components,
     read_description,
     undone_without_images,
+    write_description,
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import Store, open_store
+from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
@@ -105,6 +114,9 @@ class Map:
         self._close = weakref.finalize(self, store.close)
         self.calibration: Calibration | None = None
         """What `calibrate` measured; None where it did not, or the map is open for appending."""
+        self.components = read_components(folder, description)
+        """The components that shorten descriptors, and those of queries; None is none."""
+        self._approximate: Approximate | None = None
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
@@ -157,6 +169,7 @@ class Map:
             opened.calibration = read_calibration(folder, description.model)
             if verify and description.store == "files":
                 opened.verify()
+            opened._approximate = open_approximate(folder, opened._segments, verify=verify)
         except BaseException:
             opened.close()
             raise
@@ -234,14 +247,18 @@ class Map:
         self.axes = self.axes or axes
         self._segments.append(segment)
 
-    def search(self, queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+    def search(
+        self, queries: Float32[np.ndarray, "q d"], k: int, *, exact: bool = False
+    ) -> Neighbours:
         """Find the k most similar images of each query, best first; all where there are fewer.
 
         Search is exact, by inner product; of equal similarities the earlier image stands first.
+        A map with an approximate search finds nearly all of them. Their similarities are exact.
 
         Args:
-            queries: unit descriptors, of the map's model.
+            queries: unit descriptors, of the map's model, shortened by its `components`.
             k: neighbours per query.
+            exact: whether to search exactly although the map has an approximate search.
 
         Raises:
             InputError: no queries, none in the map, descriptors that are no unit vectors of the
@@ -252,7 +269,39 @@ class Map:
         if not len(self):
             raise InputError(f"{self.folder}: found a map without images, expected at least one")
         self._check_descriptors("queries", queries)
-        return self._store.search(queries, min(k, len(self)), len(self))
+        k = min(k, len(self))
+        if self._approximate is not None and isinstance(self._store, FileStore) and not exact:
+            return self._approximate.search(self._store, queries, k, len(self))
+        return self._store.search(queries, k, len(self))
+
+    def shorten(self, descriptors: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n short"]:
+        """Shorten a model's descriptors by the map's `components`; without any they stay."""
+        return descriptors if self.components is None else self.components.apply(descriptors)
+
+    def build_search(self, kind: str, *, quiet: bool = True) -> float | None:
+        """Build the map's approximate search from its descriptors, where it is not there yet.
+
+        Args:
+            kind: "hnsw" or "ivf-pq"; "exact" removes what there is.
+            quiet: whether to show no progress bar.
+
+        Returns:
+            The share of the exact 10 nearest others that are found of 100 of its images; None of
+            an exact search.
+
+        Raises:
+            InputError: an unknown kind, too few images, or a map in Milvus.
+        """
+        self._approximate = build_approximate(
+            self.folder,
+            kind,
+            self._segments,
+            self._store,
+            lambda: self.descriptors,
+            self.description.descriptor_length,
+            quiet=quiet,
+        )
+        return None if self._approximate is None else self._approximate.recall
 
     def locate(
         self,
@@ -296,7 +345,8 @@ class Map:
         if params is None:
             params = self._checked or self.load_params()
         self.check_params(params)
-        found = self.search(describe_images(params, self.description.config, [picture]), k)
+        descriptor = describe_images(params, self.description.config, [picture])
+        found = self.search(self.shorten(descriptor), k)
         pairs = zip(found.indices[0], found.similarities[0], strict=True)
         return [
             Answer(rank, float(similarity), self.images[number])
@@ -431,6 +481,8 @@ class Map:
             "resize": description.config.images_in_words,
             "grouping": description.grouping,
             "store": description.store,
+            "search": "exact" if self._approximate is None else self._approximate.kind,
+            "components": description.pca or "none",
             "model": description.model,
             "weights": description.weights,
             "created": description.created,
@@ -479,9 +531,11 @@ class Map:
 
 @contextlib.contextmanager
 def open_for_appending(
-    folder: str | os.PathLike[str], description: MapDescription
+    folder: str | os.PathLike[str],
+    description: MapDescription,
+    components: Pca | None = None,
 ) -> Iterator[Map]:
-    """Open the map with this description to append to it, or make it.
+    """Open the map with this description to append to it, or make it, with its components.
 
     One process at a time may append; others may search meanwhile. A map that a kill left without
     images is made anew; one that an exception leaves without images is removed.
@@ -502,7 +556,9 @@ def open_for_appending(
         if existing != description:
             if has_images(folder):
                 raise InputError(f"{folder}: found another map than was expected here")
-            write_record(folder / DESCRIPTION, to_plain(description), indent=2)
+            if components is not None:
+                save_pca(folder / COMPONENTS, components)
+            write_description(folder, description)
         yield stack.enter_context(Map._opened(folder, description))
 
 

@@ -21,6 +21,7 @@ from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.follow import Followed, Follower
 from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
+from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.retrieval.windows import check_window, describe_windows
@@ -90,6 +91,7 @@ def query(
     k: int = 5,
     fps: float = 1.0,
     window: int = 1,
+    exact: bool = False,
     batch_size: int = 16,
     on_bad_image: OnBadImage = "stop",
     min_similarity: float | None = None,
@@ -107,6 +109,7 @@ def query(
         fps: frames a second taken of a video.
         window: frames that are described together: each with those just before it in its source,
             as a moving camera has them. 1 describes each alone, as a map's images are.
+        exact: whether to search exactly although the map has an approximate search.
         batch_size: number of queries described at once, each as if it were alone.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         min_similarity: a query to which no image is that similar is of an unknown place; see
@@ -156,7 +159,13 @@ def query(
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
         for part in _described(
-            params, config, sources, window=window, batch_size=batch_size, on_bad_image=on_bad_image
+            params,
+            config,
+            sources,
+            window=window,
+            batch_size=batch_size,
+            on_bad_image=on_bad_image,
+            components=places.components,
         ):
             waiting.append(part.descriptors)
             unreadable += (paths[index] for index in part.unreadable)
@@ -169,7 +178,9 @@ def query(
             if count >= AT_ONCE or (count and described == len(paths)):
                 found = np.concatenate(waiting)
                 parts.append(
-                    places.search(found, k) if follower is None else follower.answer(found, k)
+                    places.search(found, k, exact=exact)
+                    if follower is None
+                    else follower.answer(found, k)
                 )
                 waiting.clear()
     indices, similarities, *filtered = map(np.concatenate, zip(*parts, strict=True))
@@ -205,6 +216,7 @@ def _described(
     window: int,
     batch_size: int,
     on_bad_image: OnBadImage,
+    components: Pca | None,
 ) -> Iterator[Described]:
     """Describe the images of all sources; a window holds images of one source alone."""
     if window == 1:
@@ -213,7 +225,12 @@ def _described(
     for source in sources:
         if window == 1:
             stream = describe_alone(
-                params, config, source, batch_size=batch_size, on_bad_image=on_bad_image
+                params,
+                config,
+                source,
+                batch_size=batch_size,
+                on_bad_image=on_bad_image,
+                components=components,
             )
         else:
             stream = describe_windows(
@@ -225,7 +242,10 @@ def _described(
                 on_bad_image=on_bad_image,
             )
         for part in stream:
-            yield Described(part.indices + first, part.descriptors, part.unreadable + first)
+            descriptors = part.descriptors
+            if window > 1 and components is not None and len(descriptors):
+                descriptors = components.apply(descriptors)
+            yield Described(part.indices + first, descriptors, part.unreadable + first)
         first += len(source)
 
 

@@ -336,7 +336,7 @@ def test_one_process_appends_at_a_time(folder):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda m: reseal(m / "map.json", format=4), "found a map of format 4, expected at most 3"),
+        (lambda m: reseal(m / "map.json", format=5), "found a map of format 5, expected at most 4"),
         (lambda m: edit(m / "map.json", format=4), "map.json: found other bytes than were written"),
         (lambda m: edit(m / "map.json", format=2), "map.json: found other bytes than were written"),
         (lambda m: (m / "map.json").write_text('{"model'), "map.json: found no JSON (Unterminated"),

@@ -1,0 +1,178 @@
+"""Approximate search of a map: an index of FAISS beside its descriptors, made from them.
+
+The index's name holds a digest of the additions that it was built from. One of other additions is
+not used, so that a map that grew never answers from an old index.
+"""
+
+import hashlib
+import pathlib
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.retrieval.chunks import sample
+from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
+
+if TYPE_CHECKING:
+    from crisalad_jax.retrieval.faiss_index import Index
+
+SEARCHES = {
+    "exact": "every descriptor is compared",
+    "hnsw": "a graph over the descriptors, which are all in memory",
+    "ivf-pq": "codes of at most 128 bytes in memory; the files rank the answers",
+}
+"""How a map is searched."""
+FOLDER = "approximate"
+NEIGHBOURS, SAMPLE = 10, 100
+"""Recall is measured over the 10 nearest others of so many of the map's images."""
+_CANDIDATES = {"hnsw": (2, 16), "ivf-pq": (10, 100)}
+"""Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
+similarity are the answer."""
+_SEED = 0
+Additions = Sequence[tuple[int, int, str]]
+"""First number, count and SHA-256 of each addition to a map."""
+
+
+class Approximate(NamedTuple):
+    """An approximate search of a map's descriptors."""
+
+    kind: Literal["hnsw", "ivf-pq"]
+    index: "Index"
+    recall: float
+    """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
+
+    def search(
+        self, store: FileStore, queries: Float32[np.ndarray, "q d"], k: int, count: int
+    ) -> Neighbours:
+        """Find the k most similar of `count` descriptors: candidates, ranked exactly.
+
+        Queries with fewer than k candidates are searched exactly.
+
+        Raises:
+            InputError: the store is damaged or gone.
+        """
+        each, least = _CANDIDATES[self.kind]
+        numbers = self.index.search(queries, min(count, max(least, each * k))).indices
+        similarities = store.similarities(queries, np.maximum(numbers, 0))
+        similarities[numbers < 0] = -np.inf
+        order = np.lexsort((numbers, -similarities))[:, :k]
+        numbers = np.take_along_axis(numbers, order, axis=1)
+        similarities = np.take_along_axis(similarities, order, axis=1)
+        few = np.flatnonzero(numbers[:, -1] < 0)
+        if few.size:
+            numbers[few], similarities[few] = store.search(queries[few], k, count)
+        return Neighbours(numbers, similarities)
+
+
+def open_approximate(
+    folder: pathlib.Path, additions: Additions, *, verify: bool
+) -> Approximate | None:
+    """Open the approximate search of the map in `folder`; None where it has none of its images.
+
+    A note tells of one that was built from other images.
+
+    Raises:
+        InputError: it is damaged, or changed where `verify` asks for that.
+    """
+    found = sorted((folder / FOLDER).glob("*.index"))
+    if not found:
+        return None
+    digest = _digest(additions)
+    path = next((path for path in found if path.stem.endswith(digest)), None)
+    if path is None:
+        tell(
+            f"{folder}: found an approximate search of fewer or other images; the map is searched "
+            f"exactly; `crisalad index --search {_kind(found[0])}` builds it anew"
+        )
+        return None
+    from crisalad_jax.retrieval.faiss_index import load_index
+
+    record = read_json(path.with_suffix(".json"), "a record of an approximate search")
+    index = load_index(path, verify=verify)
+    count = sum(count for _, count, _ in additions)
+    if index.size != count:
+        raise InputError(f"{path}: found {index.size} descriptors, expected {count} as in the map")
+    return Approximate(index.kind, index, float(record["recall"]))
+
+
+def build_approximate(
+    folder: pathlib.Path,
+    kind: str,
+    additions: Additions,
+    store: object,
+    rows: Callable[[], Iterator[np.ndarray]],
+    length: int,
+    *,
+    quiet: bool = True,
+) -> Approximate | None:
+    """Build the approximate search of a map, unless it is there; "exact" removes any.
+
+    Args:
+        folder: the map's, whose lock is held.
+        kind: of `SEARCHES`.
+        additions: to the map.
+        store: of its descriptors.
+        rows: yields them from the first on.
+        length: numbers in a descriptor.
+        quiet: no progress bar.
+
+    Raises:
+        InputError: an unknown kind; descriptors in Milvus, or too few of them; a full disk.
+    """
+    choose("search", kind, SEARCHES)
+    if kind == "exact":
+        shutil.rmtree(folder / FOLDER, ignore_errors=True)
+        return None
+    if not isinstance(store, FileStore):
+        raise InputError(
+            f"search: found {kind}, expected exact, as a map in Milvus is searched by Milvus"
+        )
+    digest = _digest(additions)
+    path = folder / FOLDER / f"{kind}-{digest}.index"
+    if path.exists():
+        return open_approximate(folder, additions, verify=True)
+    from crisalad_jax.retrieval.faiss_index import build_from, recall_against_exact, save_index
+
+    count = sum(count for _, count, _ in additions)
+    index = build_from(kind, count, length, rows, seed=_SEED, quiet=quiet)  # pyright: ignore
+    built = Approximate(index.kind, index, 0.0)
+    places = sample(count, min(SAMPLE, count), _SEED)
+    k = min(NEIGHBOURS + 1, count)
+    queries = store.rows(places)
+    sides = built.search(store, queries, k, count), store.search(queries, k, count)
+    found, exact = (_others(places, side.indices) for side in sides)
+    built = built._replace(recall=recall_against_exact(found, exact) if exact.size else 1.0)
+    with made_folder(path.parent):
+        remove_temporaries(path.parent)
+        value = {"kind": kind, "images": count, "recall": built.recall, "queries": len(places)}
+        write_json(path.with_suffix(".json"), value)
+        save_index(path, index)
+    for other in path.parent.iterdir():
+        if other.stem != path.stem:
+            other.unlink()
+    return built
+
+
+def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Drop each image itself from its neighbours, or the last one where it is not among them."""
+    kept = numbers != places[:, None]
+    kept[kept.all(axis=1), -1] = False
+    return numbers[kept].reshape(len(numbers), -1)
+
+
+def _digest(additions: Additions) -> str:
+    lines = (f"{first} {count} {digest}\n" for first, count, digest in additions)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
+
+
+def _kind(path: pathlib.Path) -> str:
+    return path.stem.rpartition("-")[0]

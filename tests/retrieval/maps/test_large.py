@@ -1,0 +1,356 @@
+"""Maps in shares, by components, and with an approximate search."""
+
+import json
+import pathlib
+import shutil
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from crisalad_jax.data.images import list_images
+from crisalad_jax.retrieval.maps import shared as shared_module
+from crisalad_jax.retrieval.maps.build import Indexed, describe_alone, index
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.query import query
+from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
+from tests.conftest import BATCH, MODEL
+from tests.killed_appends import append_until, description, names, rows
+from tests.retrieval.maps.test_stores import brute_force
+
+ROOT = pathlib.Path(__file__).parents[3]
+QUERIES = rows(1000, 5)
+
+
+@pytest.fixture(scope="module")
+def database(shared) -> pathlib.Path:
+    return shared / "town" / "images" / "test" / "database"
+
+
+@pytest.fixture(scope="module")
+def whole(shared, params, database, tmp_path_factory) -> pathlib.Path:
+    """A map that one process made."""
+    folder = tmp_path_factory.mktemp("whole") / "map"
+    run(shared, params, database, folder)
+    return folder
+
+
+def run(shared, params, images, out, **options) -> Indexed:
+    weights = shared / "weights.safetensors"
+    options = {"batch_size": BATCH, "quiet": True} | options
+    return index(params, MODEL, images, out, weights=weights, **options)
+
+
+def contents(folder: pathlib.Path) -> tuple[list, bytes]:
+    """Images and descriptors of a map."""
+    with Map.open(folder) as places:
+        return places.images, np.concatenate(list(places.descriptors)).tobytes()
+
+
+# Shares
+
+
+def test_shares_make_the_map_of_one_process(shared, params, database, whole, tmp_path):
+    out = tmp_path / "map"
+    first = run(shared, params, database, out, share="1/2")
+    assert (first.added, first.shares_left) == (3, 1)
+    with pytest.raises(InputError, match="found no map"):
+        Map.open(out)
+    again = run(shared, params, database, out, share="1/2")
+    assert again.shares_left == 1
+    last = run(shared, params, database, out, share="0/2")
+    assert (last.added, last.positions, last.images, last.shares_left) == (7, 7, 7, 0)
+    assert contents(out) == contents(whole)
+    assert sorted(path.name for path in out.iterdir()) == ["map.json", "segments"]
+    late = run(shared, params, database, out, share="1/2")
+    assert (late.added, late.there, late.shares_left) == (0, 7, 0)
+    assert contents(out) == contents(whole)
+
+
+def test_shares_add_to_a_map(shared, params, database, whole, tmp_path):
+    part, out = tmp_path / "part", tmp_path / "map"
+    part.mkdir()
+    for path in list_images(database)[2:5]:
+        (part / path.name).symlink_to(path)
+    run(shared, params, part, out)
+    assert run(shared, params, database, out, share="0/2").added == 2
+    done = run(shared, params, database, out, share="1/2")
+    assert (done.added, done.there, done.images) == (4, 3, 7)
+    found, expected = (
+        {one.name: one.position for one in contents(folder)[0]} for folder in (out, whole)
+    )
+    assert found == expected
+
+
+def test_a_join_that_is_cut_short_goes_on(shared, params, database, whole, tmp_path, monkeypatch):
+    out = tmp_path / "map"
+    run(shared, params, database, out, share="0/2")
+    real = shared_module._add
+
+    def cut(target: Map, *rest: Any) -> None:
+        real(target, *rest)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shared_module, "_add", cut)
+        with pytest.raises(KeyboardInterrupt):
+            run(shared, params, database, out, share="1/2")
+    assert len(contents(out)[0]) == 4
+    run(shared, params, database, out, share="1/2")
+    assert contents(out) == contents(whole)
+    assert not (out / "shares").exists()
+
+
+def test_a_kill_after_all_is_joined_leaves_nothing_undone(
+    shared, params, database, tmp_path, monkeypatch
+):
+    out = tmp_path / "map"
+    run(shared, params, database, out, share="0/2")
+
+    def cut(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Map, "build_search", cut)
+        with pytest.raises(KeyboardInterrupt):
+            run(shared, params, database, out, share="1/2", search="hnsw")
+    assert run(shared, params, database, out, share="1/2", search="hnsw").recall == 1.0
+    assert not (out / "shares").exists()
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        ("2/2", "share: found '2/2', expected INDEX/COUNT"),
+        ("1", "share: found '1', expected INDEX/COUNT"),
+        ("0/3", "found 3 shares of 7 images in batches of 4, expected at most 2"),
+    ],
+)
+def test_what_is_no_share(shared, params, database, tmp_path, share, words):
+    with pytest.raises(InputError, match=words):
+        run(shared, params, database, tmp_path / "map", share=share)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_share_of_other_images_is_not_joined(shared, params, database, tmp_path):
+    images, out = tmp_path / "images", tmp_path / "map"
+    shutil.copytree(database, images)
+    run(shared, params, images, out, share="0/2")
+    shutil.copy(list_images(images)[0], images / "another.jpg")
+    with pytest.warns(Note, match=r"0-of-2\.json: found a share of other images or settings"):
+        left = run(shared, params, images, out, share="1/2").shares_left
+    assert left == 1
+    with pytest.warns(Note, match="found a share of other images"):
+        assert run(shared, params, images, out, share="0/2").images == 8
+
+
+# Components
+
+
+def test_a_map_of_components_shortens_queries_too(shared, params, database, whole, tmp_path):
+    with Map.open(whole) as places:
+        full = np.concatenate(list(places.descriptors))
+    fitted, file, out = fit_pca(full, 3), tmp_path / "pca.safetensors", tmp_path / "map"
+    save_pca(file, fitted)
+    run(shared, params, database, out, pca=file)
+    file.unlink()
+    run(shared, params, database, out)  # the map has a copy
+    value = json.loads((out / "map.json").read_text())
+    assert (value["format"], value["descriptor_length"]) == (4, 3)
+    queries = list_images(shared / "town" / "images" / "test" / "queries")
+    asked = np.concatenate(
+        [part.descriptors for part in describe_alone(params, MODEL, queries, batch_size=BATCH)]
+    )
+    with Map.open(out) as places:
+        stored = np.concatenate(list(places.descriptors))
+        # Products of other shapes round otherwise, by some units in the last place.
+        np.testing.assert_allclose(stored, fitted.apply(full), atol=1e-5)
+        answers = query(places, params, queries, k=3, batch_size=BATCH, quiet=True)
+    expected = brute_force(fitted.apply(full), fitted.apply(asked), 3)
+    np.testing.assert_array_equal(answers.neighbours.indices, expected)
+    other = fit_pca(full, 2)
+    with pytest.raises(InputError, match=r"found components [0-9a-f]{12}, expected [0-9a-f]{12}"):
+        run(shared, params, database, out, pca=other)
+    with pytest.raises(InputError, match=r"components [0-9a-f]{12}, expected none as in the map"):
+        run(shared, params, database, whole, pca=other)
+    save_pca(out / "pca.safetensors", other)
+    with pytest.raises(InputError, match=r"pca\.safetensors: found other components"):
+        Map.open(out)
+
+
+def test_a_map_without_components_is_of_the_old_format(whole):
+    value = json.loads((whole / "map.json").read_text())
+    assert value["format"] == 3
+    assert "pca" not in value
+
+
+def test_components_that_leave_lengths_are_refused(shared, params, database, whole, tmp_path):
+    with Map.open(whole) as places:
+        full = np.concatenate(list(places.descriptors))
+    loose = fit_pca(full, 3, PcaConfig(renormalise=False))
+    with pytest.raises(InputError, match="pca: found components that leave lengths"):
+        run(shared, params, database, tmp_path / "map", pca=loose)
+
+
+# Approximate search
+
+
+@pytest.fixture
+def grown(tmp_path) -> pathlib.Path:
+    append_until(tmp_path / "map", 40)
+    return tmp_path / "map"
+
+
+def build(folder: pathlib.Path, kind: str) -> float | None:
+    with open_for_appending(folder, description("files")) as target:
+        return target.build_search(kind)
+
+
+def test_a_graph_answers_and_ranks_exactly(grown):
+    """Of 40 descriptors a graph finds all, so that the answer is that of brute force."""
+    assert build(grown, "hnsw") == 1.0
+    with Map.open(grown) as places:
+        assert places.summary()["search"] == "hnsw"
+        found, exact = places.search(QUERIES, 3), places.search(QUERIES, 3, exact=True)
+        every = places.search(QUERIES, 100)
+    np.testing.assert_array_equal(found.indices, brute_force(rows(0, 40), QUERIES, 3))
+    np.testing.assert_array_equal(found.indices, exact.indices)
+    np.testing.assert_array_equal(found.similarities, exact.similarities)
+    assert sorted(every.indices[0]) == list(range(40))
+
+
+def test_candidates_come_from_the_index(grown, monkeypatch):
+    """An index that finds some alone is asked; where it finds too few, the search is exact."""
+    build(grown, "hnsw")
+    with Map.open(grown) as places:
+        approximate = places._approximate
+        assert approximate is not None
+
+        class Poor:
+            def search(self, queries, k):
+                numbers = np.full((len(queries), k), -1)
+                numbers[:, :2] = 7, 3
+                return type("Found", (), {"indices": numbers})
+
+        places._approximate = approximate._replace(index=Poor())
+        found = places.search(QUERIES, 2)
+        assert {tuple(sorted(row)) for row in found.indices.tolist()} == {(3, 7)}
+        products = QUERIES.astype(np.float64) @ rows(0, 40)[[3, 7]].T.astype(np.float64)
+        # Sums in float64, rounded to float32 once.
+        np.testing.assert_allclose(found.similarities, -np.sort(-products), rtol=1e-7)
+        np.testing.assert_array_equal(
+            places.search(QUERIES, 3).indices, places.search(QUERIES, 3, exact=True).indices
+        )
+
+
+def test_a_map_that_grew_is_searched_exactly(grown):
+    build(grown, "hnsw")
+    with open_for_appending(grown, description("files")) as target:
+        target.append(names(40, 1), [7], rows(40, 1), root="/images")
+    with (
+        pytest.warns(Note, match="searched exactly; `crisalad index --search hnsw` builds it anew"),
+        Map.open(grown) as places,
+    ):
+        assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
+    build(grown, "hnsw")
+    assert len(list((grown / "approximate").glob("*.index"))) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)
+        with Map.open(grown) as places:
+            assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
+    assert build(grown, "exact") is None
+    assert not (grown / "approximate").exists()
+
+
+def test_a_damaged_index_is_one_line(grown):
+    build(grown, "hnsw")
+    (path,) = (grown / "approximate").glob("*.index")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"\.index: found other bytes"):
+        Map.open(grown)
+
+
+def test_what_cannot_be_built(grown, shared, params, database, tmp_path):
+    with pytest.raises(InputError, match="found 40 descriptors, expected at least 9984"):
+        build(grown, "ivf-pq")
+    assert not (grown / "approximate").exists()
+    with pytest.raises(InputError, match="search: found 'tree'"):
+        run(shared, params, database, tmp_path / "new", search="tree")
+    store = f"milvus:{tmp_path / 'new' / 'rows.db'}"
+    with pytest.raises(InputError, match="is searched by Milvus"):
+        run(shared, params, database, tmp_path / "new", search="hnsw", store=store)
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_index_is_built_while_images_are_indexed(shared, params, database, tmp_path):
+    done = run(shared, params, database, tmp_path / "map", search="hnsw")
+    assert done.recall == 1.0
+    assert run(shared, params, database, tmp_path / "map", search="hnsw").recall == 1.0
+
+
+@pytest.mark.slow
+def test_codes_find_most_neighbours(tmp_path):
+    """Twenty views each of 500 places: the neighbours of a view are those of its place."""
+    generator = np.random.default_rng(0)
+    centres = generator.standard_normal((500, 48)).astype(np.float32)
+    views = centres[np.repeat(np.arange(500), 20)]
+    views += 0.3 * generator.standard_normal(views.shape).astype(np.float32)
+    views /= np.linalg.norm(views, axis=1, keepdims=True)
+    with open_for_appending(tmp_path / "map", description("files")) as target:
+        for start in range(0, len(views), 1000):
+            part = views[start : start + 1000]
+            target.append(names(start, len(part)), [7] * len(part), part, root="/images")
+        recall = target.build_search("ivf-pq")
+        assert recall is not None
+        assert recall > 0.9  # measured 1.0: ten of 19 views, of 100 candidates
+        found = target.search(views[:50], 10)
+        exact = target.search(views[:50], 10, exact=True)
+    assert (found.similarities[:, 0] == exact.similarities[:, 0]).mean() > 0.95
+
+
+def test_the_command_line_says_what_is_recalled(shared, database, tmp_path, capfd):
+    from tests.cli.test_cli import succeeds
+    from tests.cli.test_index import index as command
+    from tests.cli.test_index import query as ask
+
+    out = tmp_path / "map"
+    said = succeeds(capfd, *command(shared, database, out, "--share", "0/2"))
+    assert (
+        "share 0/2: 4 images described; shares still to be done: 1; the last one joins all" in said
+    )
+    said = succeeds(capfd, *command(shared, database, out, "--share", "1/2", "--search", "hnsw"))
+    assert "7 images added, 7 with positions" in said
+    assert "approximate search finds 100.0 % of the exact 10 nearest of 7 images" in said
+    lines = [
+        succeeds(capfd, *ask(out, list_images(database)[0], "--json", "-", *more))
+        for more in ((), ("--exact",))
+    ]
+    assert lines[0] == lines[1]
+
+
+@pytest.mark.slow
+def test_two_processes_make_one_map(shared, database, whole, tmp_path):
+    """At the same time, on one host; whichever ends last joins."""
+    command = [sys.executable, "-m", "crisalad_jax", "index", "--images", database]
+    command += ["--weights", shared / "weights.safetensors", "--out", tmp_path / "map"]
+    command += ["--batch-size", BATCH, "--quiet", "--share"]
+    running = [
+        subprocess.Popen([*map(str, command), share], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        for share in ("0/2", "1/2")
+    ]
+    said = [process.communicate()[0] for process in running]
+    assert [process.returncode for process in running] == [0, 0]
+    assert any("7 images added" in words for words in said)
+    assert contents(tmp_path / "map")[0] == contents(whole)[0]
+    found, expected = (
+        np.frombuffer(contents(folder)[1], np.float32) for folder in (tmp_path / "map", whole)
+    )
+    # Those processes' compilers optimise, these tests' does not.
+    np.testing.assert_allclose(found, expected, atol=1e-5)
