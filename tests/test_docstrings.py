@@ -31,15 +31,8 @@ FUNCTIONS = {name: value for name, value in DOCUMENTED.items() if not inspect.is
 SLOW = {
     *("Map", "attend_across_images", "build_vocabulary", "convert", "evaluate", "extract"),
     *("extract_features", "extract_tokens", "fit", "index", "init_train_state"),
-    *(
-        "merge_params",
-        "query",
-        "query_live",
-        "read_backbone",
-        "split_params",
-        "train",
-        "write_export",
-    ),
+    *("merge_params", "query", "query_live", "read_backbone", "show_transport", "split_params"),
+    *("train", "write_export"),
 }
 """Examples that make, train or run a model; `describe` and `make_train_step` stand for them."""
 MINUTES = {"compare"}

@@ -43,11 +43,12 @@ EXAMPLE = "crisalad train --data gsv --out runs/a --val pitts30k_val.mat --backb
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train on places in the GSV-Cities layout; go on with the run if OUT holds one."""
+    """Train on places, each with several images; go on with the run if OUT holds one."""
 
     data: pathlib.Path
-    """Folder with Dataframes/ and Images/; for netvlad, patch-netvlad and selavpr, which mine
-    tuples, a training set of queries in any layout that `evaluate` reads."""
+    """Folder with one folder a place, a table name,place[,lat,lon[,heading]] (places.csv in the
+    folder, or the file), or Dataframes/ and Images/ of GSV-Cities; for netvlad, patch-netvlad and
+    selavpr, which mine tuples, a training set of queries in any layout that `evaluate` reads."""
     out: pathlib.Path
     """Folder of the run."""
     settings: Any

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 import numpy as np
 
+from crisalad_jax.config.concise import in_one_line
 from crisalad_jax.utils.errors import InputError
 
 _T = TypeVar("_T")
@@ -80,7 +81,7 @@ def _check_type(config: Any, name: str, hint: Any) -> None:
     value = getattr(config, name)
     require(
         _fits(hint, value),
-        f"{type(config).__name__}.{name}: found {value!r}, expected {_words(hint)}",
+        f"{type(config).__name__}.{name}: found {in_one_line(value)}, expected {_words(hint)}",
     )
 
 

@@ -4,8 +4,10 @@ import dataclasses
 from typing import Literal
 
 from crisalad_jax.config.checks import require, require_choice, require_positive
+from crisalad_jax.config.concise import concise
 
 
+@concise()
 @dataclasses.dataclass(frozen=True)
 class ClassesConfig:
     """Classes of a training set, and the groups that epochs train in turn.

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
 
 from crisalad_jax.config.checks import REGISTRY, check_types
+from crisalad_jax.config.concise import concise_repr, in_one_line
 from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_of
 from crisalad_jax.utils.errors import InputError
 
@@ -27,8 +28,10 @@ class Part:
         check_types(self)
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Check a subclass's fields before its own `__post_init__` reads them."""
+        """Print what differs, and check fields before the class's own `__post_init__`."""
         super().__init_subclass__(**options)
+        if "__repr__" not in vars(cls):
+            cls.__repr__ = concise_repr  # pyright: ignore[reportAttributeAccessIssue]
         own = vars(cls).get("__post_init__")
         if own is None:
             return
@@ -274,7 +277,9 @@ def resolve_names(config: Any) -> None:
                 raise InputError(f"{where}: {words}") from error
             object.__setattr__(config, field.name, value)
         elif not isinstance(value, registry.base):
-            raise InputError(f"{where}: found {value!r}, expected a {registry.kind} or its name")
+            raise InputError(
+                f"{where}: found {in_one_line(value)}, expected a {registry.kind} or its name"
+            )
         elif "part_name" not in vars(type(value)):
             raise InputError(
                 f"{where}: found {type(value).__qualname__}, which is not registered, expected "

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from crisalad_jax.config.checks import check_types, require
+from crisalad_jax.config.concise import concise
 from crisalad_jax.config.fields import free_field
 
 Size = tuple[int, int]
@@ -24,6 +25,7 @@ WORDS: Mapping[str, Mapping[str, Any]] = {
 """Words of the flag --resize, and the fields that they set."""
 
 
+@concise()
 @dataclasses.dataclass(frozen=True)
 class PreprocessingConfig:
     """How a photograph becomes a network's input.

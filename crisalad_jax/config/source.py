@@ -28,7 +28,9 @@ def _files_of(part: type[Part]) -> list[pathlib.Path] | None:
     base = part.registry.base
     classes = [each for each in part.__mro__ if issubclass(each, base) and each is not base]
     files: set[pathlib.Path] = set()
-    for member in [part, *(f for each in classes for f in vars(each).values())]:
+    # How a part prints changes no descriptor, and `Part` sets it from a module of this package.
+    methods = [f for each in classes for name, f in vars(each).items() if name != "__repr__"]
+    for member in [part, *methods]:
         file = _file_of(member)
         if member is part and file is None:
             return None

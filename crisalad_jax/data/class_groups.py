@@ -54,6 +54,7 @@ def class_groups(
         sets = [_place_classes(places, config, min_images)]
     else:
         views = views_of(places)
+        _check_own(places, config)
         if not views.known.all():
             city = places.cities[int(np.argmin(views.known))]
             raise InputError(
@@ -83,6 +84,22 @@ def class_groups(
         for turn in zip(*chosen)  # noqa: B905, for as many of each set
         for classes, group in zip(sets, turn, strict=True)
     )
+
+
+def _check_own(places: Places, config: ClassesConfig) -> None:
+    """Check that a table of one's own has what classes by position ask for.
+
+    Raises:
+        InputError: it has no positions or no headings, or the places are folders.
+    """
+    if places.names is None:
+        return
+    lacking = "positions (lat,lon)" if places.views is None else "headings (heading)"
+    if places.views is None or np.isnan(places.views).any():
+        raise InputError(
+            f"{places.root}: found no {lacking} of the images, which loss.kind.classes.kind "
+            f"{config.kind!r} asks for, expected a table name,place,lat,lon,heading{_ADVICE}"
+        )
 
 
 def cell_classes(
@@ -297,4 +314,6 @@ def _regrouped(places: Places, classes: Classes, group: int) -> Places:
         place_city=places.place_city[old],
         place_id=places.place_id[old],
         place_start=start,
+        names=None if places.names is None else tuple(places.names[place] for place in old),
+        views=None if places.views is None else places.views[images],
     )

@@ -1,6 +1,6 @@
-"""Training places in the layout of GSV-Cities (Ali-bey et al. 2022), and their order in an epoch.
+"""Training places in the layout of GSV-Cities (Ali-bey et al. 2022) or of one's own, in order.
 
-Layout: `Dataframes/{city}.csv` with one row per image, and
+The layout of GSV-Cities: `Dataframes/{city}.csv` with one row per image, and
 `Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
 """
 
@@ -14,10 +14,12 @@ from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int, Int32, Int64
+from jaxtyping import Float64, Int, Int32, Int64
 
+from crisalad_jax.data.own_places import read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, check_source
+from crisalad_jax.utils.files import LARGEST, check_source, real_path
+from crisalad_jax.utils.notes import tell
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
 IDS_PER_CITY = 10**5
@@ -40,6 +42,11 @@ class Places:
     place_id: Int64[np.ndarray, " places"]
     """The id in the CSV modulo 10**5, plus 10**5 times the position of the city: unique."""
     place_start: Int64[np.ndarray, " places+1"]
+    names: tuple[str, ...] | None = None
+    """Place -> its name; None in the layout of GSV-Cities, where places have ids, and files' names
+    tell where they were taken."""
+    views: Float64[np.ndarray, "images 3"] | None = None
+    """Image -> latitude, longitude and heading of a table, NaN where it has no heading."""
 
     @property
     def image_counts(self) -> Int64[np.ndarray, " places"]:
@@ -51,7 +58,9 @@ class Places:
         return self.root / self.files[image]
 
     def describe_place(self, place: int | np.integer) -> str:
-        """Name a place for a message: its city and its id as in the CSV."""
+        """Name a place for a message: its name, or its city and its id as in the CSV."""
+        if self.names is not None:
+            return f"place {self.names[place]}"
         city = self.cities[self.place_city[place]]
         return f"place {self.place_id[place] % IDS_PER_CITY} of {city}"
 
@@ -59,13 +68,18 @@ class Places:
 def read_places(
     root: str | os.PathLike[str], *, cities: Sequence[str] | None = None, min_images: int = 4
 ) -> Places:
-    """Read a folder in the layout of GSV-Cities; every image named must exist.
+    """Read a folder in the layout of GSV-Cities or of one's own; every image named must exist.
 
-    Images may end in .jpg or .JPG, and may lie in a folder named by the city id or by the CSV file.
-    A row that repeats an earlier one of its place is dropped: no picture is its own second view.
+    A layout of one's own is a folder in which each folder with images is a place; or a table with
+    the columns `name,place`, and `lat,lon` and `heading` in degrees where they are known: a file,
+    or `places.csv` in the folder. Names are relative to the table.
+
+    GSV-Cities' images may end in .jpg or .JPG, and may lie in a folder named by the city id or by
+    the CSV file. A row that repeats an earlier one of its place is dropped: no picture is its own
+    second view.
 
     Args:
-        root: folder that holds `Dataframes/` and `Images/`.
+        root: folder that holds `Dataframes/` and `Images/`, or a layout of one's own.
         cities: names of CSV files without the suffix; None reads all, in alphabetical order.
         min_images: places with fewer images are left out.
 
@@ -73,14 +87,16 @@ def read_places(
         The places, with their images' files.
 
     Raises:
-        InputError: no `Dataframes` or nothing in it, an unknown or repeated city, a CSV without a
-            column or with a field that is not a number, a missing image, no place large enough.
+        InputError: none of these layouts, an unknown or repeated city, a CSV without a column or
+            with a field that is not a number, a missing image, no place large enough.
 
     Example:
         >>> read_places(places, min_images=3).image_counts.tolist()
         [3, 3, 3, 3, 3, 3, 3, 3]
     """
     root = pathlib.Path(root)
+    if not (root / "Dataframes").is_dir():
+        return _own_places(root, cities, min_images)
     tables = _find_tables(root, cities)
     listings: dict[str, frozenset[str]] = {}
     files: list[str] = []
@@ -111,11 +127,42 @@ def read_places(
     )
 
 
+def _own_places(root: pathlib.Path, cities: Sequence[str] | None, min_images: int) -> Places:
+    """Read places of one's own, which are of one city."""
+    if cities is not None:
+        raise InputError(
+            f"cities: found {', '.join(cities)} for {root}, expected none: it is not in the layout "
+            "of GSV-Cities"
+        )
+    found = read_own_places(root)
+    kept = {name: files for name, files in found.images.items() if len(files) >= min_images}
+    if not kept:
+        largest = max(map(len, found.images.values()))
+        raise InputError(
+            f"{root}: found no place with at least {min_images} images; the largest has {largest}"
+        )
+    if len(kept) < len(found.images):
+        tell(
+            f"{root}: left out {len(found.images) - len(kept)} of {len(found.images)} places, with "
+            f"fewer than {min_images} images"
+        )
+    files = [file for place in kept.values() for file in place]
+    counts = [len(place) for place in kept.values()]
+    return Places(
+        root=found.root,
+        cities=(real_path(found.root).name,),
+        files=tuple(files),
+        image_place=np.repeat(np.arange(len(kept), dtype=np.int32), counts),
+        place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        place_city=np.zeros(len(kept), np.int32),
+        place_id=np.arange(len(kept), dtype=np.int64),
+        names=tuple(kept),
+        views=views_in_order(found, files),
+    )
+
+
 def _find_tables(root: pathlib.Path, cities: Sequence[str] | None) -> list[pathlib.Path]:
     folder = root / "Dataframes"
-    if not folder.is_dir():
-        missing = "folder Dataframes" if root.is_dir() else "such folder"
-        raise InputError(f"{root}: found no {missing}, expected the layout of GSV-Cities")
     tables = {path.stem: path for path in folder.glob("*.csv")}
     if not tables:
         raise InputError(f"{folder}: found no CSV file, expected one for each city")

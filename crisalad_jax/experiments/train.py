@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.own_places import TABLE
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.experiments.report import training_curves
@@ -41,8 +42,8 @@ def train(
 
     Args:
         config: how to train.
-        data: folder in the layout of GSV-Cities; for a recipe that mines tuples, a set that
-            `open_benchmark` reads, such as pitts30k_train.mat.
+        data: places, in a layout that `read_places` reads; for a recipe that mines tuples, a set
+            that `open_benchmark` reads, such as pitts30k_train.mat.
         images: folder of the images that such a file names.
         out: folder of the run; see `fit`.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
@@ -136,9 +137,10 @@ def _read_set(config: TrainConfig, data: Path, images: Path | None) -> Places | 
         )
     if images is not None and pathlib.Path(data).is_dir():
         raise InputError(f"--data-images: found beside the folder {data}, expected it for a file")
-    if (pathlib.Path(data) / "Dataframes").is_dir():
+    folder = pathlib.Path(data)
+    if (folder / "Dataframes").is_dir() or (folder / TABLE).is_file():
         raise InputError(
-            f"{data}: found places in the layout of GSV-Cities, expected queries and a database, "
+            f"{data}: found places, expected queries and a database, "
             "such as pitts30k_train.mat or MSLS: this recipe mines tuples"
         )
     return read_query_set(

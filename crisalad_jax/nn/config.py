@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.config.concise import concise
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
@@ -21,6 +22,7 @@ MOST_PIXELS = 4096
 """Largest side of an image that models describe: attention grows by its fourth power."""
 
 
+@concise("backbone", "aggregator")
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
     """The configuration of CriSALAD, and of the methods that it is compared with.

@@ -12,6 +12,7 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
+from crisalad_jax.config.concise import concise
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.attention import (
@@ -40,6 +41,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 NORM_EPSILON = 1e-5
 
 
+@concise(switch=("layers", 0))
 @dataclasses.dataclass(frozen=True)
 class CrossImageConfig:
     """The transformer encoder that attends across the images of a batch (paper section 3.4).

@@ -12,6 +12,7 @@ from crisalad_jax.config.checks import (
     require_fraction,
     require_positive,
 )
+from crisalad_jax.config.concise import concise
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.losses import LossConfig
@@ -19,6 +20,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
 
 
+@concise()
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
     """An optimiser of torch, with an optional warm-up and a learning rate that falls.
@@ -103,6 +105,7 @@ def _rises(numbers: tuple[int, ...]) -> bool:
     return all(first < second for first, second in itertools.pairwise(numbers))
 
 
+@concise(switch=("kind", "none"))
 @dataclasses.dataclass(frozen=True)
 class MiningConfig:
     """Tuples of a query, its nearest positive and its hardest negatives, by the model as it is.
@@ -154,6 +157,7 @@ class MiningConfig:
         )
 
 
+@concise("model", "loss")
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """A whole training run, apart from where its files lie.

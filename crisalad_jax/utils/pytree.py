@@ -1,6 +1,7 @@
 """Dataclasses that are pytrees, with dotted names for their leaves."""
 
 import dataclasses
+import math
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -23,6 +24,8 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
     Unflattening bypasses `__init__`. JAX also builds trees of shapes, labels or masks from the same
     structure, which must not be checked against the annotations of arrays.
 
+    `repr` tells names, types and shapes, and no values (`summary`), unless the class has its own.
+
     Args:
         cls: a class with annotated fields.
 
@@ -36,9 +39,15 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
         ...     slope: float
         ...     offset: float
         >>> jax.tree.map(lambda x: 2 * x, Line(1.0, 3.0))
-        Line(slope=2.0, offset=6.0)
+        Line
+          slope   float
+          offset  float
+        2 leaves, 0 parameters, 0 bytes
     """
-    cls = dataclasses.dataclass(frozen=True)(cls)
+    own = "__repr__" in vars(cls)
+    cls = dataclasses.dataclass(frozen=True, repr=False)(cls)
+    if not own:
+        cls.__repr__ = summary  # pyright: ignore[reportAttributeAccessIssue]
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     names = tuple(field.name for field in fields if not field.metadata.get("static"))
     statics = tuple(field.name for field in fields if field.metadata.get("static"))
@@ -77,3 +86,52 @@ def named_leaves(tree: Any) -> dict[str, Any]:
     """Return the leaves by dotted path, as in `backbone.blocks.mlp.fc1.weight`, in tree order."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def summary(tree: Any) -> str:
+    """Write a line for each leaf, its name, shape and type, and the totals below.
+
+    Values are neither read nor computed, so leaves may be arrays of any kind, tracers or
+    `jax.ShapeDtypeStruct`. Where a field is None there is no leaf. Of a leaf without a shape the
+    line has its class.
+
+    Args:
+        tree: a pytree, such as a model's parameters.
+
+    Returns:
+        The lines; parameters are the numbers in all arrays.
+
+    Example:
+        >>> import jax
+        >>> print(summary({"bias": jax.ShapeDtypeStruct((3,), "float32"), "weight": None}))
+        dict
+          bias  (3,)  float32
+        1 leaf, 3 parameters, 12 bytes
+    """
+    lines: list[tuple[str, str, str]] = []
+    count = size = 0
+    for name, leaf in named_leaves(tree).items():
+        shape, dtype = getattr(leaf, "shape", None), getattr(leaf, "dtype", None)
+        if not isinstance(shape, tuple) or dtype is None:
+            lines.append((name, type(leaf).__name__, ""))
+            continue
+        lines.append((name, str(shape), str(dtype)))
+        if all(isinstance(side, int) for side in shape):  # an export's sides may be symbols
+            count += math.prod(shape)
+            size += math.prod(shape) * getattr(dtype, "itemsize", 0)
+    name_width, shape_width = (max((len(row[i]) for row in lines), default=0) for i in (0, 1))
+    return "\n".join(
+        [
+            type(tree).__name__,
+            *(f"  {n:{name_width}}  {s:{shape_width}}  {d}".rstrip() for n, s, d in lines),
+            f"{len(lines)} lea{'f' if len(lines) == 1 else 'ves'}, {count:,} parameters, "
+            f"{_in_bytes(size)}",
+        ]
+    )
+
+
+def _in_bytes(size: int) -> str:
+    for unit, bytes_each in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if size >= bytes_each:
+            return f"{size / bytes_each:.1f} {unit}"
+    return f"{size} bytes"

@@ -123,7 +123,7 @@ def test_no_dataframes(tmp_path):
         InputError, match=r"^.*none: found no such folder, expected the layout of G"
     ):
         read_places(tmp_path / "none")
-    with pytest.raises(InputError, match="no folder Dataframes"):
+    with pytest.raises(InputError, match=r"found nothing, expected .*places\.csv, or one folder a"):
         read_places(tmp_path)
     (tmp_path / "Dataframes").mkdir()
     with pytest.raises(InputError, match="no CSV file"):

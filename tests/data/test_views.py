@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from crisalad_jax.data.metres import transverse_mercator
 from crisalad_jax.data.places import Places
-from crisalad_jax.data.views import transverse_mercator, views_of
+from crisalad_jax.data.views import views_of
 from crisalad_jax.utils.errors import InputError
 
 AXIS, FLATTENING = 6378137.0, 1 / 298.257223563

@@ -616,7 +616,7 @@ def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
         fit(CONFIG, city, out, quiet=True)
     with pytest.raises(InputError, match="places: found a QuerySet with mining 'none', expected"):
         fit(RECIPE, read_query_set(street), out, quiet=True)
-    with pytest.raises(InputError, match="found places in the layout of GSV-Cities, expected quer"):
+    with pytest.raises(InputError, match="found places, expected quer"):
         train(CONFIG, shared / "city", out, quiet=True)
     with pytest.raises(InputError, match="--data-images: found for places"):
         train(RECIPE, shared / "city", out, images=tmp_path, quiet=True)

@@ -1,4 +1,4 @@
-"""Two plain folders, `database/` and `queries/`, with or without a table of matches."""
+"""Two plain folders, `database/` and `queries/`, with tables of matches or positions, or none."""
 
 import csv
 import os
@@ -11,6 +11,8 @@ from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_split, list_part
+from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.data.benchmarks.tables_of_positions import positions_beside
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
@@ -19,17 +21,24 @@ _HEADER = ["query", "database"]
 
 
 def read_folders(
-    root: str | os.PathLike[str], split: str | None = None, *, frames: int | None = None
+    root: str | os.PathLike[str],
+    split: str | None = None,
+    radius: float | None = None,
+    *,
+    frames: int | None = None,
 ) -> Benchmark:
     """Read `database/` and `queries/`, whose images may have any names.
 
-    The ground truth is `ground_truth.csv` beside the folders, or `frames`, or there is none. The
-    table has lines of `query,database`, with paths relative to the two folders: one line for each
-    match of a query, or the line `query,` for a query without a match. Every query has a line.
+    The ground truth is `ground_truth.csv` beside the folders, or `frames`, or the positions of a
+    table (`positions_beside`), or there is none. The table of matches has lines of
+    `query,database`, with paths relative to the two folders: one line for each match of a query, or
+    the line `query,` for a query without a match. Every query has a line.
 
     Args:
         root: the folder that holds the two, or one with `images/{test,val,train}` that do.
         split: None takes `test`, else `val`.
+        radius: where positions are the ground truth, metres within which an image is a positive,
+            inclusive; None is 25.
         frames: the i-th query matches the database images i - frames to i + frames, where both
             folders hold a frame of the same moments. Frames are in the order of the numbers in
             their names, so that frame 10 follows frame 9.
@@ -37,7 +46,8 @@ def read_folders(
     Raises:
         InputError: a folder is missing or without images; a table that names an image that is not
             there, leaves one out, or contradicts itself; a negative number of frames, folders of
-            different counts, or `frames` beside a table.
+            different counts, `frames` beside a table, a radius without positions to measure, or
+            what `positions_beside` raises.
     """
     root = pathlib.Path(root)
     folder, name = find_split(root, split)
@@ -46,14 +56,32 @@ def read_folders(
     if frames is not None:
         if table.exists():
             raise InputError(f"frames: found {frames} beside {table}, expected one of the two")
+        _refuse_radius(radius, "frames")
         return _by_frames(root, name, database, queries, frames)
+    places, asked = positions_beside(folder, database, queries)
     if table.exists():
+        _refuse_radius(radius, table)
         positives = _by_table(table, _numbers(folder, database), _numbers(folder, queries))
         name, rule = f"{name} (two folders, {TRUTH})", f"the database images that {TRUTH} lists"
+    elif places is not None and asked is not None:
+        radius = DEFAULT_RADIUS if radius is None else radius
+        check_radius(radius)
+        positives = within(places, asked, radius)
+        name, rule = f"{name} (two folders, {radius:g} m)", f"a distance of at most {radius:g} m"
     else:
+        _refuse_radius(radius, f"{root}, which has no positions (positions.csv)")
         positives = None
         name, rule = f"{name} (two folders, no ground truth)", "none: there is no ground truth"
-    return Benchmark(name, root, database, queries, positives, rule)
+    radius = DEFAULT_RADIUS if radius is None else radius
+    return Benchmark(name, root, database, queries, positives, rule, places, asked, radius)
+
+
+def _refuse_radius(radius: float | None, what: object) -> None:
+    if radius is not None:
+        raise InputError(
+            f"radius: found {radius:g} beside {what}, expected it where positions are the ground "
+            "truth"
+        )
 
 
 def _by_frames(

@@ -40,7 +40,7 @@ LAYOUTS = {
     "msls-subtask": Layout(
         "raw MSLS, subtask all", read_msls_subtask, ("split", "radius", "max_heading_difference")
     ),
-    "folders": Layout("two plain folders", folders.read_folders, ("split", "frames")),
+    "folders": Layout("two plain folders", folders.read_folders, ("split", "radius", "frames")),
 }
 """Layouts by the name that `open_benchmark` takes."""
 

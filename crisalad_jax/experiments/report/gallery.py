@@ -4,17 +4,26 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.experiments.report.style import DPI, GREY, INK, RIGHT, WRONG, fit_width, save
+from crisalad_jax.experiments.report.style import (
+    DPI,
+    GREY,
+    INK,
+    RIGHT,
+    WRONG,
+    Picture,
+    fit_width,
+    save,
+)
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import staged_folder
@@ -23,8 +32,12 @@ _NAME = 28
 """Largest number of characters of a name: at 7 points they are as wide as a picture."""
 
 
-def prediction_gallery(
-    path: str | os.PathLike[str],
+def prediction_gallery(path: str | os.PathLike[str], *found: Any, **options: Any) -> None:
+    """Write a PNG of queries with what was retrieved for them: see `retrieval_figure`."""
+    save(retrieval_figure(*found, **options), path)
+
+
+def retrieval_figure(
     queries: Sequence[Path],
     database: Sequence[Path],
     indices: Int[np.ndarray, "q k"],
@@ -36,8 +49,8 @@ def prediction_gallery(
     chosen: Sequence[int] | None = None,
     title: str = "",
     names: tuple[Sequence[str], Sequence[str]] | None = None,
-) -> None:
-    """Write a PNG of queries, one a row, with what was retrieved for them, best first.
+) -> Picture:
+    """Draw queries, one a row, with what was retrieved for them, best first.
 
     Retrievals are framed green where right and red where wrong, with rank and similarity below.
     Unless queries are `chosen`, half of the rows have a right first retrieval and half a wrong one,
@@ -45,7 +58,6 @@ def prediction_gallery(
     gives the same picture. Without `positives` all are framed grey, and queries spread evenly.
 
     Args:
-        path: the picture to write.
         queries: image files of the q queries.
         database: image files that `indices` count.
         indices: database indices retrieved for each query, best first.
@@ -56,6 +68,9 @@ def prediction_gallery(
         chosen: the queries shown, in their order.
         title: stands above the picture.
         names: of the queries and of the database, to stand below each, shortened in the middle.
+
+    Returns:
+        The figure.
 
     Raises:
         InputError: no queries or retrievals, numbers of rows that differ, an index beyond the
@@ -92,7 +107,7 @@ def prediction_gallery(
         2 * margin + count * width + count * gap,
         margin + head + len(chosen) * (height + between),
     )
-    figure = Figure(figsize=size)
+    figure = Picture(figsize=size)
 
     def place(row: int, column: int, image: UInt8[np.ndarray, "h w 3"]) -> Axes:
         left = margin + column * (width + gap) + gap * (column > 0)
@@ -142,7 +157,7 @@ def prediction_gallery(
     for text, colour in parts:
         drawn = figure.text(left, top, text, fontsize=9, color=colour, va="top")
         left += drawn.get_window_extent().width / figure.bbox.width
-    save(figure, path)
+    return figure
 
 
 def write_galleries(
@@ -182,24 +197,32 @@ def write_galleries(
     return [Path(out) / name for name in names]
 
 
-def answers_gallery(
-    path: str | os.PathLike[str],
+def answers_gallery(path: str | os.PathLike[str], answers: Answers, **options: Any) -> None:
+    """Write a PNG of queries to a map, one a row, beside their answers: see `answers_figure`."""
+    save(answers_figure(answers, **options), path)
+
+
+def answers_figure(
     answers: Answers,
     *,
     root: str | os.PathLike[str] | None = None,
     rows: int = 24,
     columns: int = 8,
+    chosen: Sequence[int] | None = None,
     title: str = "",
-) -> None:
-    """Write a PNG of queries to a map, one a row, beside their answers.
+) -> Picture:
+    """Draw queries to a map, one a row, beside their answers.
 
     Args:
-        path: the picture.
         answers: what `retrieval.maps.query.query` returned.
         root: folder of the map's images; None is where they were.
         rows: number of queries shown, at most.
         columns: number of answers to each, at most.
+        chosen: the queries shown, in their order.
         title: stands above the picture.
+
+    Returns:
+        The figure.
 
     Raises:
         InputError: rows or columns below 1, or an image that cannot be read.
@@ -211,8 +234,7 @@ def answers_gallery(
         path.as_posix() if known else f"unknown: {path.as_posix()}"
         for path, known in zip(answers.queries, answers.known, strict=True)
     ]
-    prediction_gallery(
-        path,
+    return retrieval_figure(
         answers.queries,
         [Path(image.root if root is None else root) / image.name for image in images],
         places.reshape(indices.shape),
@@ -220,6 +242,7 @@ def answers_gallery(
         None,
         rows=rows,
         columns=columns,
+        chosen=chosen,
         names=(asked, [image.name for image in images]),
         title=title,
     )

@@ -4,6 +4,7 @@ They are drawn with matplotlib's object interface: no display, and no state outs
 """
 
 import contextlib
+import io
 import os
 import pathlib
 import warnings
@@ -32,6 +33,17 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 DPI = 120
 NARROW, NARROW_DPI = 4.0, 200
 """Width in inches, and dots an inch: letters of 9 points are then readable on a telephone."""
+
+
+class Picture(Figure):
+    """A figure that notebooks show by itself, without pyplot and its state."""
+
+    def _repr_jpeg_(self) -> bytes:
+        """Return the figure for IPython's display; photographs as a PNG fill a notebook."""
+        data = io.BytesIO()
+        with _any_names(self):
+            self.savefig(data, format="jpg", facecolor="white", pil_kwargs={"quality": 88})
+        return data.getvalue()
 
 
 def fit_width(label: Label, figure: Figure) -> None:

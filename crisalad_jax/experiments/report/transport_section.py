@@ -8,6 +8,7 @@ import matplotlib.colors
 import numpy as np
 
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import Pixels
 from crisalad_jax.experiments.report.embedding import Drawing, drawing
 from crisalad_jax.experiments.report.query_selection import Shown
 from crisalad_jax.experiments.report.sections import Subject
@@ -99,14 +100,15 @@ def transport_of(
     paths: list[pathlib.Path], params: Crisalad, config: ModelConfig
 ) -> list[Transported]:
     """Read photographs and compute their transport, one by one: their sizes may differ."""
-    transported = []
-    for path in paths:
-        image = read_image(path)
-        prepared = prepare_image(image, config)
-        grid = config.backbone.grid((prepared.shape[0], prepared.shape[1]))
-        (mass,) = np.asarray(transport_masses(params, prepared[None], config), np.float32)
-        transported.append(Transported(image, mass.reshape(*grid, -1), config.token_shape.tokens))
-    return transported
+    return [transport_of_image(read_image(path), params, config) for path in paths]
+
+
+def transport_of_image(image: Pixels, params: Crisalad, config: ModelConfig) -> Transported:
+    """Compute the transport of a photograph, resized as the configuration says."""
+    prepared = prepare_image(image, config)
+    grid = config.backbone.grid((prepared.shape[0], prepared.shape[1]))
+    (mass,) = np.asarray(transport_masses(params, prepared[None], config), np.float32)
+    return Transported(image, mass.reshape(*grid, -1), config.token_shape.tokens)
 
 
 def _gradient() -> str:

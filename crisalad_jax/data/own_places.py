@@ -1,0 +1,148 @@
+"""Training places of one's own: one folder a place, or a table of names and places."""
+
+import csv
+import math
+import pathlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from crisalad_jax.data.benchmarks.folders_on_disk import find_images, has_sides, has_split, listing
+from crisalad_jax.data.images import list_images
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import LARGEST, check_source
+
+TABLE = "places.csv"
+_COLUMNS = "name,place[,lat,lon[,heading]]"
+_LAYOUTS = f"the layout of GSV-Cities (Dataframes/, Images/), {TABLE}, or one folder a place"
+_VIEW = ("lat", "lon", "heading")
+
+
+class OwnPlaces(NamedTuple):
+    """The images of each place by the place's name, and where they were taken."""
+
+    root: pathlib.Path
+    images: dict[str, list[str]]
+    """Place -> paths relative to `root`."""
+    views: dict[str, tuple[float, float, float]] | None
+    """Image -> latitude, longitude and heading, NaN where unknown; None without positions."""
+
+
+def read_own_places(root: pathlib.Path) -> OwnPlaces:
+    """Read a table, a folder with a table in it, or a folder with one folder a place.
+
+    Raises:
+        InputError: it is none of these, or what is there does not fit.
+    """
+    if root.is_file():
+        return _read_table(root)
+    if (root / TABLE).is_file():
+        return _read_table(root / TABLE)
+    return _read_folders(root)
+
+
+def views_in_order(found: OwnPlaces, files: list[str]) -> Float64[np.ndarray, "images 3"] | None:
+    """Return where files were taken, in their order."""
+    if found.views is None:
+        return None
+    return np.array([found.views[file] for file in files], np.float64).reshape(-1, 3)
+
+
+def _read_folders(root: pathlib.Path) -> OwnPlaces:
+    """Read a folder in which each folder that holds images is a place."""
+    if has_sides(root) or has_split(root):
+        raise InputError(
+            f"{root}: found an evaluation set (database/ and queries/), expected {_LAYOUTS}"
+        )
+    inside = root.is_dir() and any(
+        not path.name.startswith(".") and path.is_dir() for path in root.iterdir()
+    )
+    if not inside:
+        raise InputError(f"{root}: found {listing(root)}, expected {_LAYOUTS}")
+    images: dict[str, list[str]] = {}
+    for path in list_images(root):
+        name = path.relative_to(root)
+        if name.parent == pathlib.Path():
+            raise InputError(
+                f"{path}: found an image beside the folders, expected it in the folder of its place"
+            )
+        images.setdefault(name.parent.as_posix(), []).append(name.as_posix())
+    return OwnPlaces(root, images, None)
+
+
+def _read_table(table: pathlib.Path) -> OwnPlaces:
+    places: dict[str, list[str]] = {}
+    place_of: dict[str, str] = {}
+    views: dict[str, tuple[float, float, float]] = {}
+    has_positions = False
+    for where, row in _rows(table):
+        name, place = row["name"], row["place"]
+        if not name or not place:
+            missing = "name" if not name else "place"
+            raise InputError(f"{where}: found no {missing}, expected {_COLUMNS}")
+        if name in place_of:
+            raise InputError(
+                f"{where}: found {name!r} twice, in places {place_of[name]} and {place}, expected "
+                "it once"
+            )
+        place_of[name] = place
+        places.setdefault(place, []).append(name)
+        if "lat" in row:
+            has_positions = True
+            views[name] = _view(where, row)
+    if not places:
+        raise InputError(f"{table}: found no row below the header, expected {_COLUMNS}")
+    find_images(table, table.parent, place_of)
+    return OwnPlaces(table.parent, places, views if has_positions else None)
+
+
+def _rows(table: pathlib.Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield where each row stands, and its fields by column."""
+    check_source(table, "a table of UTF-8 CSV", largest=LARGEST)
+    try:
+        # utf-8-sig: a spreadsheet's byte order mark would spoil the first column's name.
+        with table.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            header = [name.strip() for name in next(reader, [])]
+            _check_header(table, header)
+            for row in reader:
+                where = f"{table}: line {reader.line_num}"
+                if not row:
+                    continue
+                if len(row) != len(header):
+                    raise InputError(
+                        f"{where}: found {len(row)} fields, expected {len(header)} "
+                        f"({','.join(header)})"
+                    )
+                yield where, {n: v.strip() for n, v in zip(header, row, strict=True)}
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{table}: cannot be read as UTF-8 CSV: {error}") from error
+
+
+def _check_header(table: pathlib.Path, header: list[str]) -> None:
+    known = {"name", "place", *_VIEW}
+    twice = [name for name in header if name in known and header.count(name) > 1]
+    halves = ("lat" in header) != ("lon" in header) or ("heading" in header and "lat" not in header)
+    if twice or halves or not {"name", "place"} <= set(header):
+        raise InputError(
+            f"{table}: found columns {', '.join(header) or 'none'}, expected {_COLUMNS}"
+        )
+
+
+def _view(where: str, row: dict[str, str]) -> tuple[float, float, float]:
+    """Read latitude, longitude and heading in degrees."""
+    values = []
+    for name, limit in zip(_VIEW, (90.0, 180.0, math.inf), strict=True):
+        if name not in row:
+            values.append(math.nan)
+            continue
+        try:
+            value = float(row[name])
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and abs(value) <= limit):
+            raise InputError(f"{where}: {name}: found {row[name]!r}, expected degrees")
+        values.append(value)
+    return values[0], values[1], values[2]

@@ -1,0 +1,90 @@
+"""Two folders with positions in tables."""
+
+import numpy as np
+import pytest
+
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.utils.errors import InputError
+from tests.data.benchmarks.trees import lists_of, touch
+
+DATABASE, QUERIES = ("a.jpg", "b.jpg", "deep/c.jpg"), ("q.jpg", "r.jpg")
+
+
+@pytest.fixture
+def mine(tmp_path):
+    for name in DATABASE:
+        touch(tmp_path / "mine" / "database" / name)
+    for name in QUERIES:
+        touch(tmp_path / "mine" / "queries" / name)
+    return tmp_path / "mine"
+
+
+def _write(folder, name, axes, rows):
+    lines = [f"name,{axes}", *(f"{image},{x},{y}" for image, (x, y) in rows.items())]
+    (folder / name).write_text("\n".join(lines), encoding="utf-8")
+
+
+def _both(there, asked):
+    rows = {f"database/{name}": xy for name, xy in zip(DATABASE, there, strict=True)}
+    return rows | {f"queries/{name}": xy for name, xy in zip(QUERIES, asked, strict=True)}
+
+
+def test_metres_in_one_table(mine):
+    # r is exactly 25 m from b (15, 20), and 25.02 m from a.
+    rows = _both([(0, 0), (30, 40), (500, 0)], [(0, 24), (15, 20)])
+    rows["queries/r.jpg"] = (15, 20.02)
+    _write(mine, "positions.csv", "east,north", rows | {"another.jpg": (1, 2)})
+    benchmark = open_benchmark(mine)
+    assert benchmark.name == "mine (two folders, 25 m)"
+    assert benchmark.rule == "a distance of at most 25 m"
+    assert lists_of(benchmark.positives) == [[0], [1]]
+    assert benchmark.database_positions.tolist() == [[0, 0], [30, 40], [500, 0]]
+    assert lists_of(open_benchmark(mine, radius=34.1).positives) == [[0, 1], [0, 1]]
+
+
+def test_degrees_in_a_table_a_side(mine):
+    # A thousandth of a degree is 111.2 m of latitude on a sphere, and half of that of longitude at
+    # 60 degrees. On the ellipsoid they are 111.4 m and 55.8 m; UTM's scale is 0.9996 to 1.0010.
+    there = dict(zip(DATABASE, [(60, 5), (60.001, 5), (60, 5.001)], strict=True))
+    _write(mine, "database.csv", "lat,lon", there)
+    _write(mine, "queries.csv", "lat,lon", {"q.jpg": (60, 5), "r.jpg": (60.001, 5.001)})
+    benchmark = open_benchmark(mine, radius=60)
+    assert lists_of(benchmark.positives) == [[0, 2], [1]]
+    apart = np.linalg.norm(benchmark.database_positions - benchmark.query_positions[0], axis=1)
+    np.testing.assert_allclose(apart, [0, 111.4, 55.8], rtol=1e-3, atol=1e-6)
+    assert benchmark.radius == 60
+
+
+def test_a_table_of_matches_goes_first(mine):
+    _write(mine, "positions.csv", "east,north", _both([(0, 0)] * 3, [(0, 0)] * 2))
+    (mine / "ground_truth.csv").write_text("q.jpg,b.jpg\nr.jpg,\n")
+    benchmark = open_benchmark(mine)
+    assert lists_of(benchmark.positives) == [[1], []]
+    assert benchmark.query_positions.shape == (2, 2)  # for maps
+    with pytest.raises(InputError, match=r"radius: found 5 beside .*ground_truth\.csv, expected"):
+        open_benchmark(mine, radius=5)
+
+
+def test_a_radius_needs_positions(mine):
+    with pytest.raises(InputError, match=r"radius: found 5 beside .*no positions \(positions\.csv"):
+        open_benchmark(mine, radius=5)
+
+
+def test_tables_that_do_not_fit(mine):
+    rows = {f"database/{name}": (0, 0) for name in DATABASE}
+    _write(mine, "positions.csv", "lat,lon", rows | {"queries/q.jpg": (0, 0)})
+    message = r"positions\.csv: found 1 of 2 images of queries without a line, .* first is r\.jpg"
+    with pytest.raises(InputError, match=message.replace("r\\.jpg", r"queries/r\.jpg")):
+        open_benchmark(mine)
+    _write(mine, "positions.csv", "lat,lon", _both([(0, 0)] * 3, [(0, 10), (0, 100)]))
+    with pytest.raises(InputError, match=r"found longitudes 100 degrees from the median, expected"):
+        open_benchmark(mine)
+    _write(mine, "database.csv", "lat,lon", dict.fromkeys(DATABASE, (0, 0)))
+    with pytest.raises(InputError, match=r"found positions\.csv, database\.csv, expected"):
+        open_benchmark(mine)
+    (mine / "positions.csv").unlink()
+    with pytest.raises(InputError, match=r"found database\.csv, expected positions\.csv, or"):
+        open_benchmark(mine)
+    _write(mine, "queries.csv", "east,north", dict.fromkeys(QUERIES, (0, 0)))
+    with pytest.raises(InputError, match=r"found lat,lon in one table and east,north in the other"):
+        open_benchmark(mine)
