@@ -79,7 +79,7 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
     metadata = header.pop("__metadata__")
     assert metadata.keys() == {"crisalad-jax 3"}
     told = json.loads(metadata["crisalad-jax 3"])
-    assert list(told) == ["checksum", "config", "version", "parts", "aggregator"]
+    assert list(told) == [*("checksum", "config", "version", "parts", "source_bytes", "aggregator")]
     blank = data.replace(told["checksum"].encode(), b"0" * 64)
     assert hashlib.sha256(blank).hexdigest() == told["checksum"]
     assert told["config"] == to_plain(MODEL)
@@ -92,6 +92,8 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
         "aggregator.sinkhorn.gradient": "unrolled",
     }
     assert all(re.fullmatch("[0-9a-f]{64}", digest) for _, digest in told["parts"].values())
+    assert told["source_bytes"].keys() == told["parts"].keys()
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in told["source_bytes"].values())
     assert header.keys() == named_leaves(params).keys()
     entry = header["aggregator.score.fc1.weight"]
     assert (entry["dtype"], entry["shape"]) == ("F32", [32, 16])
@@ -688,6 +690,12 @@ def notes_of(path: pathlib.Path) -> list[str]:
 
 
 @pytest.mark.usefixtures("_own_parts")
+def clear_digests() -> None:
+    """Read sources anew, as a later process does."""
+    source._file_digest.cache_clear()
+    source._bytes_digest.cache_clear()
+
+
 def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
     plugin, path = tmp_path / "plugin.py", tmp_path / "w.safetensors"
     plugin.write_text(PLUGIN)
@@ -696,10 +704,10 @@ def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
     assert notes_of(path) == []
     # A later process reads the file anew. Comments, docstrings and layout are no other source.
     plugin.write_text("# Mine.\n" + PLUGIN.replace("The largest of all", "Maximum of") + "\n\n")
-    source._file_digest.cache_clear()
+    clear_digests()
     assert notes_of(path) == []
     plugin.write_text(PLUGIN.replace("max(", "min("))
-    source._file_digest.cache_clear()
+    clear_digests()
     (note,) = notes_of(path)
     assert note == (
         f"{path}: found another source of aggregator brightest than these weights were written "
@@ -715,6 +723,9 @@ def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypa
     told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
     del told["checksum"]
     told["parts"]["aggregator.dustbin"][1] = "0" * 64  # as the checksum is before it is known
+    reseal(shared, path, told)
+    assert notes_of(path) == []  # the same bytes are the same source
+    told["source_bytes"]["aggregator.dustbin"] = "1" * 64
     reseal(shared, path, told)
     (note,) = notes_of(path)
     assert f"{path}: found another source of aggregator.dustbin column than" in note
