@@ -5,7 +5,6 @@ import functools
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
@@ -413,6 +412,8 @@ def split_statistics(params: PyTree) -> tuple[PyTree, PyTree]:
     measured = jax.tree_util.tree_map_with_path(
         lambda path, _: jax.tree_util.keystr(path[-1:], simple=True) in STATISTICS, params
     )
+    import equinox as eqx  # which takes a quarter of a second, and describing does without
+
     return eqx.partition(params, measured)
 
 

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec
@@ -413,7 +412,11 @@ def _tokens_in_parts(
     def tokens_of(
         statistics: Crisalad | None, images: Images, keys: Keys | None, valid: Array | None
     ) -> tuple[Crisalad | None, Tokens]:
-        current = params if statistics is None else eqx.combine(statistics, params)
+        current = params
+        if statistics is not None:
+            import equinox as eqx  # which takes a quarter of a second, and describing does without
+
+            current = eqx.combine(statistics, params)
         features, statistics = _extract_features(current, images, valid, config)
         grid = config.backbone.grid((images.shape[1], images.shape[2]))
         with jax.named_scope("aggregator"):

@@ -123,15 +123,17 @@ def describe_set(
         "on_bad_image": on_bad_image,
         "quiet": quiet,
     }
-    if work.folder is None:
+    # A single batch is nothing to resume: no work is kept of it, and no digest of the model needed.
+    folder = work.folder if len(paths) > batch_size else None
+    if folder is None:
         tokens = read_tokens(params, config, paths, label="images", **options)
     else:
-        tokens = read_tokens_partly(work.folder, params, config, paths, **options)
+        tokens = read_tokens_partly(folder, params, config, paths, **options)
     if not tokens.readable.any():
         raise InputError(f"{source}: found {len(paths)} images, none of them readable")
     how: dict[str, Any] = {"batch_size": batch_size, "seed": seed, "quiet": quiet}
     written = None
-    if work.folder is None:
+    if folder is None:
         descriptors = group(params, config, tokens, grouping, **how)[tokens.readable]
         check_rows(
             descriptors,
@@ -142,7 +144,7 @@ def describe_set(
         if components is not None:
             descriptors = components.apply(descriptors)
     else:
-        with told_of(work.folder):
+        with told_of(folder):
             written = work.temporary()
             rows = described(params, config, tokens, grouping, **how)
             _write_rows(written, rows, tokens, config, f"{source}: descriptors")
