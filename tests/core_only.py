@@ -47,7 +47,8 @@ def main() -> None:
         folder / "weights.safetensors", cj.merge_params(trainable, frozen, config), config
     )
     loaded, config = cj.load(folder / "weights.safetensors")
-    names, descriptors, _, _ = cj.extract(loaded, config, folder, folder / "descriptors.npy")
+    found = cj.extract(loaded, config, folder, folder / "descriptors.npy")
+    names, descriptors = found.names, found.descriptors
     assert names == [f"{number}.png" for number in range(4)]
     assert descriptors.shape == (4, config.descriptor_dim)
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-5)

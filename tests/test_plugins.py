@@ -496,6 +496,7 @@ def test_a_step_a_dustbin_and_a_loss_are_trained_saved_and_told(
     assert "R@1" in succeeds(capfd, *data, *rest)
     files[0].write_text(files[0].read_text().replace("jnp.exp(", "jnp.exp(0.5 * "))
     source._file_digest.cache_clear()
+    source._bytes_digest.cache_clear()
     load_plugin(str(files[0]))  # nothing: it is there
     from crisalad_jax.cli import main
 

@@ -149,6 +149,9 @@ def _fitted(text: str, tail: str, width: int, most: int) -> list[str]:
         is_whole = clauses.count("(") == clauses.count(")")
         if len(lines) <= most and is_whole and (end == ends[-1] or end > _SHORT):
             return lines
-    room = width * most - 8 - len(tail)
-    text = textwrap.shorten(text, room, placeholder=" ...", break_on_hyphens=False)
-    return textwrap.wrap(text + tail, width, break_on_hyphens=False)[:most]
+    for room in range(width * most - len(tail), 0, -4):
+        short = textwrap.shorten(text, room, placeholder=" ...", break_on_hyphens=False)
+        lines = textwrap.wrap(short + tail, width, break_on_hyphens=False)
+        if len(lines) <= most:
+            return lines
+    return []

@@ -62,6 +62,8 @@ def resize_image(
             f"image: found {image.dtype} of shape {image.shape}, expected uint8 of shape "
             "(height, width, 3) with sides of at least 1"
         )
+    if not _is_size(image_size):
+        raise InputError(f"image_size: found {image_size!r}, expected two whole numbers of pixels")
     if min(image_size) < 1:
         raise InputError(f"image_size: found {image_size}, expected sides of at least 1")
     if filter == "area":
@@ -80,6 +82,15 @@ def resize_image(
     target = resized.reshape(image_size[0], -1)
     resample(flat.astype(np.float32), *lines, *columns, target, pixels == "bytes")
     return resized.astype(np.uint8) if pixels == "bytes" else resized
+
+
+def _is_size(size: Any) -> bool:
+    whole = (int, np.integer)
+    return (
+        isinstance(size, tuple | list)
+        and len(size) == 2
+        and all(isinstance(n, whole) for n in size)
+    )
 
 
 def _resize_by_area(image: Pixels, image_size: tuple[int, int], pixels: str) -> Pixels:

@@ -145,8 +145,18 @@ def describe_images(
         (1, 576)
     """
     check_grouping((), batch_size, seed=0)
+    if isinstance(images, np.ndarray) and images.ndim == 3:
+        raise InputError(
+            f"images: found one picture of shape {images.shape}, expected a list of pictures"
+        )
     if not len(images):
         raise InputError("images: found none, expected at least one picture")
+    for image in images:
+        if not isinstance(image, np.ndarray):
+            raise InputError(
+                f"images: found {type(image).__name__}, expected pictures as of `read_image` "
+                "(`describe_files` takes files)"
+            )
     prepared = [prepare_image(image, config) for image in images]
     return describe_prepared(params, config, prepared, batch_size=batch_size)
 

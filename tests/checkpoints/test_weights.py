@@ -646,6 +646,12 @@ def brightest(features):
 '''
 
 
+def clear_digests() -> None:
+    """Read sources anew, as a later process does."""
+    source._file_digest.cache_clear()
+    source._bytes_digest.cache_clear()
+
+
 def save_brightest(path: pathlib.Path) -> ModelConfig:
     """Write a model of the plug-in's aggregator."""
     config = dataclasses.replace(WITHOUT_ENCODER, aggregator="brightest")
@@ -690,12 +696,6 @@ def notes_of(path: pathlib.Path) -> list[str]:
 
 
 @pytest.mark.usefixtures("_own_parts")
-def clear_digests() -> None:
-    """Read sources anew, as a later process does."""
-    source._file_digest.cache_clear()
-    source._bytes_digest.cache_clear()
-
-
 def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
     plugin, path = tmp_path / "plugin.py", tmp_path / "w.safetensors"
     plugin.write_text(PLUGIN)

@@ -684,7 +684,7 @@ def test_what_the_disk_refuses_is_one_line(capfd, tmp_path, shared, monkeypatch)
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "d.npy")
 
-    monkeypatch.setattr("crisalad_jax.utils.files.npy_header", full)
+    monkeypatch.setattr("crisalad_jax.retrieval.descriptor_files.npy_header", full)
     out = tmp_path / "d.npy"
     start = extract(shared, shared / "town", out)
     words = (f"{out}: cannot be written: No space left", f"is kept in {out}.partial")

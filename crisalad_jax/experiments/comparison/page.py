@@ -129,7 +129,7 @@ def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawi
     axes.set_yticks(range(len(rows)), titles, fontsize=9)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(left=0)
-    axes.xaxis.set_major_formatter("{x:.0f} %")
+    axes.xaxis.set_major_formatter("{x:g} %")
     axes.set_xlabel(f"R@1 on {name}", fontsize=10, color=INK)
     path = out / f"recall_{number}.png"
     save(figure, path, NARROW_DPI, dark=True)

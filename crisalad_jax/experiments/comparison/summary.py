@@ -338,14 +338,21 @@ def _difference_note(prepared: Prepared, title: str) -> str:
 def _training_note(prepared: Prepared) -> str:
     """Describe the start and the set of training, and its length if that is the same for all."""
     config = prepared.config
-    trained = [v.training for v in prepared.variants if v.trains]
     start = "a given backbone" if config.backbone else "nothing, by the recipe scratch"
     words = f"Trained from {start} on {pathlib.Path(config.train or '').name}: "
-    sizes = {(t.epochs, t.places_per_batch, t.images_per_place) for t in trained}
-    if len(sizes) > 1:
-        return words + "epochs and batches of each method's recipe."
-    ((epochs, places, images),) = sizes
-    return words + f"epochs: {epochs}, batches of {places} places x {images} images."
+    of_size: dict[str, list[str]] = {}
+    for variant in prepared.variants:
+        if variant.trains:
+            t = variant.training
+            size = f"epochs: {t.epochs}, batches of {t.places_per_batch} places x"
+            title = variant.labels[0]
+            of_size.setdefault(f"{size} {t.images_per_place} images", []).append(title)
+    if len(of_size) == 1:
+        (size,) = of_size
+        return f"{words}{size}."
+    # One title stands for a variant of several groupings.
+    several = (f"{size} ({', '.join(dict.fromkeys(titles))})" for size, titles in of_size.items())
+    return f"{words}{'; '.join(several)}."
 
 
 def _method_notes(prepared: Prepared) -> list[str]:

@@ -199,6 +199,11 @@ class Map:
         """Close the map."""
         self.close()
 
+    def __repr__(self) -> str:
+        """Return one line for a notebook."""
+        length = self.description.descriptor_length
+        return f"Map({str(self.folder)!r}: {len(self)} images, {length} numbers each)"
+
     def __len__(self) -> int:
         """Return the number of images."""
         return len(self.images)

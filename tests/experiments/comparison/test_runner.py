@@ -97,7 +97,7 @@ def test_what_it_leaves(finished):
     written = {path.name for path in finished.iterdir() if path.is_file()}
     assert written == {
         *("config.json", "behind.json", "speed.json", "results.json", "table.md", "table.csv"),
-        *("index.html", "recall_0.png"),
+        *("index.html", "recall_0.png", "recall_0_dark.png"),
     }
     page = (finished / "index.html").read_text()
     assert "CriSALAD" in page
@@ -266,7 +266,7 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
     """Of a method that learns nothing: what the vocabulary gave is what is evaluated."""
     built = []
 
-    def with_vocabulary(params, config, paths, *, images, seed, quiet):
+    def with_vocabulary(params, config, paths, *, images, seed, on_bad_image, quiet):
         built.append((len(paths), images, seed))
         return dataclasses.replace(
             params, aggregator=jax.tree.map(lambda x: x + 1, params.aggregator)

@@ -42,6 +42,7 @@
     const count = Math.min(shown, found.length).toLocaleString("en");
     output.textContent = `${count} of ${found.length.toLocaleString("en")} shown`;
     more.hidden = shown >= found.length;
+    more.textContent = `Show ${Math.min(AT_ONCE, found.length - shown)} more`;
   }
 
   function update() {
@@ -70,7 +71,6 @@
     head.append(button);
     return head;
   });
-  more.textContent = `Show ${AT_ONCE} more`;
   section.querySelector("thead tr").append(...heads);
   more.addEventListener("click", () => {
     shown += AT_ONCE;
