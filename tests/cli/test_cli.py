@@ -687,7 +687,7 @@ def test_what_the_disk_refuses_is_one_line(capfd, tmp_path, shared, monkeypatch)
     monkeypatch.setattr("crisalad_jax.retrieval.descriptor_files.npy_header", full)
     out = tmp_path / "d.npy"
     start = extract(shared, shared / "town", out)
-    words = (f"{out}: cannot be written: No space left", f"is kept in {out}.partial")
+    words = (f"{out}.partial: cannot be written: No space left", f"is kept in {out}.partial")
     fails(capfd, *start, words=words)
     assert {path.split("/")[0] for path in files_in(tmp_path)} == {"d.npy.partial"}
     monkeypatch.undo()
