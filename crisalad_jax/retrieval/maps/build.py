@@ -1,5 +1,6 @@
 """Build maps from folders of images: each image is described alone, in bounded memory."""
 
+import contextlib
 import dataclasses
 import os
 import pathlib

@@ -20,6 +20,7 @@ from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
 from tests.conftest import BATCH, MODEL
+from tests.data.test_sources import write_jpeg
 from tests.killed_appends import append_until, description, names, rows
 from tests.retrieval.maps.test_stores import brute_force
 
@@ -70,6 +71,26 @@ def test_shares_make_the_map_of_one_process(shared, params, database, whole, tmp
     late = run(shared, params, database, out, share="1/2")
     assert (late.added, late.there, late.shares_left) == (0, 7, 0)
     assert contents(out) == contents(whole)
+
+
+def test_shares_know_positions_of_exif(shared, params, tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for number in range(7):
+        write_jpeg(photos / f"{number}.jpg", _2=(52.0, float(number), 0.0))
+    run(shared, params, photos, tmp_path / "one")
+    for share in ("0/2", "1/2"):
+        found = run(shared, params, photos, tmp_path / "two", share=share)
+    assert (found.added, found.positions) == (7, 7)
+    assert contents(tmp_path / "two") == contents(tmp_path / "one")
+    images = contents(tmp_path / "two")[0]
+    expected = [(52 + number / 60, 21.0125) for number in range(7)]  # by hand
+    np.testing.assert_allclose([image.position for image in images], expected, atol=1e-9)
+    # A map that is there takes those of new photographs, too.
+    write_jpeg(photos / "9.jpg", _2=(52.0, 9.0, 0.0))
+    for share in ("0/2", "1/2"):
+        found = run(shared, params, photos, tmp_path / "two", share=share)
+    assert (found.added, found.positions, found.images) == (1, 1, 8)
 
 
 def test_shares_add_to_a_map(shared, params, database, whole, tmp_path):
