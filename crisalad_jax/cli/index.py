@@ -21,8 +21,8 @@ class Index:
     """A .safetensors file of this package, or a published model's name (`crisalad models`); of a
     map that is there, the same model's."""
     images: pathlib.Path
-    """Folder, searched with its subfolders; the map names images by their paths in it. Or a file, a
-    pattern, a list, a table or a video (docs/how-to/image-sources.md)."""
+    """Folder, file, pattern, list, table or video (docs/how-to/image-sources.md); the map names
+    images by their paths in the folder, subfolders included."""
     out: pathlib.Path
     """The map's folder. After a kill the same command goes on."""
     fps: float = 1.0

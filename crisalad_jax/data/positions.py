@@ -107,7 +107,8 @@ def _read_table(path: pathlib.Path, *, must: bool) -> ImageTable:
                     raise InputError(f"{where}: found {name!r} twice, expected it once")
                 seen.add(name)
                 lines.append((rows.line_num, name))
-                if axes is not None and (must or any(row[axis] for axis in axes)):
+                # A field that is missing is an error, and no empty one.
+                if axes is not None and (must or any(row[axis] != "" for axis in axes)):
                     positions[name] = _position(row, axes, separator, where)
     except (OSError, ValueError, csv.Error) as error:
         if isinstance(error, InputError):
@@ -137,6 +138,8 @@ def _axes(path: pathlib.Path, header: Sequence[str], *, must: bool) -> tuple[str
         raise InputError(f"{found}, expected {_NEEDED}")
     if "name" not in header:
         raise InputError(f"{found}, expected one called name")
+    if any(axis in header for axes in AXES[:2] for axis in axes):
+        raise InputError(f"{found}, expected both numbers of a position: {_NEEDED}")
     return None
 
 

@@ -31,7 +31,9 @@ from crisalad_jax.utils.version import VERSION
 MOST_ANSWERS = 100
 """Largest k."""
 MOST_WAITING = 128
-"""Number of requests with pictures that are read, decoded or described at once."""
+"""Number of requests whose pictures are decoded or described at once."""
+_UPLOADS = 2
+"""Number of pictures that may be arriving at once, in `most_waiting`."""
 _PATIENCE = 60.0
 """Seconds in which a picture has to arrive."""
 _RETRY = {"Retry-After": "1"}
@@ -171,6 +173,8 @@ def make_app(
         default_response_class=_Json,
     )
     room = _Room(most_waiting)
+    # Apart, so that clients who stop in the middle of a picture keep no whole ones waiting.
+    uploads = _Room(_UPLOADS * most_waiting)
     _handle_errors(app)
     page = importlib.resources.files("crisalad_jax.serve").joinpath("page.html").read_bytes()
 
@@ -211,8 +215,9 @@ def make_app(
         k: Annotated[int, fastapi.Query(ge=1, le=MOST_ANSWERS)] = k,
     ) -> Located:
         """Find the most similar images of the map to a picture."""
-        with room.taken():
+        with uploads.taken():
             data, name = await _picture(request, max_bytes)
+        with room.taken():
             start = time.perf_counter()
             found, known = await service.locate(data, name, k)
         return Located([Neighbour(**each) for each in found], known, _milliseconds(start))
@@ -237,8 +242,9 @@ def make_app(
         if not service.appends:
             raise RefusedError(403, "images: found a map that is only read, expected --append")
         axes, position = _position(name, (east, north), (lat, lon), (x, y))
-        with room.taken():
+        with uploads.taken():
             data, _ = await _picture(request, max_bytes)
+        with room.taken():
             start = time.perf_counter()
             fields = await service.append(data, name, axes, position)
         return Appended(**fields, latency_ms=_milliseconds(start))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from crisalad_jax.data.positions import read_positions, utm_positions
+from crisalad_jax.data.positions import read_image_table, read_positions, utm_positions
 from crisalad_jax.utils.errors import InputError
 
 
@@ -63,3 +63,15 @@ def test_a_table_that_cannot_be_read_is_one_line(tmp_path):
     (tmp_path / "bytes.csv").write_bytes(b"name,east,north\n\xff,1,2\n")
     with pytest.raises(InputError, match=r"bytes\.csv: cannot read these positions: 'utf-8'"):
         read_positions(tmp_path / "bytes.csv")
+
+
+@pytest.mark.parametrize("header", ["name,lat", "lon,name", "name,east,x", "name,north"])
+def test_half_a_position_is_no_position_left_out(tmp_path, header):
+    """A misspelt column would be noticed after the map is made, which keeps what it has."""
+    table = tmp_path / "a.csv"
+    table.write_text(f"{header}\n")
+    with pytest.raises(InputError, match="expected both numbers of a position: name,east,north"):
+        read_image_table(table)
+    table.write_text("name,lat,lon\na.jpg\n")
+    with pytest.raises(InputError, match=r"line 2: found \[None, None\], expected two finite"):
+        read_image_table(table)
