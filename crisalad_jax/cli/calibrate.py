@@ -4,10 +4,9 @@ import dataclasses
 import pathlib
 from typing import Literal
 
-from crisalad_jax.cli.common import console, find_given, give_json, prepare_json, say
+from crisalad_jax.cli.common import console, find_given, give_json, open_set, prepare_json, say
 from crisalad_jax.cli.tables import points_table
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
 from crisalad_jax.evaluation.operating_point import caveats, check_precision
 from crisalad_jax.retrieval.maps.calibration import CALIBRATION
@@ -73,20 +72,7 @@ def run(arguments: Calibrate) -> None:
     check_precision(arguments.precision)
     with Map.open(arguments.map, verify=arguments.verify) as places:
         params = places.load_params(find_given(arguments.weights, quiet=arguments.quiet))
-        benchmark = open_benchmark(
-            arguments.data,
-            arguments.split,
-            arguments.radius,
-            images=arguments.images,
-            max_heading_difference=arguments.max_heading_difference,
-            frames=arguments.frames,
-            queries=arguments.queries,
-            layout=arguments.layout,
-        )
-        say(
-            f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} "
-            f"database images; positive: {benchmark.rule}"
-        )
+        benchmark = open_set(arguments)
         calibration = calibrate(
             places,
             params,

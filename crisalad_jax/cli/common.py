@@ -13,7 +13,7 @@ import rich.console
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_seed
-from crisalad_jax.data.resize import compile_ahead
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training.recipes import recipe
@@ -94,6 +94,32 @@ def check_one_model(weights: pathlib.Path | None, preset: str | None) -> None:
         raise InputError("--preset: found beside --weights, expected only one of the two")
 
 
+def open_set(arguments: Any) -> Benchmark:
+    """Open the evaluation set that a command's flags name, and say what it is.
+
+    Args:
+        arguments: has the flags of `evaluate` that say which set, how it lies and what is right.
+
+    Raises:
+        InputError: what `open_benchmark` raises.
+    """
+    benchmark = open_benchmark(
+        arguments.data,
+        arguments.split,
+        arguments.radius,
+        images=arguments.images,
+        max_heading_difference=arguments.max_heading_difference,
+        frames=arguments.frames,
+        queries=arguments.queries,
+        layout=arguments.layout,
+    )
+    say(
+        f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
+        f"images; positive: {benchmark.rule}"
+    )
+    return benchmark
+
+
 def load_model(
     weights: pathlib.Path | None,
     *,
@@ -125,7 +151,6 @@ def load_model(
             or both weights and a preset are given.
     """
     check_one_model(weights, preset)
-    compile_ahead()
     if weights is None:
         preset = preset or "b14"
         config = recipe(preset).model

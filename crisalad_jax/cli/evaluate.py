@@ -11,12 +11,13 @@ from crisalad_jax.cli.common import (
     check_json,
     console,
     load_model,
+    open_set,
     say,
     talk_beside,
     write_or_print_json,
 )
 from crisalad_jax.cli.tables import grouping_table, points_table
-from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.resize import compile_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
@@ -142,6 +143,7 @@ def run(arguments: Evaluate) -> None:
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
+    compile_ahead()
     params, config, model_name = load_model(
         arguments.weights,
         preset=arguments.preset,
@@ -154,20 +156,7 @@ def run(arguments: Evaluate) -> None:
     )
     rerank = _reranking(arguments, config)
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
-    benchmark = open_benchmark(
-        arguments.data,
-        arguments.split,
-        arguments.radius,
-        images=arguments.images,
-        max_heading_difference=arguments.max_heading_difference,
-        frames=arguments.frames,
-        queries=arguments.queries,
-        layout=arguments.layout,
-    )
-    say(
-        f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
-        f"images; positive: {benchmark.rule}"
-    )
+    benchmark = open_set(arguments)
     say(model_name)
     say(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()

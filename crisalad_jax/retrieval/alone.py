@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
@@ -38,6 +38,7 @@ def describe_alone(
     batch_size: int,
     on_bad_image: OnBadImage = "stop",
     components: Pca | None = None,
+    cache: ImageCache | None = None,
 ) -> Iterator[Described]:
     """Describe images in order, each as if it were alone, and yield batch by batch.
 
@@ -49,7 +50,7 @@ def describe_alone(
         InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
     """
     stream = tokens_in_batches(
-        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image
+        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image, cache=cache
     )
     for tokens, batch in stream:
         descriptors = group(params, config, tokens, "single", batch_size=batch_size)

@@ -15,6 +15,7 @@ from crisalad_jax.nn.model import Crisalad, attend_across_images, cast_params, e
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.retrieval.alone import Described, describe_images
 from crisalad_jax.retrieval.describe import FolderTokens, group, tokens_in_batches
+from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
 
@@ -42,11 +43,12 @@ def describe_windows(
     window: int,
     batch_size: int,
     on_bad_image: OnBadImage = "stop",
+    components: Pca | None = None,
 ) -> Iterator[Described]:
     """Describe images in order, each with the `window - 1` before it, and yield batch by batch.
 
     The descriptors are those of the grouping `window` (`retrieval.describe.group`) of all images.
-    No image looks at one that could not be read.
+    No image looks at one that could not be read. Components shorten the descriptors.
 
     Raises:
         InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
@@ -59,6 +61,8 @@ def describe_windows(
         known = 0 if before is None else len(before.readable)
         both = new if before is None else FolderTokens(*map(_join, before, new))
         descriptors = group(params, config, both, "window", batch_size=window)[known:]
+        if components is not None and new.readable.any():
+            descriptors = components.apply(descriptors)
         indices = batch.indices[batch.indices >= 0]
         yield Described(indices[new.readable], descriptors[new.readable], indices[~new.readable])
         before = FolderTokens(*(leaf[1 - window :] for leaf in both))

@@ -25,7 +25,7 @@ from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.model import Crisalad, cast_params, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
-from crisalad_jax.retrieval.describe import group, tokens_in_batches
+from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.batches import (
     Rounds,
@@ -347,7 +347,7 @@ class Run:
         def describe(images: np.ndarray) -> np.ndarray:
             nonlocal unreadable
             rows = np.full((len(images), config.model.descriptor_dim), np.nan, np.float32)
-            batches = tokens_in_batches(
+            stream = describe_alone(
                 params,
                 config.model,
                 [queries.path(image) for image in images],
@@ -355,12 +355,9 @@ class Run:
                 on_bad_image=on_bad_image,
                 cache=self._cache,
             )
-            for tokens, batch in batches:
-                described = group(
-                    params, config.model, tokens, "single", batch_size=DESCRIBED_AT_ONCE
-                )
-                rows[batch.indices[batch.valid]] = described[batch.valid]
-                unreadable += int(((batch.indices >= 0) & ~batch.valid).sum())
+            for part in stream:
+                rows[part.indices] = part.descriptors
+                unreadable += len(part.unreadable)
             return rows
 
         mined = mine_tuples(

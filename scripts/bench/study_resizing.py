@@ -17,6 +17,7 @@ from PIL import Image
 from crisalad_jax.cli.common import load_model
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.alone import describe_images
 
 Resize = Callable[[pathlib.Path, int, int], np.ndarray]
@@ -43,13 +44,13 @@ WAYS: Mapping[str, Resize] = {
 }
 
 
-def rows(params: object, config: ModelConfig, paths: list[pathlib.Path]) -> list[tuple[str, ...]]:
+def rows(params: Crisalad, config: ModelConfig, paths: list[pathlib.Path]) -> list[tuple[str, ...]]:
     """Return a line for each of `WAYS`: cosines (median, least) and distances (median, most)."""
-    ours = describe_images(params, config, [read_image(path) for path in paths])  # pyright: ignore
+    ours = describe_images(params, config, [read_image(path) for path in paths])
     lines = []
     for name, way in WAYS.items():
         resized = [np.ascontiguousarray(way(path, *config.image_size)) for path in paths]
-        theirs = describe_images(params, config, resized)  # pyright: ignore
+        theirs = describe_images(params, config, resized)
         cosines = np.sum(ours * theirs, axis=1)
         distances = np.linalg.norm(ours - theirs, axis=1)
         words = (f"{np.median(cosines):.4f}", f"{cosines.min():.4f}")

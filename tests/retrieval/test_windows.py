@@ -9,6 +9,7 @@ import pytest
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.pca import fit_pca
 from crisalad_jax.retrieval.windows import FrameDescriber, check_window, describe_windows
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL
@@ -72,3 +73,13 @@ def test_windows_that_mean_nothing_are_refused():
     with pytest.raises(InputError, match="window: found 2 with a model without a cross-image enc"):
         check_window(alone, 2)
     check_window(alone, 1)
+
+
+def test_components_shorten_what_is_described(town, params):
+    components = fit_pca(town.expected, 4)
+    stream = describe_windows(
+        params, MODEL, town.paths, window=WINDOW, batch_size=BATCH, components=components
+    )
+    found = np.concatenate([part.descriptors for part in stream])
+    # As above, times what unit length gives back of a vector that lost most of its own.
+    np.testing.assert_allclose(found, components.apply(town.expected), atol=10 * ROUNDING)

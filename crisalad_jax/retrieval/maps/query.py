@@ -1,5 +1,6 @@
 """Queries to a map: which of its images are most similar to others, and where they were taken."""
 
+import itertools
 import json
 import os
 import pathlib
@@ -219,33 +220,18 @@ def _described(
     components: Pca | None,
 ) -> Iterator[Described]:
     """Describe the images of all sources; a window holds images of one source alone."""
+    options: dict[str, Any] = {
+        "batch_size": batch_size,
+        "on_bad_image": on_bad_image,
+        "components": components,
+    }
     if window == 1:
-        sources = [[path for source in sources for path in source]]
+        yield from describe_alone(params, config, list(itertools.chain(*sources)), **options)
+        return
     first = 0
     for source in sources:
-        if window == 1:
-            stream = describe_alone(
-                params,
-                config,
-                source,
-                batch_size=batch_size,
-                on_bad_image=on_bad_image,
-                components=components,
-            )
-        else:
-            stream = describe_windows(
-                params,
-                config,
-                source,
-                window=window,
-                batch_size=batch_size,
-                on_bad_image=on_bad_image,
-            )
-        for part in stream:
-            descriptors = part.descriptors
-            if window > 1 and components is not None and len(descriptors):
-                descriptors = components.apply(descriptors)
-            yield Described(part.indices + first, descriptors, part.unreadable + first)
+        for part in describe_windows(params, config, source, window=window, **options):
+            yield Described(part.indices + first, part.descriptors, part.unreadable + first)
         first += len(source)
 
 
