@@ -17,7 +17,6 @@ from crisalad_jax.cli.common import (
     write_or_print_json,
 )
 from crisalad_jax.cli.tables import grouping_table, points_table
-from crisalad_jax.data.resize import compile_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
@@ -143,7 +142,6 @@ def run(arguments: Evaluate) -> None:
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
-    compile_ahead()
     params, config, model_name = load_model(
         arguments.weights,
         preset=arguments.preset,

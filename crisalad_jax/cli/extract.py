@@ -6,7 +6,6 @@ from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
-from crisalad_jax.data.resize import compile_ahead
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 
@@ -101,7 +100,6 @@ def run(arguments: Extract) -> None:
         share=arguments.share,
     )
     weights = find_weights(arguments.weights, quiet=arguments.quiet)
-    compile_ahead()
     params, config, _ = load_model(
         weights,
         image_size=arguments.image_size,

@@ -1,8 +1,9 @@
 """Resize images as Pillow and torch do, compiled by numba: OpenCV has no antialiased filters."""
 
 import functools
+import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -31,7 +32,8 @@ def resize_image(
     on bytes does. (OpenCV's INTER_AREA is a box filter, several times further from Pillow on
     photographs; its INTER_LINEAR aliases.) Floats equal torch's `interpolate` up to rounding, with
     the antialias or without.
-    Without numba, which the `train` extra installs, matrix products take a hundred times as long.
+    The first few images are resized by numpy, and so are all without numba, which the `train` extra
+    installs: the same bits, in ten times as long.
 
     Args:
         image: 8-bit RGB; with "floats" also float32.
@@ -74,11 +76,11 @@ def resize_image(
     flat = np.ascontiguousarray(image).reshape(height, 3 * width)
     if (filter, antialias, pixels) == ("bilinear", True, "bytes"):
         resized = np.empty((*image_size, 3), np.uint8)
-        resample = _compiled()
+        resample = _resampler(flat.size)
         resample(flat, *lines, *columns, resized.reshape(image_size[0], -1))
         return resized
     resized = np.empty((*image_size, 3), np.float32)
-    resample = _compiled_floats()
+    resample = _resampler_of_floats(flat.size)
     target = resized.reshape(image_size[0], -1)
     resample(flat.astype(np.float32), *lines, *columns, target, pixels == "bytes")
     return resized.astype(np.uint8) if pixels == "bytes" else resized
@@ -166,26 +168,42 @@ def _taps_at_points(old: int, new: int, name: str) -> _Taps:
 
 _COMPILING = threading.Lock()
 """Lock around the compilation: without it every thread would compile at its first image."""
+_FEW = 2**23
+"""Values that numpy resamples in about the time that numba takes to load: four photographs."""
 
 
-def _compiled() -> Callable[..., None]:
-    """Return `_resample` as machine code, or as matrix products without numba."""
+class _Seen:
+    """Counts the values that were resampled so far."""
+
+    values = 0
+
+
+def _resampler(values: int) -> Callable[..., None]:
+    """Return `_resample` for so many more values: numpy's while they are few, or machine code."""
+    return _step if _are_few(values) else _compiled() or _step
+
+
+def _resampler_of_floats(values: int) -> Callable[..., None]:
+    """Return `_resample_floats` for so many more values, as `_resampler` does."""
+    return _step_floats if _are_few(values) else _compiled_floats() or _step_floats
+
+
+def _are_few(values: int) -> bool:
+    """Count values, and return whether so few were seen that numba need not be loaded."""
+    _Seen.values += values
+    return _Seen.values <= _FEW and "numba" not in sys.modules
+
+
+def _compiled() -> Callable[..., None] | None:
+    """Return `_resample` as machine code; None without numba."""
     with _COMPILING:
-        return _machine_code(_resample, "uint8", "uint8") or _multiply
+        return _machine_code(_resample, "uint8", "uint8")
 
 
-def _compiled_floats() -> Callable[..., None]:
-    """Return `_resample_floats` as machine code, or as matrix products without numba."""
+def _compiled_floats() -> Callable[..., None] | None:
+    """Return `_resample_floats` as machine code; None without numba."""
     with _COMPILING:
-        return _machine_code(_resample_floats, "float32", "float32", "bool_") or _multiply_floats
-
-
-def compile_ahead() -> None:
-    """Start to load numba and the default filter's machine code in a thread.
-
-    A program that reads a model's file first has them when it comes to its first image.
-    """
-    threading.Thread(target=_compiled, daemon=True).start()
+        return _machine_code(_resample_floats, "float32", "float32", "bool_")
 
 
 @functools.cache
@@ -290,34 +308,65 @@ def _resample_floats(
                 target[i] = min(max(np.floor(target[i] + np.float32(0.5)), 0), 255)
 
 
-def _multiply(pixels: np.ndarray, *taps_and_result: np.ndarray) -> None:
-    """Resample as `_resample` does, by dense matrix products."""
-    *taps, resized = taps_and_result
-    lines = _matrix(_Taps(*taps[:3]), pixels.shape[0])
-    columns = _matrix(_Taps(*taps[3:]), pixels.shape[1] // 3)
-    rows = (lines @ pixels.astype(np.float32)).reshape(len(lines), -1, 3)
-    target = resized.reshape(len(lines), -1, 3)
-    np.add(
-        np.einsum("hwc,vw->hvc", rows, columns, optimize=True), 0.5, out=target, casting="unsafe"
-    )
+def _step(
+    pixels: np.ndarray,
+    first_line: np.ndarray,
+    line_count: np.ndarray,
+    line_weights: np.ndarray,
+    first_column: np.ndarray,
+    column_count: np.ndarray,
+    column_weights: np.ndarray,
+    resized: np.ndarray,
+) -> None:
+    """Resample as `_resample` does, to the bit, a tap of all pixels at a time."""
+    lines = np.zeros((len(first_line), pixels.shape[1]), np.float32)
+    for at, weights in _each_tap(first_line, line_weights, len(pixels)):
+        lines = _fused(weights[:, None], pixels[at], lines)
+    near = lines.reshape(len(lines), -1, 3)
+    result = np.full((len(lines), len(first_column), 3), 0.5, np.float32)
+    for at, weights in _each_tap(first_column, column_weights, near.shape[1]):
+        result = _fused(weights[:, None], near[:, at], result)
+    resized[:] = result.astype(np.uint8).reshape(resized.shape)
 
 
-def _multiply_floats(pixels: np.ndarray, *taps_result_and_rounds: Any) -> None:
-    """Resample as `_resample_floats` does, by dense matrix products."""
-    *taps, resized, rounds = taps_result_and_rounds
-    lines = _matrix(_Taps(*taps[:3]), pixels.shape[0])
-    columns = _matrix(_Taps(*taps[3:]), pixels.shape[1] // 3)
-    rows = np.einsum("hwc,vw->hvc", pixels.reshape(len(pixels), -1, 3), columns, optimize=True)
-    rows = rows.reshape(len(pixels), -1)
+def _step_floats(
+    pixels: np.ndarray,
+    first_line: np.ndarray,
+    line_count: np.ndarray,
+    line_weights: np.ndarray,
+    first_column: np.ndarray,
+    column_count: np.ndarray,
+    column_weights: np.ndarray,
+    resized: np.ndarray,
+    rounds: bool,
+) -> None:
+    """Resample as `_resample_floats` does, to the bit, a tap of all pixels at a time."""
+    near = pixels.reshape(len(pixels), -1, 3)
+    lines = np.zeros((len(pixels), len(first_column), 3), np.float32)
+    for at, weights in _each_tap(first_column, column_weights, near.shape[1]):
+        lines = _fused(weights[:, None], near[:, at], lines)
     if rounds:
-        rows = np.clip(np.floor(rows + np.float32(0.5)), 0, 255)
-    np.matmul(lines, rows, out=resized)
-    if rounds:
-        np.clip(np.floor(resized + np.float32(0.5)), 0, 255, out=resized)
+        lines = np.clip(np.floor(lines + np.float32(0.5)), 0, 255)
+    lines = lines.reshape(len(pixels), -1)
+    result = np.zeros(resized.shape, np.float32)
+    for at, weights in _each_tap(first_line, line_weights, len(lines)):
+        result = _fused(weights[:, None], lines[at], result)
+    resized[:] = np.clip(np.floor(result + np.float32(0.5)), 0, 255) if rounds else result
 
 
-def _matrix(taps: _Taps, old: int) -> np.ndarray:
-    matrix = np.zeros((len(taps.first), old + taps.weights.shape[1]), np.float32)
-    at = taps.first[:, None] + np.arange(taps.weights.shape[1])
-    np.put_along_axis(matrix, at, taps.weights, axis=1)
-    return matrix[:, :old]
+def _each_tap(
+    first: np.ndarray, weights: np.ndarray, old: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the old places and the weights of each tap; those beyond the last weigh nothing."""
+    for tap in range(weights.shape[1]):
+        yield np.minimum(first + tap, old - 1), weights[:, tap].astype(np.float64)
+
+
+def _fused(weights: np.ndarray, values: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    """Multiply and add as a processor's fused instruction does: rounded once, to float32.
+
+    A product of two float32 is exact in float64.
+    """
+    products = weights * values
+    products += sums
+    return products.astype(np.float32)

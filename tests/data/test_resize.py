@@ -191,6 +191,34 @@ print(compiled)
     assert done.stdout == "[True]\n", done.stderr
 
 
+@pytest.mark.parametrize("shape", [(48, 64), (300, 401), (1, 1), (3, 90), (31, 28)])
+@pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("pixels", ["bytes", "floats"])
+@pytest.mark.parametrize("antialias", [True, False])
+def test_numpy_has_the_bits_of_machine_code(monkeypatch, shape, filter, pixels, antialias):
+    """So the first images, or a machine without numba, get no descriptors of their own."""
+    image = picture(*shape)
+    how = {"filter": filter, "pixels": pixels, "antialias": antialias}
+    compiled = [resize_image(image, size, **how) for size in ((28, 42), (70, 56))]
+    monkeypatch.setattr(resize, "_machine_code", lambda *_: None)
+    by_numpy = [resize_image(image, size, **how) for size in ((28, 42), (70, 56))]
+    for expected, found in zip(compiled, by_numpy, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_numba_is_loaded_for_many_images_alone():
+    program = """
+import sys, numpy
+from crisalad_jax.data.resize import resize_image
+image = numpy.zeros((1024, 1024, 3), numpy.uint8)
+for _ in range(3):
+    resize_image(image, (28, 28))
+    print("numba" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.split() == ["False", "False", "True"], done.stderr
+
+
 @pytest.mark.parametrize("error", [RuntimeError("no locator"), OSError(28, "No space left")])
 def test_where_nothing_can_be_kept_it_compiles_all_the_same(monkeypatch, error):
     njit = numba.njit
