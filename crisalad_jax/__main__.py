@@ -13,7 +13,7 @@ def main() -> None:
     # Imported after signals are handled, because it takes a while.
     from crisalad_jax.cli import main as run_command
 
-    code = run_command()
+    code = run_command(keep_programs=True)
     sys.stdout.flush()
     sys.exit(code)
 

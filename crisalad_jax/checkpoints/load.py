@@ -3,23 +3,23 @@
 import os
 import pathlib
 import re
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from crisalad_jax.checkpoints.cache import cached_weights
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.checkpoints.published.base import nearest_names
-from crisalad_jax.checkpoints.torch_io import read_checkpoint
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
+
+if TYPE_CHECKING:
+    from crisalad_jax.nn.config import ModelConfig
+    from crisalad_jax.nn.model import Crisalad
 
 
 class Model(NamedTuple):
     """A model's parameters and configuration."""
 
-    params: Crisalad
-    config: ModelConfig
+    params: "Crisalad"
+    config: "ModelConfig"
 
 
 def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
@@ -47,6 +47,9 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
         >>> load(folder / "weights.safetensors").config == config
         True
     """
+    # Imported here: the layouts of public checkpoints take a tenth of a second, and few need them.
+    from crisalad_jax.checkpoints.torch_io import read_checkpoint
+
     checkpoint = read_checkpoint(find_weights(path), verify=verify)
     return Model(checkpoint.params, checkpoint.config)
 
@@ -82,6 +85,8 @@ def find_weights(weights: str | os.PathLike[str], *, quiet: bool = False) -> pat
             tell(f"{name}: found a file of this name here, and took that, not the published model")
         return path
     if model is not None:
+        from crisalad_jax.checkpoints.cache import cached_weights
+
         for each in (model, *filter(None, [PUBLISHED.get(model.backbone)])):
             tell(f"{each.name}: {each.licence.words} ({each.repository})")
         return cached_weights(model, quiet=quiet)

@@ -1,6 +1,7 @@
 """Read and write safetensors files: arrays by name, and one object of JSON with a checksum."""
 
 import json
+import mmap
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ class Contents(NamedTuple):
     value: Any
     """The object beside the arrays, without its checksum."""
     arrays: dict[str, np.ndarray]
+    """Read-only views of the file, by name: what writes into the file would change them."""
 
 
 def write_safetensors(
@@ -99,7 +101,7 @@ def read_sealed(
             if form is None:
                 raise InputError(f"{path}: found metadata {sorted(metadata)}, expected {expected}")
             names = [name for name in file.keys() if not name.startswith(but)]  # noqa: SIM118
-            arrays = {name: file.get_tensor(name) for name in names}
+        arrays = _views(path, names)
     except (safetensors.SafetensorError, OSError) as error:
         raise InputError(
             f"{path}: not a whole safetensors file ({error}), expected {expected}"
@@ -112,3 +114,38 @@ def read_sealed(
     else:
         tell_unchecked(path)
     return Contents(form, value, arrays)
+
+
+_TYPES = {
+    "BOOL": "?",
+    "U8": "u1",
+    "I8": "i1",
+    "U16": "<u2",
+    "I16": "<i2",
+    "F16": "<f2",
+    "U32": "<u4",
+    "I32": "<i4",
+    "F32": "<f4",
+    "U64": "<u8",
+    "I64": "<i8",
+    "F64": "<f8",
+}
+"""numpy's types by the format's names, without those that numpy lacks."""
+
+
+def _views(path: pathlib.Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Map arrays of a file that `safetensors` found whole into memory: nothing is copied."""
+    with path.open("rb") as file:
+        count = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(count))
+        data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))[8 + count :]
+    arrays = {}
+    for name in names:
+        entry = header[name]
+        start, end = entry["data_offsets"]
+        if entry["dtype"] not in _TYPES:
+            known = ", ".join(_TYPES)
+            raise InputError(f"{path}: found {name} of {entry['dtype']}, expected one of {known}")
+        values = np.frombuffer(data[start:end], _TYPES[entry["dtype"]])
+        arrays[name] = values.reshape(entry["shape"])
+    return arrays

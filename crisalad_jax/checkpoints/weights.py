@@ -18,6 +18,7 @@ from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.misfits import is_finite
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
 from crisalad_jax.utils.errors import InputError
@@ -37,6 +38,8 @@ _MARK = "aggregator.backbone"
 """Array in files of version 0.1: a checksum of the backbone of AnyLoc's vocabulary; 0 before one is
 built."""
 _FORMATS = {FORMAT, FORMAT_2, FORMAT_1}
+_DIGEST = "model_sha256"
+"""Key of the `model_hash` in the metadata."""
 EXTRA = "extra."
 """Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
 
@@ -80,6 +83,7 @@ def save_weights(
         "parts": sources_of(config),
         "source_bytes": source_bytes_of(config),
         "aggregator": config.aggregator.metadata(params.aggregator),
+        _DIGEST: model_hash(params, config),
     }
     write_sealed(path, arrays, FORMAT, metadata)
 
@@ -133,6 +137,27 @@ def load_weights(
         ...
         crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
     """
+    params, config, _ = _loaded(path, expected, verify=verify)
+    return params, config
+
+
+def load_with_hash(path: str | os.PathLike[str]) -> tuple[Crisalad, ModelConfig, str]:
+    """Read what `load_weights` reads, and the `model_hash` of the parameters as they were written.
+
+    The file's checksum covers both. Files of versions that wrote none are digested.
+
+    Raises:
+        InputError: what `load_weights` raises.
+    """
+    params, config, metadata = _loaded(path, None, verify=True)
+    digest = metadata.get(_DIGEST)
+    return params, config, digest if isinstance(digest, str) else model_hash(params, config)
+
+
+def _loaded(
+    path: str | os.PathLike[str], expected: ModelConfig | None, *, verify: bool
+) -> tuple[Crisalad, ModelConfig, dict[str, Any]]:
+    """Read parameters, configuration and the rest of the metadata, and tell of changed sources."""
     path = pathlib.Path(path)
     try:
         with checked_safetensors(path, verify=verify):
@@ -152,7 +177,7 @@ def load_weights(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
             "with; descriptors may differ"
         )
-    return params, config
+    return params, config, metadata
 
 
 def _load(
@@ -291,11 +316,13 @@ def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path
             problems.append(
                 f"{name} found {array.dtype} {array.shape}, expected {leaf.dtype} {leaf.shape}"
             )
-        elif not np.isfinite(array).all():
+        elif not is_finite(array):
             problems.append(f"{name} holds NaN or infinity")
     if problems:
         raise InputError(f"{path}: weights do not fit: {'; '.join(sorted(problems))}")
-    leaves = [jax.device_put(arrays[name]) for name in wanted]
+    # Not the file's own memory, which another program may change, and copied when this returns.
+    leaves = [jax.device_put(arrays[name], may_alias=False) for name in wanted]
+    jax.block_until_ready(leaves)
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 

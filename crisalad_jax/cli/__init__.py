@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from crisalad_jax.config.checks import choose, require
-from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_failure
+from crisalad_jax.config.plugins import has_plugins, load_entry_points, load_plugin, plugin_failure
 from crisalad_jax.utils.errors import InputError, Stopped
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.notes import Note
@@ -117,9 +117,9 @@ def _limit_pixels(given: Sequence[str]) -> None:
         os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = pixels
 
 
-def _run(name: str, given: list[str]) -> None:
+def _run(name: str, given: list[str], keep_programs: bool) -> None:
     from crisalad_jax.cli import renamed
-    from crisalad_jax.utils import compiler
+    from crisalad_jax.utils import compiler, kept
 
     require("" not in given, "arguments: found an empty one, expected a value")
     _limit_pixels(given)
@@ -129,6 +129,8 @@ def _run(name: str, given: list[str]) -> None:
     chosen = _parse(name, module, arguments)
     _check_numbers(chosen)
     compiler.set_up()
+    if keep_programs and not has_plugins():
+        kept.keep_programs()
     module.run(chosen)
 
 
@@ -164,8 +166,11 @@ def _show_note(message: Any, category: type[Warning], *rest: Any, **more: Any) -
 _show_warning: Callable[..., None] = warnings.showwarning
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command, and return its exit code."""
+def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
+    """Run one command, and return its exit code.
+
+    A process of its own may `keep_programs` (`utils.kept`): nothing else changes the code there.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if given else sys.stderr)
@@ -176,13 +181,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _show_note
         warnings.simplefilter("always", Note)
-        return _exit_code(given)
+        return _exit_code(given, keep_programs)
 
 
-def _exit_code(given: list[str]) -> int:
+def _exit_code(given: list[str], keep_programs: bool) -> int:
     try:
         choose("command", given[0], _COMMANDS)
-        _run(given[0], given[1:])
+        _run(given[0], given[1:], keep_programs)
     except ModuleNotFoundError as error:
         print(f"crisalad: {missing_extra(error, f'crisalad {given[0]}')}", file=sys.stderr)
         return 2

@@ -5,21 +5,20 @@ import json
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import jax
 import rich.console
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_seed
-from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, init_crisalad
-from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
 from crisalad_jax.utils.output import printable
+
+if TYPE_CHECKING:  # commands that load no model of a file start without these
+    from crisalad_jax.data.benchmarks import Benchmark
+    from crisalad_jax.nn.config import ModelConfig
+    from crisalad_jax.nn.model import Crisalad
 
 # Into a file or a pipe, wide enough that tables do not wrap. Brackets and colons in names are text.
 console = rich.console.Console(
@@ -94,7 +93,7 @@ def check_one_model(weights: pathlib.Path | None, preset: str | None) -> None:
         raise InputError("--preset: found beside --weights, expected only one of the two")
 
 
-def open_set(arguments: Any) -> Benchmark:
+def open_set(arguments: Any) -> "Benchmark":
     """Open the evaluation set that a command's flags name, and say what it is.
 
     Args:
@@ -103,6 +102,8 @@ def open_set(arguments: Any) -> Benchmark:
     Raises:
         InputError: what `open_benchmark` raises.
     """
+    from crisalad_jax.data.benchmarks import open_benchmark
+
     benchmark = open_benchmark(
         arguments.data,
         arguments.split,
@@ -130,7 +131,7 @@ def load_model(
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
     verify: bool = True,
     quiet: bool = False,
-) -> tuple[Crisalad, ModelConfig, str]:
+) -> "tuple[Crisalad, ModelConfig, str]":
     """Load a model from a file, or initialise an untrained preset without one.
 
     Args:
@@ -152,12 +153,19 @@ def load_model(
     """
     check_one_model(weights, preset)
     if weights is None:
+        import jax
+
+        from crisalad_jax.nn.model import init_crisalad
+        from crisalad_jax.training.recipes import recipe
+
         preset = preset or "b14"
         config = recipe(preset).model
         check_seed("seed", seed)
         params = init_crisalad(jax.random.key(seed), config)
         name = f"untrained {preset}, seed {seed}"
     else:
+        from crisalad_jax.checkpoints.weights import load_weights
+
         weights = find_weights(weights, quiet=quiet)
         params, config = load_weights(weights, verify=verify)
         name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name

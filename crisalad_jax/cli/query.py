@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from crisalad_jax.cli import live
+from crisalad_jax.cli.answers import answers_table
 from crisalad_jax.cli.common import STDOUT, console, find_given, say, talk_beside
-from crisalad_jax.cli.tables import answers_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError

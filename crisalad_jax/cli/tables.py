@@ -12,7 +12,6 @@ from crisalad_jax.checkpoints.published import Published
 from crisalad_jax.checkpoints.published.base import GITHUB
 from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
-from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.training.summary import ModelSummary
 from crisalad_jax.utils.output import printable
 
@@ -134,31 +133,3 @@ def _model_cells(model: Published) -> tuple[str, ...]:
         model.images,
         model.repository.removeprefix(GITHUB),
     )
-
-
-def answers_table(answers: Answers, title: str = "") -> Table:
-    """Make a table of answers for the terminal; a query of an unknown place has one row."""
-    followed = answers.probabilities is not None
-    table = Table(title=printable(title), title_justify="left")
-    table.add_column("query", overflow="fold")
-    table.add_column("rank", justify="right")
-    table.add_column("name", overflow="fold")
-    table.add_column("similarity", justify="right", no_wrap=True)
-    if followed:
-        table.add_column("probability", justify="right", no_wrap=True)
-    table.add_column(", ".join(answers.axes or ("position",)), justify="right", overflow="fold")
-    for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
-        shown = ranked if known else ranked[:1]
-        for answer in shown:
-            position = answers.position(answer.image) if known else None
-            cells = (
-                path.as_posix() if answer.rank == 1 else "",
-                str(answer.rank) if known else "-",
-                answer.image.name if known else "unknown",
-                f"{answer.similarity:.3f}",
-                *([f"{answer.probability:.3f}"] if followed else []),
-                "-" if position is None else ", ".join(f"{v:.9g}" for v in position.values()),
-            )
-            # `Text` keeps square brackets in a name from being markup.
-            table.add_row(*map(Text, map(printable, cells)), end_section=answer.rank == len(shown))
-    return table

@@ -59,6 +59,11 @@ def load_plugin(plugin: str) -> None:
     _PLUGINS[str(real_path(pathlib.Path(plugin))) if plugin.endswith(".py") else plugin] = None
 
 
+def has_plugins() -> bool:
+    """Return whether code of any plug-in was loaded, of a file, a module or an entry point."""
+    return bool(_LOADED or _ENTERED)
+
+
 def loaded_plugins() -> list[str]:
     """Return what `load_plugin` takes to load the same in another process."""
     return list(_PLUGINS)

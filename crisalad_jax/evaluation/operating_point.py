@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float, Int
 
 from crisalad_jax.evaluation.metrics import accepted, right_retrievals
@@ -51,8 +50,10 @@ class OperatingPoint(NamedTuple):
         """
         if not self.right:
             return 0.0
+        import scipy.special  # takes a tenth of a second, which a query does not need
+
         wrong = self.answered - self.right
-        return float(scipy.stats.beta.ppf(1 - CONFIDENCE, self.right, wrong + 1))
+        return float(scipy.special.betaincinv(self.right, wrong + 1, 1 - CONFIDENCE))
 
     @property
     def recall(self) -> float:

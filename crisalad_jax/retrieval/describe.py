@@ -24,7 +24,7 @@ from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.progress import progress_bar
 
 _SMALL = 16
-"""Largest batch that is padded, so that few images need no other program than many."""
+"""Largest batch that is padded to a power of two, so that few sizes are compiled."""
 
 
 class FolderTokens(NamedTuple):
@@ -53,8 +53,14 @@ class HeldTokens(Protocol):
 
 
 def useful_batch_size(batch_size: int, images: int) -> int:
-    """Return the batch size, or less where it would be padding for the most part."""
-    return min(batch_size, max(images, _SMALL))
+    """Return the batch size, or less where it would be padding for the most part.
+
+    Example:
+        >>> [useful_batch_size(32, images) for images in (1, 3, 12, 20, 50)]
+        [1, 4, 16, 20, 32]
+    """
+    padded = images if images > _SMALL else 1 << max(0, images - 1).bit_length()
+    return min(batch_size, padded)
 
 
 def read_tokens(

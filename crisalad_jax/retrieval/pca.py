@@ -321,7 +321,8 @@ def _load(path: pathlib.Path, expected: str) -> Pca:
     form, value, arrays = read_sealed(path, (FORMAT, FORMAT_1), expected)
     if arrays.keys() != set(_ARRAYS):
         raise InputError(f"{path}: found arrays {sorted(arrays)[:3]}, expected {expected}")
-    arrays = {name: arrays[name] for name in _ARRAYS}
+    # In memory of its own: the file may be written anew while a map uses them.
+    arrays = {name: arrays[name].copy() for name in _ARRAYS}
     plain = value["config"] if form == FORMAT and "config" in value else value
     shape = arrays["components"].shape
     dim, length = shape if len(shape) == 2 else (0, 0)

@@ -13,7 +13,8 @@ from jax.extend.core import get_opaque_trace_state
 
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
-from crisalad_jax.utils.target import lowering_platforms, over_devices_of, target
+from crisalad_jax.utils.kept import kept
+from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
@@ -96,7 +97,17 @@ def jit(
             with _precision_of(leaves):
                 return inner(*args, **kwargs)
         with _precision_of(leaves), over_devices_of(leaves):
-            return outermost(leaves)(*args, **kwargs)
+            jitted = outermost(leaves)
+            if not runs_long and target() == machine():
+
+                def compile(*args: Any, **kwargs: Any) -> Any:
+                    return jitted.lower(*args, **kwargs).compile()
+
+                static = options.get("static_argnames", ())
+                program = kept(function, compile, args, kwargs, static)
+                if program is not None:
+                    return program()
+            return jitted(*args, **kwargs)
 
     def lower(*args: Any, **kwargs: Any) -> Any:
         leaves = jax.tree.leaves((args, kwargs))

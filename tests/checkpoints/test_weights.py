@@ -79,7 +79,9 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
     metadata = header.pop("__metadata__")
     assert metadata.keys() == {"crisalad-jax 3"}
     told = json.loads(metadata["crisalad-jax 3"])
-    assert list(told) == [*("checksum", "config", "version", "parts", "source_bytes", "aggregator")]
+    assert list(told) == [
+        *("checksum", "config", "version", "parts", "source_bytes", "aggregator", "model_sha256")
+    ]
     blank = data.replace(told["checksum"].encode(), b"0" * 64)
     assert hashlib.sha256(blank).hexdigest() == told["checksum"]
     assert told["config"] == to_plain(MODEL)
@@ -539,6 +541,19 @@ def put(config: Any, name: str, value: Any) -> Any:
     head, _, rest = name.partition(".")
     inner = put(getattr(config, head), rest, value) if rest else value
     return dataclasses.replace(config, **{head: inner})
+
+
+def test_the_hash_is_read_with_the_weights(tmp_path, shared, monkeypatch):
+    """Of a file that holds it nothing is digested; earlier files hold none."""
+    path = shared / "weights.safetensors"
+    expected = model_hash(*load_weights(path))
+    plain = dict(weights._read(path)[1])
+    del plain["model_sha256"]
+    arrays, _ = weights._read(path)
+    write_sealed(tmp_path / "earlier.safetensors", arrays, weights.FORMAT, plain)
+    assert weights.load_with_hash(tmp_path / "earlier.safetensors")[2] == expected
+    monkeypatch.setattr(weights, "model_hash", None)
+    assert weights.load_with_hash(path)[2] == expected
 
 
 @pytest.mark.parametrize("name", [name for name, _, _ in fields_of(CONVERGING)])

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float, Float32
 
-from crisalad_jax.checkpoints.weights import load_weights, model_hash
+from crisalad_jax.checkpoints.weights import load_with_hash, model_hash
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.positions import Positions
@@ -513,8 +513,8 @@ class Map:
                 f"{self.folder}: found no {file}, which made this map, expected it there or as "
                 "--weights"
             )
-        params, config = load_weights(file)
-        check_model(self.description, self.folder, model_hash(params, config), file)
+        params, _, digest = load_with_hash(file)
+        check_model(self.description, self.folder, digest, file)
         self._checked = params
         return params
 

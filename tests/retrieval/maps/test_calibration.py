@@ -11,7 +11,7 @@ import pytest
 
 import crisalad_jax.retrieval.maps.build
 import crisalad_jax.retrieval.maps.follow
-from crisalad_jax.cli.tables import answers_table
+from crisalad_jax.cli.answers import answers_table
 from crisalad_jax.data.images import list_images
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
 from crisalad_jax.evaluation.evaluate import evaluate

@@ -11,7 +11,7 @@ from rich.console import Console
 
 import crisalad_jax.retrieval.maps.query
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.cli.tables import answers_table
+from crisalad_jax.cli.answers import answers_table
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.file_store import FileStore

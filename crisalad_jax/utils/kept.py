@@ -1,0 +1,235 @@
+"""Compiled programs on disk, found by what they are traced from: neither traced nor lowered again.
+
+JAX's own compile cache is keyed by the lowered program, so that a start traces and lowers first.
+That takes most of the time to a first descriptor. The key here covers all that a trace depends on:
+the code of this package, the versions of the libraries, settings, configuration and shapes.
+"""
+
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import inspect
+import os
+import pathlib
+import pickle
+import platform
+import stat
+import sys
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
+
+from crisalad_jax.utils.files import atomic_path, user_cache
+from crisalad_jax.utils.version import VERSION
+
+_MOST = 64
+"""Largest number of programs that are kept: those used last."""
+_DIGEST = 32
+"""Bytes of the digest that a file begins with."""
+_TRACED_WITH = ("jax", "jaxlib", "numpy", "optimistix", "lineax", "equinox")
+_ENABLED = "jax_enable_compilation_cache"
+"""JAX's setting: whether its own cache is read and written."""
+_SETTINGS = ("JAX_", "XLA_")
+"""Beginnings of the environment variables that a program depends on."""
+
+
+class _Folder:
+    """The folder of kept programs; None, and nothing is kept, until `keep_programs`."""
+
+    path: pathlib.Path | None = None
+
+
+def keep_programs() -> None:
+    """Keep compiled programs from now on, in a folder of the user's alone.
+
+    A program that runs nothing but this package may call it: code that was changed while it ran, as
+    in a notebook, is not part of the key. Where there can be no such folder nothing is kept.
+    """
+    with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
+        folder = user_cache() / "crisalad-jax" / "programs"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # What is read from it runs, so nobody else may write there.
+        if _is_ones_own(folder):
+            _Folder.path = folder
+
+
+def kept(
+    function: Callable[..., Any],
+    compile: Callable[..., Any],
+    args: Sequence[Any],
+    kwargs: Mapping[str, Any],
+    static_argnames: str | Sequence[str] = (),
+) -> Callable[[], Any] | None:
+    """Find the compiled program for a call: of this process, on disk, or by compiling it.
+
+    Args:
+        function: what is traced, outside of other transformations, for this machine.
+        compile: compiles it for these arguments; returns a `jax.stages.Compiled`.
+        args: positional arguments of the call.
+        kwargs: arguments by name.
+        static_argnames: names of those that are part of the program.
+
+    Returns:
+        The call of the program; None where none is kept, as on accelerators.
+    """
+    if _Folder.path is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
+        return None
+    names = {static_argnames} if isinstance(static_argnames, str) else set(static_argnames)
+    places = list(zip(_parameters(function), args, strict=False))
+    static = {n: each for n, each in (*places, *kwargs.items()) if n in names}
+    traced = tuple(each for n, each in places if n not in names)
+    by_name = {n: each for n, each in kwargs.items() if n not in names}
+    leaves, tree = jax.tree.flatten((traced, by_name))
+    arrays = [_as_array(leaf) for leaf in leaves]
+    traced, by_name = jax.tree.unflatten(tree, arrays)
+    signature = (
+        function,
+        tuple(sorted(static.items())),
+        tree,
+        tuple((leaf.aval, leaf.sharding, leaf.committed) for leaf in arrays),
+    )
+    program = _programs.get(signature)
+    if program is None:
+        path = _Folder.path / _key(function, static, tree, arrays)
+        program = _read(path, tree, _devices(arrays))
+        if program is None:
+            with _without_jaxs_cache():
+                program = compile(*args, **kwargs)
+            _write(path, program, tree)
+        _programs[signature] = program
+    return functools.partial(program, *traced, **by_name)
+
+
+@contextlib.contextmanager
+def _without_jaxs_cache() -> Iterator[None]:
+    """Compile anew: what comes from JAX's own cache lacks its functions once it is kept again."""
+    before = jax.config.values[_ENABLED]
+    jax.config.update(_ENABLED, False)
+    compilation_cache.reset_cache()
+    try:
+        yield
+    finally:
+        jax.config.update(_ENABLED, before)
+        compilation_cache.reset_cache()
+
+
+def _as_array(leaf: Any) -> jax.Array:
+    """Put a numpy array on the device, for which `jnp.asarray` would compile a program."""
+    if isinstance(leaf, np.ndarray):
+        return jax.device_put(leaf)
+    return leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf)
+
+
+_programs: dict[Hashable, Any] = {}
+"""Programs of this process, by all that they depend on."""
+
+
+@functools.cache
+def _parameters(function: Callable[..., Any]) -> tuple[str, ...]:
+    return tuple(inspect.signature(function).parameters)
+
+
+def _devices(arrays: Sequence[jax.Array]) -> list[jax.Device]:
+    """Return the devices that a program of these arguments runs on, in their order."""
+    committed = (leaf.sharding.device_set for leaf in arrays if leaf.committed)
+    chosen = next(committed, jax.local_devices()[:1])
+    return sorted(chosen, key=lambda device: device.id)
+
+
+def _key(
+    function: Callable[..., Any],
+    static: Mapping[str, Any],
+    tree: Any,
+    arrays: Sequence[jax.Array],
+) -> str:
+    """Digest all that a program depends on: the same in every process."""
+    words = [f"{function.__module__}.{function.__qualname__}", repr(tree)]
+    words += [f"{name}={_whole(value)}" for name, value in sorted(static.items())]
+    words += [
+        f"{leaf.aval.str_short()} {leaf.aval.weak_type} {leaf.committed} {leaf.sharding!r} "
+        f"{sorted(device.id for device in leaf.sharding.device_set)}"
+        for leaf in arrays
+    ]
+    digest = hashlib.sha256(_surroundings())
+    for word in words:
+        digest.update(f"{len(word)} {word}".encode())
+    return digest.hexdigest()
+
+
+def _whole(value: Any) -> str:
+    """Describe a static argument by all its fields: its repr may leave some out."""
+    from crisalad_jax.config.io import to_plain
+
+    plain = to_plain(value) if hasattr(value, "__dataclass_fields__") else value
+    return f"{type(value).__qualname__} {plain!r}"
+
+
+@functools.cache
+def _surroundings() -> bytes:
+    """Digest what all programs of a process depend on: code, versions, settings, processor."""
+    digest = hashlib.sha256()
+    root = pathlib.Path(__file__).parent.parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root)} {path.stat().st_size} ".encode())
+        digest.update(path.read_bytes())
+    words = [VERSION, sys.version, *(importlib.metadata.version(name) for name in _TRACED_WITH)]
+    words += [f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)]
+    words += [f"{k}={v}" for k, v in sorted(jax.config.values.items(), key=lambda pair: pair[0])]
+    words += [str(jax.devices()), *_processor()]
+    digest.update("\n".join(words).encode())
+    return digest.digest()
+
+
+def _processor() -> list[str]:
+    """Describe the processor that machine code is for."""
+    words = [platform.system(), platform.machine(), platform.processor()]
+    with contextlib.suppress(OSError):
+        lines = pathlib.Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+        words += [line for line in lines if line.startswith(("model name", "flags", "Features"))]
+    return words
+
+
+def _is_ones_own(path: pathlib.Path) -> bool:
+    """Return whether only this user can write to a file or folder."""
+    if not hasattr(os, "getuid"):
+        return True
+    status = path.stat()
+    return status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+def _read(path: pathlib.Path, tree: Any, devices: list[jax.Device]) -> Any:
+    """Load a kept program; None where there is none that is whole and this user's own."""
+    try:
+        data = path.read_bytes()
+        if not _is_ones_own(path) or hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:
+            return None
+        payload, out_tree = pickle.loads(data[_DIGEST:])
+        program = serialize_executable.deserialize_and_load(
+            payload, tree, out_tree, execution_devices=devices
+        )
+        os.utime(path)
+    except Exception:  # of another jaxlib, cut short, or removed meanwhile: it is compiled anew
+        return None
+    return program
+
+
+def _write(path: pathlib.Path, program: Any, tree: Any) -> None:
+    """Keep a program for the next process, and forget those that were not used for long."""
+    try:
+        payload, in_tree, out_tree = serialize_executable.serialize(program)
+        if in_tree != tree:
+            return
+        data = pickle.dumps((payload, out_tree))
+        with atomic_path(path) as temporary:
+            pathlib.Path(temporary).write_bytes(hashlib.sha256(data).digest() + data)
+        others = sorted(path.parent.glob("*"), key=lambda each: each.stat().st_mtime)
+        for each in others[:-_MOST]:
+            each.unlink(missing_ok=True)
+    except Exception:  # a program that cannot be kept, or a full disk: it is compiled the next time
+        return
