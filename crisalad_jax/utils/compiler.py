@@ -13,7 +13,7 @@ from jax.extend.core import get_opaque_trace_state
 
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
-from crisalad_jax.utils.kept import kept
+from crisalad_jax.utils.kept import kept, remembered
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
@@ -51,15 +51,22 @@ def compiler_options(library: str, *, least_memory: bool = False) -> dict[str, b
 
 @functools.cache
 def _known_options(library: str, least_memory: bool) -> dict[str, bool | str]:
-    known = {}
     wanted = _LIBRARIES[library] | (_LEAST_MEMORY if least_memory else {})
-    for name, value in wanted.items():
+    return {name: value for name, value in wanted.items() if _is_known(name, value)}
+
+
+@functools.cache
+def _is_known(name: str, value: bool | str) -> bool:
+    """Try an option on a program of nothing, which takes a fiftieth of a second."""
+
+    def compiles() -> bool:
         try:
             jax.jit(lambda x: x, compiler_options={name: value}).lower(0.0).compile()
         except Exception:  # jaxlib's own class, which differs by version
-            continue
-        known[name] = value
-    return known
+            return False
+        return True
+
+    return remembered(f"option {name} {value}", compiles)
 
 
 def jit(

@@ -28,8 +28,8 @@ from jax.experimental.compilation_cache import compilation_cache
 from crisalad_jax.utils.files import atomic_path, user_cache
 from crisalad_jax.utils.version import VERSION
 
-_MOST = 64
-"""Largest number of programs that are kept: those used last."""
+_MOST = 128
+"""Largest number of files that are kept: those used last."""
 _DIGEST = 32
 """Bytes of the digest that a file begins with."""
 _TRACED_WITH = ("jax", "jaxlib", "numpy", "optimistix", "lineax", "equinox")
@@ -104,6 +104,29 @@ def kept(
             _write(path, program, tree)
         _programs[signature] = program
     return functools.partial(program, *traced, **by_name)
+
+
+def remembered(question: str, answer: Callable[[], bool]) -> bool:
+    """Answer a question about the compiler as the last process of the same surroundings did.
+
+    Args:
+        question: its words.
+        answer: finds the answer the first time, and always where no programs are kept.
+
+    Returns:
+        The answer.
+    """
+    if _Folder.path is None:
+        return answer()
+    digest = hashlib.sha256(_surroundings() + question.encode()).hexdigest()
+    known = {told: _Folder.path / f"{digest}.{told}" for told in (True, False)}
+    for told, path in known.items():
+        if path.exists():
+            return told
+    told = answer()
+    with contextlib.suppress(OSError):
+        known[told].touch()
+    return told
 
 
 @contextlib.contextmanager

@@ -1,0 +1,210 @@
+"""Compiled programs that outlive their process."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.utils import compiler, kept
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The folder of kept programs, as a program of its own sets it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kept._Folder, "path", None)
+    kept.keep_programs()
+    assert kept._Folder.path == tmp_path / "crisalad-jax" / "programs"
+    return kept._Folder.path
+
+
+def next_process(monkeypatch):
+    """Forget the programs of this one."""
+    monkeypatch.setattr(kept, "_programs", {})
+
+
+def counting():
+    """Make a compiled function, and the list that each of its traces is added to."""
+    traces = []
+
+    def scaled(tree, *, factor, by=None):
+        traces.append(factor)
+        total = tree["a"] * factor + tree["b"]
+        return {"total": total if by is None else total * by}
+
+    return compiler.jit(scaled, static_argnames="factor"), traces
+
+
+TREE = {"a": np.arange(3.0, dtype=np.float32), "b": np.float32(2)}
+
+
+def programs(folder):
+    return sorted(path for path in folder.iterdir() if not path.suffix)
+
+
+def test_the_next_process_traces_nothing_and_gives_the_same(folder, monkeypatch):
+    function, traces = counting()
+    expected = function(TREE, factor=3)
+    np.testing.assert_array_equal(expected["total"], [2, 5, 8])
+    assert traces == [3]
+    assert len(programs(folder)) == 1
+    next_process(monkeypatch)
+    again, traces_again = counting()
+    np.testing.assert_array_equal(again(TREE, factor=3)["total"], expected["total"])
+    np.testing.assert_array_equal(again(TREE, factor=3)["total"], expected["total"])
+    assert traces_again == []
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda f: f(TREE, factor=4),
+        lambda f: f(TREE | {"a": np.arange(4.0, dtype=np.float32)}, factor=3),
+        lambda f: f(TREE | {"a": np.arange(3)}, factor=3),
+        lambda f: f(TREE, factor=3, by=np.float32(2)),
+        lambda f: f({"b": TREE["a"], "a": TREE["b"]}, factor=3),
+        lambda f: f(TREE | {"a": jax.device_put(TREE["a"], jax.devices()[0])}, factor=3),
+    ],
+    ids=["static", "shape", "type", "argument", "places", "committed"],
+)
+def test_another_call_is_another_program(folder, call):
+    function, _ = counting()
+    function(TREE, factor=3)
+    call(function)
+    assert len(programs(folder)) == 2
+
+
+def test_every_field_of_a_configuration_counts():
+    config = PRESETS["tiny"]
+    assert "iterations" in kept._whole(config)  # which its repr leaves out, as a default
+    assert kept._whole(config) != kept._whole(PRESETS["s14"])
+
+
+@pytest.mark.parametrize("name", ["JAX_ENABLE_X64", "XLA_FLAGS"])
+def test_surroundings_count(monkeypatch, name):
+    before = kept._surroundings.__wrapped__()
+    assert kept._surroundings.__wrapped__() == before
+    monkeypatch.setenv(name, "anything")
+    assert kept._surroundings.__wrapped__() != before
+
+
+def test_the_code_counts(tmp_path, monkeypatch):
+    before = kept._surroundings.__wrapped__()
+    root = pathlib.Path(kept.__file__).parent.parent
+    read_bytes = pathlib.Path.read_bytes
+
+    def changed(path):
+        data = read_bytes(path)
+        return data + b" " if path == root / "nn" / "layers.py" else data
+
+    monkeypatch.setattr(pathlib.Path, "read_bytes", changed)
+    assert kept._surroundings.__wrapped__() != before
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: data[:40] + b"?" * 60])
+def test_a_damaged_program_is_compiled_anew(folder, monkeypatch, damage):
+    function, traces = counting()
+    expected = function(TREE, factor=3)
+    (path,) = programs(folder)
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    next_process(monkeypatch)
+    np.testing.assert_array_equal(function(TREE, factor=3)["total"], expected["total"])
+    next_process(monkeypatch)
+    function(TREE, factor=3)
+    assert len(traces) <= 2  # JAX keeps the trace of one process
+    assert path.stat().st_size == len(whole)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no modes of files")
+def test_what_others_may_write_is_not_run(folder, monkeypatch):
+    function, _ = counting()
+    function(TREE, factor=3)
+    (path,) = programs(folder)
+    path.chmod(0o666)
+    assert kept._read(path, None, []) is None
+    folder.chmod(0o777)
+    monkeypatch.setattr(kept._Folder, "path", None)
+    kept.keep_programs()
+    assert kept._Folder.path is None
+
+
+def test_only_the_latest_are_kept(folder, monkeypatch):
+    monkeypatch.setattr(kept, "_MOST", 2)
+    function, _ = counting()
+    for factor in range(4):
+        function(TREE, factor=factor)
+        for age, path in enumerate(reversed(programs(folder))):
+            os.utime(path, (1000 - age, 1000 - age))
+    assert len(programs(folder)) == 2
+
+
+def test_answers_are_remembered(folder):
+    asked = []
+
+    def answer():
+        asked.append(True)
+        return False
+
+    assert not kept.remembered("is it so?", answer)
+    assert not kept.remembered("is it so?", answer)
+    assert asked == [True]
+    assert kept.remembered("and this?", lambda: True)
+
+
+def test_nothing_is_kept_unasked(tmp_path, monkeypatch):
+    monkeypatch.setattr(kept._Folder, "path", None)
+    function, traces = counting()
+    assert kept.kept(function, None, (TREE,), {"factor": 1}, "factor") is None  # pyright: ignore
+    np.testing.assert_array_equal(function(TREE, factor=1)["total"], [2, 3, 4])
+    assert traces == [1]
+
+
+def test_the_command_line_keeps_programs_unless_a_plugin_is_loaded(tmp_path):
+    """As a process: `crisalad.main` within another one must not."""
+    plugin = tmp_path / "plugin.py"
+    plugin.write_text("import crisalad_jax\n")
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    image = tmp_path / "images" / "a.png"
+    image.parent.mkdir()
+    program = """
+import sys, jax
+from crisalad_jax import PRESETS, init_crisalad, save_weights
+save_weights(sys.argv[1], init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
+import cv2, numpy
+cv2.imwrite(sys.argv[2], numpy.zeros((50, 60, 3), numpy.uint8))
+"""
+    weights = tmp_path / "w.safetensors"
+    subprocess.run([sys.executable, "-c", program, weights, image], env=environment, check=True)
+    extract = [sys.executable, "-m", "crisalad_jax", "extract", "--weights", str(weights)]
+    extract += ["--images", str(image.parent), "--quiet", "--out"]
+    folder = tmp_path / "cache" / "crisalad-jax" / "programs"
+    run = [*extract, str(tmp_path / "1.npy"), "--plugin", str(plugin)]
+    subprocess.run(run, env=environment, check=True, capture_output=True)
+    assert not folder.exists()
+    for out in ("2.npy", "3.npy"):
+        run = [*extract, str(tmp_path / out)]
+        subprocess.run(run, env=environment, check=True, capture_output=True)
+        assert len(programs(folder)) == 2  # tokens, and descriptors from them
+    files = [(tmp_path / f"{n}.npy").read_bytes() for n in (1, 2, 3)]
+    assert files[0] == files[1] == files[2]
+
+
+def test_many_arguments_keep_their_places(folder, monkeypatch):
+    """A program takes no argument that it does not use, and the others in their order."""
+
+    def some(first, unused, last, *, config):
+        return first * config - last
+
+    function = compiler.jit(some, static_argnames=("config",))
+    given = (jnp.ones(2), jnp.zeros(5), np.full(2, 4, np.float32))
+    expected = function(*given, config=3)
+    next_process(monkeypatch)
+    np.testing.assert_array_equal(function(*given, config=3), expected)
+    np.testing.assert_array_equal(expected, [-1, -1])
