@@ -158,7 +158,7 @@ def _parameters(function: Callable[..., Any]) -> tuple[str, ...]:
     return tuple(inspect.signature(function).parameters)
 
 
-def _devices(arrays: Sequence[jax.Array]) -> list[jax.Device]:
+def _devices(arrays: Sequence[jax.Array]) -> list[Any]:
     """Return the devices that a program of these arguments runs on, in their order."""
     committed = (leaf.sharding.device_set for leaf in arrays if leaf.committed)
     chosen = next(committed, jax.local_devices()[:1])
@@ -226,7 +226,7 @@ def _is_ones_own(path: pathlib.Path) -> bool:
     return status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
-def _read(path: pathlib.Path, tree: Any, devices: list[jax.Device]) -> Any:
+def _read(path: pathlib.Path, tree: Any, devices: list[Any]) -> Any:
     """Load a kept program; None where there is none that is whole and this user's own."""
     try:
         data = path.read_bytes()
