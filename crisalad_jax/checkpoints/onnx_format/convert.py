@@ -1,9 +1,8 @@
 """Walk through a traced program, and convert it equation by equation."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
@@ -38,7 +37,8 @@ def _run(
 
     def read(atom: Any) -> Value:
         if isinstance(atom, Literal):
-            return Value.of(np.asarray(atom.val, atom.aval.dtype))
+            aval: Any = atom.aval
+            return Value.of(np.asarray(atom.val, aval.dtype))
         return values[atom]
 
     for eqn in program.eqns:
@@ -57,11 +57,14 @@ def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
         which = int(inputs[0].constant.item())
         branch = eqn.params["branches"][min(max(which, 0), len(eqn.params["branches"]) - 1)]
         return convert(graph, branch, inputs[1:])
-    if called is not None and not eqn.primitive.name.startswith(("while", "custom_linear")):
+    if called is not None and not name.startswith(("while", "custom_linear")):
         closed = isinstance(called, ClosedJaxpr)
         constants = [Value.of(each) for each in called.consts] if closed else []
         return _run(graph, called.jaxpr if closed else called, constants, inputs)
     missing = next((value.missing for value in inputs if value.missing), "")
+    if not missing and all(0 in var.aval.shape for var in eqn.outvars):
+        # Of arrays without numbers engines cannot tell the symbolic side.
+        return [_nothing(var.aval) for var in eqn.outvars]
     if not missing:
         try:
             if name in CONVERTERS:
@@ -71,6 +74,10 @@ def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
             missing = str(error)
     nothing = np.dtype(np.float32)  # of types of JAX's own, such as a key's, there is no other
     return [Value(var.aval.shape, nothing, missing=missing) for var in eqn.outvars]
+
+
+def _nothing(aval: Any) -> Value:
+    return Value.of(np.zeros([s if is_known(s) else 1 for s in aval.shape], aval.dtype))
 
 
 def _folded(inputs: list[Value], eqn: Any) -> list[Value]:
@@ -98,10 +105,9 @@ def _unrolled(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
         ]
     results: list[list[Value]] = []
     order = range(length)[::-1] if params["reverse"] else range(length)
-    slices = eqn.invars[len(fixed) + len(carry) :]
     for number in order:
-        own = [_row(graph, x, number) for x, _ in zip(rows, slices, strict=True)]
-        *outputs, = convert(graph, body, [*fixed, *carry, *own])
+        own = [_row(graph, x, number) for x in rows]
+        outputs = convert(graph, body, [*fixed, *carry, *own])
         carry, made = outputs[:count], outputs[count:]
         results.append(made)
     if params["reverse"]:
@@ -129,8 +135,3 @@ def _row(graph: Graph, x: Value, number: int) -> Value:
 def _stack(graph: Graph, values: Sequence[Value]) -> Value:
     broken = next((value for value in values if value.missing), None)
     return broken or shapes.stacked(graph, values, 0)
-
-
-def traced(function: Callable[..., Any], *arguments: Any) -> ClosedJaxpr:
-    """Trace a function of arrays or their shapes."""
-    return jax.make_jaxpr(function)(*arguments)

@@ -34,7 +34,12 @@ def common_shape(*shapes: Shape) -> Shape:
     """Broadcast shapes as numpy does; their sides are known to fit."""
     rank = max(map(len, shapes))
     padded = [(1,) * (rank - len(shape)) + tuple(shape) for shape in shapes]
-    return tuple(next((s for s in sides if not is_one(s)), 1) for sides in zip(*padded, strict=True))
+    columns = zip(*padded, strict=True)
+    return tuple(next((size for size in sides if not is_one(size)), 1) for sides in columns)
+
+
+def _with_side(shape: Shape, axis: int, size: Size) -> Shape:
+    return (*shape[:axis], size, *shape[axis + 1 :])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,8 +146,7 @@ class Graph:
         if value.constant is not None and all(map(is_known, wanted)):
             return Value.of(np.broadcast_to(value.constant, wanted))
         # A side of 1 keeps what is there: only those that grow need a number while it runs.
-        grown = [1 if is_known(o) and not is_one(o) else s for o, s in zip(value.shape, wanted)]
-        grown = [1 if not is_known(o) else s for o, s in zip(value.shape, grown)]
+        grown = [s if is_one(o) else 1 for o, s in zip(value.shape, wanted, strict=True)]
         return self.add("Expand", [value, self.sides(tuple(grown))], wanted, value.dtype)
 
     def reshape(self, value: Value, shape: Shape) -> Value:
@@ -196,10 +200,10 @@ class Graph:
 
     def concatenate(self, values: Sequence[Value], axis: int) -> Value:
         """Join values, which are of one shape but for the axis, and whole along it."""
-        shape = common_shape(*(v.shape[:axis] + (1,) + v.shape[axis + 1 :] for v in values))
-        length = sum(v.shape[axis] for v in values)
-        parts = [self.full(v, shape[:axis] + (v.shape[axis],) + shape[axis + 1 :]) for v in values]
-        shape = shape[:axis] + (length,) + shape[axis + 1 :]
+        values = [value for value in values if value.shape[axis] != 0] or values[:1]
+        shape = common_shape(*(_with_side(v.shape, axis, 1) for v in values))
+        parts = [self.full(v, _with_side(shape, axis, v.shape[axis])) for v in values]
+        shape = _with_side(shape, axis, sum(v.shape[axis] for v in values))
         if all(part.constant is not None for part in parts):
             return Value.of(np.concatenate([part.constant for part in parts], axis))  # type: ignore
         return self.add("Concat", parts, shape, parts[0].dtype, axis=axis)

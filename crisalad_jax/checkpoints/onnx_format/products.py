@@ -50,9 +50,7 @@ def _count(sides: Sequence[Any]) -> Any:
 
 @converts("conv_general_dilated")
 def _convolution(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    x, kernel = (
-        graph.full(x, var.aval.shape) for x, var in zip(inputs, eqn.invars, strict=True)
-    )
+    x, kernel = (graph.full(x, var.aval.shape) for x, var in zip(inputs, eqn.invars, strict=True))
     params, order = eqn.params, eqn.params["dimension_numbers"]
     if set(params["lhs_dilation"]) != {1} or params["batch_group_count"] != 1:
         raise Unsupported("conv_general_dilated between pixels, or in groups of images")
