@@ -15,12 +15,11 @@ import jaxtyping
 import numpy as np
 import onnx
 import onnxruntime
-import openvino
 import pytest
 from jax import export
 
 from crisalad_jax.checkpoints import export as exports
-from crisalad_jax.checkpoints.engines import load_program
+from crisalad_jax.checkpoints.engines import import_openvino, load_program
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.onnx_format.program import write_onnx
 from crisalad_jax.nn.aggregators.boq import BoqConfig
@@ -83,6 +82,7 @@ def test_openvino_gives_our_descriptors_for_any_number_of_images(
     manifest = write_export(tmp_path / "out", params, MODEL, ExportConfig(format="openvino"))
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["describe.bin", "describe.xml", "manifest.json"]
+    openvino = import_openvino()
     model = openvino.Core().read_model(tmp_path / "out" / "describe.xml")
     precision = {"INFERENCE_PRECISION_HINT": "f32"}
     compiled = openvino.Core().compile_model(model, "CPU", precision)
