@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from crisalad_jax.data.video import spelled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
@@ -95,7 +96,7 @@ def _read_table(path: pathlib.Path, *, must: bool) -> ImageTable:
             header = rows.fieldnames = [name.strip() for name in rows.fieldnames or []]
             axes = _axes(path, header, must=must)
             for row in rows:
-                where, name = f"{path}: line {rows.line_num}", row["name"]
+                where, name = f"{path}: line {rows.line_num}", spelled(row["name"] or "")
                 if None in row:
                     raise InputError(
                         f"{where}: found more fields than the header's {len(header)}, expected as "

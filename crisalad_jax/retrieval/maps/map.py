@@ -26,6 +26,8 @@ from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
     open_approximate,
+    stale_kind,
+    tell_stale,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.file_store import FileStore
@@ -119,6 +121,8 @@ class Map:
         self.components = read_components(folder, head)
         """The components that shorten descriptors, and those of queries; None is none."""
         self._approximate: Approximate | None = None
+        self._tells_stale = True
+        """Whether the next search that is not asked to be exact tells why it is."""
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
@@ -275,6 +279,7 @@ class Map:
 
         Search is exact, by inner product; of equal similarities the earlier image stands first.
         A map with an approximate search finds nearly all of them. Their similarities are exact.
+        A note tells, once, of an approximate search that is not of all images, and is not used.
 
         Args:
             queries: unit descriptors, of the map's model, shortened by its `components`.
@@ -293,7 +298,20 @@ class Map:
         k = min(k, len(self))
         if self._approximate is not None and isinstance(self._store, FileStore) and not exact:
             return self._approximate.search(self._store, queries, k, len(self))
+        if self._tells_stale and not exact:
+            tell_stale(self.folder, self._segments)
+            self._tells_stale = False
         return self._store.search(queries, k, len(self))
+
+    @property
+    def search_kind(self) -> str:
+        """How `search` searches: "exact", "hnsw" or "ivf-pq"."""
+        return "exact" if self._approximate is None else self._approximate.kind
+
+    @property
+    def stale_search(self) -> str | None:
+        """Kind of an approximate search that is not used, as it is of fewer or other images."""
+        return stale_kind(self.folder, self._segments) if self._approximate is None else None
 
     def shorten(self, descriptors: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n short"]:
         """Shorten a model's descriptors by the map's `components`; without any they stay."""
@@ -504,7 +522,8 @@ class Map:
             "resize": description.config.images_in_words,
             "grouping": description.grouping,
             "store": description.store,
-            "search": "exact" if self._approximate is None else self._approximate.kind,
+            "search": self.search_kind,
+            "stale_search": self.stale_search or "none",
             "components": description.pca or "none",
             "model": description.model,
             "weights": description.weights,
