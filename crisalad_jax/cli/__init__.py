@@ -37,7 +37,7 @@ _COMMANDS = {
     "query": "Ask a map where images were taken.",
     "serve": "Answer over HTTP, and in a browser, where photographs were taken.",
     "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
-    "export": "Write a model as a StableHLO program that needs nothing of this package.",
+    "export": "Write a model as a program that needs nothing of this package.",
     "pca": "Fit principal components to descriptors, for shorter ones.",
     "compile-check": "Compile for GPUs and TPUs that need not be here, and table memory and work.",
     "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
