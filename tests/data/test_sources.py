@@ -153,7 +153,7 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
         ("a.csv", "file,lat,lon\n", "found columns file, lat, lon, expected one called name"),
         ("a.csv", "name\n", "a.csv: found no image, expected a path a line"),
         ("a.csv", "name,year\n,1\n", "line 2: found no name, expected an image's"),
-        ("a.csv", "name,lat,lon\n{run}/left/0.png,1,5,2,5\n", "line 2: found more fields than"),
+        ("a.csv", "name,lat,lon\n{run}/left/0.png,1,5,2,5\n", "line 2: found 5 fields, expected 3"),
         ("a.csv", "name;lat;lon\n{run}/left/0.png;1.000,5;2\n", "expected two finite numbers"),
         ("a.csv", "name,lat,lon\n{run}/left/0.png,1,\n", "line 2: .*expected two finite numbers"),
         ("a.csv", "name,x,x,y\n", "found the column x twice, expected it once"),
