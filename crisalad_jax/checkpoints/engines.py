@@ -1,6 +1,8 @@
 """Engines that run exported programs: onnxruntime and OpenVINO. Nothing here needs jax."""
 
+import importlib
 import pathlib
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -16,6 +18,7 @@ Program = Callable[[np.ndarray], np.ndarray]
 """A loaded program: images to descriptors."""
 IMAGES, DESCRIPTORS = "images", "descriptors"
 """Names of a program's input and output."""
+_TOOLS = "openvino.tools.ovc"
 
 
 def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
@@ -31,9 +34,20 @@ def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
     return lambda images: np.asarray(session.run([DESCRIPTORS], {IMAGES: images})[0])
 
 
-def _openvino(path: pathlib.Path, precision: Precision) -> Program:
-    import openvino
+def import_openvino() -> Any:
+    """Import OpenVINO without its tools, whose import takes time, and tells its makers of it."""
+    is_first = "openvino" not in sys.modules
+    if is_first:
+        sys.modules[_TOOLS] = None  # type: ignore[assignment]
+    try:
+        return importlib.import_module("openvino")
+    finally:
+        if is_first:
+            del sys.modules[_TOOLS]
 
+
+def _openvino(path: pathlib.Path, precision: Precision) -> Program:
+    openvino = import_openvino()
     # Left to itself it takes fewer bits where the processor has units for them.
     hint = {"float32": "f32", "bfloat16": "bf16"}[precision]
     compiled = openvino.Core().compile_model(path, "CPU", {"INFERENCE_PRECISION_HINT": hint})
@@ -81,9 +95,9 @@ def convert_to_openvino(program: pathlib.Path, out: pathlib.Path) -> None:
         InputError: OpenVINO is not installed.
     """
     try:
-        import openvino
+        openvino = import_openvino()
     except ModuleNotFoundError as error:
         raise InputError(missing_extra(error, "format openvino")) from error
-    model: Any = openvino.convert_model(program)
+    model = openvino.Core().read_model(program)
     # By default the weights lose half of their bits.
     openvino.save_model(model, out, compress_to_fp16=False)

@@ -31,13 +31,12 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Images, check_params, describe, self_mask
-from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
 from crisalad_jax.utils.pytree import named_leaves
-from crisalad_jax.utils.target import PORTABLE, lowering_for
+from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
 FORMAT = "crisalad-jax export 1"
 PROGRAM, WEIGHTS, MANIFEST = "describe.jax_export", "weights.safetensors", "manifest.json"
@@ -281,9 +280,9 @@ def _write_onnx(
         from crisalad_jax.checkpoints.onnx_format.program import OPSET, write_onnx
     except ModuleNotFoundError as error:
         raise InputError(missing_extra(error, f"format {how.format}")) from error
-    run, weights, images = _program(params, _in_log_domain(config), how)
+    run, weights, images = _program(params, config, how)
     is_onnx = how.format == "onnx"
-    with lowering_for(PORTABLE):
+    with lowering_for(STRAIGHT):
         descriptors = jax.eval_shape(run, weights, images)
         write_onnx(
             folder / ONNX,
@@ -319,21 +318,6 @@ def _write_onnx(
         "opset": OPSET,
         "checked": {"engine": engine, "largest_difference": difference},
     }
-
-
-def _in_log_domain(config: Any) -> Any:
-    """Return a configuration with all transport in the log domain, which needs no branches.
-
-    The result is the same: the other domain is for speed, and left where it is not exact.
-    """
-    if isinstance(config, SinkhornConfig):
-        return dataclasses.replace(config, domain="log")
-    if not dataclasses.is_dataclass(config) or isinstance(config, type):
-        return config
-    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    changed = {name: _in_log_domain(value) for name, value in values.items()}
-    changed = {name: value for name, value in changed.items() if value is not values[name]}
-    return dataclasses.replace(config, **changed) if changed else config
 
 
 def _difference(

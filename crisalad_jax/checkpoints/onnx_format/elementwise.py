@@ -103,7 +103,8 @@ def _square(graph: Graph, inputs: Sequence[Value], shape: Shape, dtype: Any) -> 
 
 @elementwise("rsqrt")
 def _rsqrt(graph: Graph, inputs: Sequence[Value], shape: Shape, dtype: Any) -> Value:
-    return graph.add("Reciprocal", [graph.add("Sqrt", inputs, shape, dtype)], shape, dtype)
+    one = Value.of(np.array(1, dtype))
+    return graph.add("Div", [one, graph.add("Sqrt", inputs, shape, dtype)], shape, dtype)
 
 
 @elementwise("integer_pow")

@@ -38,7 +38,7 @@ def _reduce(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 @converts("reduce_and", "reduce_or")
 def _logic(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     name = {"reduce_and": "reduce_min", "reduce_or": "reduce_max"}[eqn.primitive.name]
-    x = graph.cast(inputs[0], np.int32)
+    x = graph.cast(inputs[0], np.float32)  # which TensorRT takes, unlike whole numbers
     return [graph.cast(_extreme(graph, x, name, eqn.params["axes"]), np.bool_)]
 
 
