@@ -14,7 +14,6 @@ from crisalad_jax.data.video import frame_time, name_frame
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.chunks import check_all_rows
-from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
     check_suffix,
@@ -22,7 +21,7 @@ from crisalad_jax.retrieval.descriptor_files import (
     targets,
     write_descriptors,
 )
-from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.sets import (

@@ -1,41 +1,41 @@
-"""Images described a second, beside the same model in torch, in one run.
+"""Images described a second, beside every engine that a user would pick instead, in one run.
 
     python scripts/bench/bench_describe.py [--out docs/performance] [--page docs/performance.md]
-        [--presets b14 megaloc ...] [--sizes 224x224 ...] [--batches 8 16] [--dtype bfloat16]
+        [--presets b14 megaloc ...] [--sizes 224x224 ...] [--batches 1 8 16]
+        [--dtypes float32 bfloat16] [--keep]
 
-The other side is the reference of the parity checks, with the same random weights. Needs torch (the
-`dev` extra). On a GPU if both jax and torch find one. Before anything is timed, descriptors are
-checked to be equal to rounding. `timing.py` says how contenders are timed.
+The others are torch, eager and through torch.compile, ONNX Runtime and OpenVINO (`engines.py`).
+Torch's model is the reference of the parity checks as users would write it (`usual.py`), with the
+same random weights. Needs torch (the `dev` extra) and the `bench` extra. On a GPU torch alone is
+the other side, if both it and jax find one. Before anything is timed, descriptors are checked to be
+equal to rounding. `timing.py` says how contenders are timed.
 
-Both get images that are normalised. "over devices" is nearly how the command line runs it: the CPU
-made into a device for each core, the images spread over them. There programs are kept in the
-compile cache besides, for which large ones do without oneDNN's products.
+All get images that are normalised. "over devices" is nearly how the command line runs it: the CPU
+made into a device for each core, the images spread over them. A single image has one device. There
+programs are kept in the compile cache besides, for which large ones do without oneDNN's products.
 
 Memory is what a call needs at once beyond parameters and images: of jax what the compiled program
-sets aside and its output, of torch the peak of what it allocates. The share of the machine is the
-model's operations (two a multiply-accumulate of `crisalad info`) a second over those of the better
-library's product of two square matrices.
+sets aside and its output, of torch the peak of what it allocates; the others do not tell. The share
+of the machine is the model's operations (two a multiply-accumulate of `crisalad info`) a second
+over those of the fastest product of matrices that any of the engines reaches.
+
+All races take an hour and more. With `--keep` those that an earlier run left in the folder, on the
+same machine with the same versions, stay in the tables, so that it can be done in parts.
 """
 
 import argparse
 import dataclasses
 import itertools
+import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from tables import Study, Table, bars, count, flags, leave, read
-from timing import (
-    measured,
-    megabytes,
-    product_rate,
-    race,
-    ratio,
-    times,
-    torch_memory,
-    wait,
-)
+from engines import OPENVINO, ORT, packages, peers, product_rate
+from tables import Study, Table, bars, count, files_of, flags, leave, read
+from timing import Timed, machine, megabytes, race, ratio, times, torch_memory, wait
+from usual import as_users_write_it, narrowed
 
 # After timing, which says how many devices there are.
 import jax  # isort: skip
@@ -66,6 +66,12 @@ MODELS: Mapping[str, ModelConfig] = {
         aggregator=CosPlaceConfig(dim=2048),
         cross_image=CrossImageConfig(layers=0),
     ),
+    "resnet50": ModelConfig(
+        image_size=(224, 224),
+        backbone=ResNetConfig(),
+        aggregator=CosPlaceConfig(dim=2048),
+        cross_image=CrossImageConfig(layers=0),
+    ),
     "megaloc": ModelConfig(
         image_size=(322, 322),
         backbone=ViTConfig(adapter=AdapterConfig(kind="none")),
@@ -74,22 +80,29 @@ MODELS: Mapping[str, ModelConfig] = {
         projection=ProjectionConfig(dim=8448),
     ),
 }
-"""The sizes of CriSALAD, and two published models as their files have them."""
+"""The sizes of CriSALAD, two published models as their files have them, and one of them smaller."""
 TORCHES = ("torch eager", "torch.compile")
 OURS = ("ours", "ours, over devices")
+CONTENDERS = (*TORCHES, ORT, OPENVINO, *OURS)
+"""In the order of the tables' columns."""
+DRAWN = 8
+"""Images of the races that the picture shows."""
 
 
 class Contender(NamedTuple):
     name: str
     call: Callable[[], Any]
-    memory: Callable[[], int]
+    memory: Callable[[], int | None]
+    """Bytes; None where an engine does not tell."""
     program: Callable[[], str] = str
     """As XLA compiled it: of torch's, nothing."""
     devices: int = 1
+    ready: float = 0.0
+    """Seconds that it took to be made, as a part of the first call."""
 
 
 class Sides(NamedTuple):
-    """The same model and images for both libraries."""
+    """The same model and images for both libraries. Torch's is as users write it."""
 
     theirs: TorchCrisalad
     ours: Crisalad
@@ -110,7 +123,7 @@ def sides(config: ModelConfig, name: str, batch: int, dtype: str) -> Sides:
     images = np.random.default_rng(0).normal(size=(batch, *config.image_size, 3)).astype(np.float32)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     theirs = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous().to(device)
-    return Sides(model.to(device), ours, model.config, images, theirs)
+    return Sides(as_users_write_it(model).to(device), ours, model.config, images, theirs)
 
 
 def by_torch(both: Sides, compiled: bool) -> Contender:
@@ -143,6 +156,13 @@ def by_us(both: Sides, spread: bool) -> Contender:
     return Contender(OURS[spread], call, memory, lambda: compiled().as_text(), count)
 
 
+def by_engines(both: Sides, dtype: str) -> list[Contender]:
+    found = peers(both.theirs, both.theirs_images, dtype)
+    return [
+        Contender(name, peer.run, lambda: None, ready=peer.seconds) for name, peer in found.items()
+    ]
+
+
 def seconds(call: Callable[[], Any]) -> float:
     started = time.perf_counter()
     call()
@@ -165,17 +185,12 @@ def check(contenders: Sequence[Contender], tolerance: float) -> None:
             raise RuntimeError(f"{one.name}: differs from {contenders[0].name} by {off:.1e}")
 
 
-HEADER = (
-    *("model", "images", "contender", "times faster", "share of the machine"),
-    *("first call, s", "MB"),
-)
-
-
 class Case(NamedTuple):
     """One race."""
 
     title: str
     batch: int
+    dtype: str
     contenders: Sequence[Contender]
     first: dict[str, float]
     """Seconds of each one's first call, compiling included."""
@@ -183,49 +198,153 @@ class Case(NamedTuple):
     """Of a call."""
 
 
+Value = dict[str, Any]
+"""What is kept of a race's contender: see `measure`."""
+
+
+def measure(case: Case, rate: float, where: str, arguments: argparse.Namespace) -> list[Value]:
+    """Run a race on the machine `where`, which does `rate` operations a second at best."""
+    calls = {one.name: one.call for one in case.contenders}
+    timed = race(calls, arguments.rounds, arguments.calls)
+    return [
+        {
+            "model": case.title,
+            "batch": case.batch,
+            "dtype": case.dtype,
+            "machine": where,
+            "contender": one.name,
+            "ms": timed[one.name].rounds,
+            "share of the machine": 1e3 * case.operations / timed[one.name].median / rate,
+            "first call": case.first[one.name],
+            "memory": one.memory(),
+        }
+        for one in case.contenders
+    ]
+
+
+def races(values: Iterable[Value]) -> list[list[Value]]:
+    """The contenders of each race."""
+    found: dict[tuple[Any, ...], list[Value]] = {}
+    for value in values:
+        found.setdefault((value["model"], value["batch"], value["dtype"]), []).append(value)
+    return list(found.values())
+
+
+def kept(old: Iterable[Value], new: Sequence[Value]) -> list[Value]:
+    """Those of an earlier run whose races are not among the new ones, of the same machine."""
+    again = {(value["model"], value["batch"], value["dtype"]) for value in new}
+    where = {value["machine"] for value in new}
+    return [
+        value
+        for value in old
+        if value.get("machine") in where
+        and (value["model"], value["batch"], value["dtype"]) not in again
+    ]
+
+
+def per_second(value: Value) -> tuple[float, float, float]:
+    """Images a second: by the median of the rounds, least, most."""
+    found = [1e3 * value["batch"] / ms for ms in value["ms"]]
+    return 1e3 * value["batch"] / Timed(value["ms"]).median, min(found), max(found)
+
+
+def faster(values: Sequence[Value]) -> dict[str, tuple[float, float, float]]:
+    """How many times as fast as the fastest engine that is not ours each contender is, by name."""
+    timed = {value["contender"]: Timed(value["ms"]) for value in values}
+    best = min((name for name in timed if name not in OURS), key=lambda name: timed[name].median)
+    return {name: ratio(timed[best], one) for name, one in timed.items()}
+
+
+def speeds(values: Sequence[Value], caption: str) -> Table:
+    columns = columns_of(values)
+    rows = []
+    for one in races(values):
+        found = {value["contender"]: value for value in one}
+        ours = min(set(OURS) & set(found), key=lambda name: Timed(found[name]["ms"]).median)
+        cells = (times(per_second(found[name])) if name in found else "" for name in columns)
+        share = f"{100 * found[ours]['share of the machine']:.0f} %"
+        rows.append((*labels(one), *cells, times(faster(one)[ours]), share))
+    header = (*LABELS, *columns, "ours: times the fastest other", "ours: of the machine")
+    return Table(header, rows, caption, len(LABELS))
+
+
+def costs(values: Sequence[Value], caption: str) -> Table:
+    columns = columns_of(values)
+    rows = []
+    for one in races(values):
+        found = {value["contender"]: value for value in one}
+        cells = (cost(found[name]) if name in found else "" for name in columns)
+        rows.append((*labels(one), *cells))
+    return Table((*LABELS, *columns), rows, caption, len(LABELS))
+
+
+def columns_of(values: Sequence[Value]) -> list[str]:
+    there = {value["contender"] for value in values}
+    return [name for name in CONTENDERS if name in there]
+
+
+LABELS = ("model", "images", "type")
+
+
+def labels(values: Sequence[Value]) -> tuple[str, ...]:
+    one = values[0]
+    return one["model"], f"{one['batch']}", one["dtype"]
+
+
+def cost(value: Value) -> str:
+    memory = "" if value["memory"] is None else f", {megabytes(value['memory'])} MB"
+    return f"{value['first call']:.1f} s{memory}"
+
+
 def compare(name: str, what: str, cases: Iterable[Case], arguments: argparse.Namespace) -> None:
-    """Run the races, one after the other as they are made, and leave table, numbers and picture."""
-    rate = product_rate(arguments.dtype)
-    values, rows = [], []
+    """Run the races one after the other as they are made; leave tables, numbers and picture.
+
+    They are left after every race: what is done stays if the rest is stopped.
+    """
+    where = machine(*packages())
+    path = files_of(name, arguments.out)[1]
+    old = json.loads(path.read_text()) if arguments.keep and path.exists() else []
+    rates = {dtype: product_rate(dtype) for dtype in arguments.dtypes}
+    new: list[Value] = []
     for case in cases:
-        calls = {one.name: one.call for one in case.contenders}
-        timed = race(calls, arguments.rounds, arguments.calls)
-        best = min(TORCHES, key=lambda name: timed[name].median)
-        for one in case.contenders:
-            faster = ratio(timed[best], timed[one.name])
-            per_second = 1e3 / timed[one.name].median
-            share, memory = case.operations * per_second / rate, one.memory()
-            values.append(
-                {
-                    "model": case.title,
-                    "batch": case.batch,
-                    "contender": one.name,
-                    "ms": timed[one.name].rounds,
-                    "images per second": case.batch * per_second,
-                    "faster than the better torch": faster,
-                    "share of the machine": share,
-                    "first call": case.first[one.name],
-                    "memory": memory,
-                }
-            )
-            speed = times(faster)
-            if torch.cuda.is_available():
-                speed += f", {case.batch * per_second:.0f} images/s"
-            first = f"{case.first[one.name]:.1f}"
-            cells = (speed, f"{100 * share:.0f} %", first, megabytes(memory))
-            rows.append((case.title, f"{case.batch}", one.name, *cells))
+        new += measure(case, rates[case.dtype], where, arguments)
         torch.compiler.reset()
-    caption = (
-        f"{what}, {arguments.dtype}, {measured(arguments.rounds)}. "
-        "Times faster: than the better of torch eager and torch.compile."
-    )
+        report(name, what, in_order([*kept(old, new), *new]), arguments)
+
+
+def report(name: str, what: str, values: Sequence[Value], arguments: argparse.Namespace) -> None:
+    rounds = min(len(value["ms"]) for value in values)
+    where = values[0]["machine"]
+    drawn = [
+        {**value, "faster": faster(one)[value["contender"]]}
+        for one in races(values)
+        for value in one
+        if value["batch"] == DRAWN
+    ]
     figure = bars(
-        values,
-        lambda value: f"{value['model']}, {value['batch']} images",
-        "faster than the better torch",
-        "times the better torch's speed",
+        drawn,
+        lambda value: f"{value['model']}, {value['dtype']}",
+        "faster",
+        f"{DRAWN} images: times the fastest other",
     )
-    leave(name, Study(Table(HEADER, rows, caption, 3), values, figure), arguments)
+    caption = f"{what}: images a second. {where}; medians and ranges of {rounds} rounds or more."
+    study = Study(speeds(values, caption), values, figure if drawn else None)
+    leave(name, study, arguments)
+    caption = f"{what}: the first call, compiling included, and memory. {where}."
+    names = ("model", "batch", "dtype", "contender", "first call", "memory")
+    numbers = [{name: value[name] for name in names} for value in values]
+    leave(f"{name}_costs", Study(costs(values, caption), numbers), arguments)
+
+
+def in_order(values: Sequence[Value]) -> list[Value]:
+    """By model as `MODELS` has them, size, type and batch; contenders as they were."""
+    models = list(MODELS)
+
+    def place(value: Value) -> tuple[int, str, bool, int]:
+        preset, _, size = value["model"].partition(" at ")
+        return models.index(preset), size, value["dtype"] != "float32", value["batch"]
+
+    return sorted(values, key=place)
 
 
 def title(preset: str, config: ModelConfig) -> str:
@@ -248,6 +367,7 @@ def read_race(
     name: str,
     presets: Sequence[str] = ("tiny", "s14", "b14"),
     batches: Sequence[int] = (8, 16),
+    dtypes: Sequence[str] = ("float32",),
 ) -> argparse.Namespace:
     """The flags of a race, whose presets can have the sizes."""
     parser = flags(description, "docs/performance")
@@ -256,10 +376,11 @@ def read_race(
         "--sizes", type=image_size, nargs="+", default=[None], help="such as 322x322"
     )
     parser.add_argument("--batches", type=count, nargs="+", default=batches)
-    parser.add_argument("--dtype", default="float32", choices=list(TOLERANCES))
+    parser.add_argument("--dtypes", nargs="+", default=dtypes, choices=list(TOLERANCES))
+    parser.add_argument("--keep", action="store_true", help="also show races of an earlier run")
     parser.add_argument("--rounds", type=count, default=5)
     parser.add_argument("--calls", type=count, default=2)
-    arguments = read(parser, name)
+    arguments = read(parser, name, f"{name}_costs")
     try:
         for preset, size in itertools.product(arguments.presets, arguments.sizes):
             at_size(MODELS[preset], size)
@@ -269,22 +390,25 @@ def read_race(
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:
-    for preset, size, batch in itertools.product(
-        arguments.presets, arguments.sizes, arguments.batches
+    for preset, size, dtype, batch in itertools.product(
+        arguments.presets, arguments.sizes, arguments.dtypes, arguments.batches
     ):
         config = at_size(MODELS[preset], size)
-        both = sides(config, preset, batch, arguments.dtype)
-        contenders = [by_torch(both, False), by_torch(both, True), by_us(both, False)]
-        if len(jax.local_devices()) > 1:
+        both = sides(config, preset, batch, dtype)
+        contenders = by_engines(both, dtype)
+        narrowed(both.theirs)
+        contenders += [by_torch(both, False), by_torch(both, True), by_us(both, False)]
+        if devices_for(batch).mesh.size > 1:
             contenders.append(by_us(both, True))
-        first = {one.name: seconds(one.call) for one in contenders}
-        check(contenders, TOLERANCES[arguments.dtype])
+        first = {one.name: one.ready + seconds(one.call) for one in contenders}
+        check(contenders, TOLERANCES[dtype])
         operations = 2 * batch * sum(cost.macs for cost in part_costs(config, images=batch))
-        yield Case(title(preset, config), batch, contenders, first, operations)
+        yield Case(title(preset, config), batch, dtype, contenders, first, operations)
 
 
 def main() -> None:
-    arguments = read_race(__doc__ or "", "bench_describe")
+    presets, types = ("tiny", "s14", "b14", "resnet50"), ("float32", "bfloat16")
+    arguments = read_race(__doc__ or "", "bench_describe", presets, (1, 8, 16), types)
     compare("bench_describe", "Descriptors of a batch", cases(arguments), arguments)
 
 

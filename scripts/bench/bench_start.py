@@ -38,11 +38,12 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 started = time.perf_counter()
 from crisalad_jax.nn.config import PRESETS
 from parity.reference.model import Crisalad
+from usual import as_users_write_it
 ours = time.perf_counter() - started
 weights, image, out, preset, compiled = sys.argv[1:]
 config = PRESETS[preset]
 with torch.device("meta"):
-    model = Crisalad(config).eval()
+    model = as_users_write_it(Crisalad(config).eval())
 model.load_state_dict(torch.load(weights, mmap=True), assign=True)
 model = model.to(device)
 pixels = cv2.resize(cv2.imread(image)[..., ::-1], config.image_size[::-1]) / 255.0

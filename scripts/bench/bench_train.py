@@ -1,7 +1,7 @@
 """Images trained on a second, beside the same step in torch, in one run.
 
     python scripts/bench/bench_train.py [--out docs/performance] [--page docs/performance.md]
-        [--presets b14 ...] [--batches 8 16] [--dtype bfloat16]
+        [--presets b14 ...] [--batches 8 16] [--dtypes float32 bfloat16] [--keep]
 
 The step is that of the preset's recipe: the paper's (frozen backbone; adapters and head train), and
 for `tiny` all of the model. It is the whole of it: forward with dropout, mining, loss, backward,
@@ -138,13 +138,13 @@ def operations(config: TrainConfig, batch: int) -> float:
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:
-    for preset, size, batch in itertools.product(
-        arguments.presets, arguments.sizes, arguments.batches
+    for preset, size, dtype, batch in itertools.product(
+        arguments.presets, arguments.sizes, arguments.dtypes, arguments.batches
     ):
         config = recipe(preset)
         config = dataclasses.replace(config, model=at_size(config.model, size))
-        both = sides(config.model, preset, batch, arguments.dtype)
-        check(both, config, LOSS_TOLERANCES[arguments.dtype])
+        both = sides(config.model, preset, batch, dtype)
+        check(both, config, LOSS_TOLERANCES[dtype])
         contenders = [
             torch_step(both, config, False),
             torch_step(both, config, True),
@@ -153,7 +153,8 @@ def cases(arguments: argparse.Namespace) -> Iterator[Case]:
         if len(jax.local_devices()) > 1 and shards_batch(config.trainable):
             contenders.append(our_step(both, config, True))
         first = {one.name: seconds(one.call) for one in contenders}
-        yield Case(title(preset, config.model), batch, contenders, first, operations(config, batch))
+        name, count = title(preset, config.model), operations(config, batch)
+        yield Case(name, batch, dtype, contenders, first, count)
 
 
 def main() -> None:

@@ -7,6 +7,7 @@ again, and `calls` at least, of calls that do. A ratio is that of two medians of
 the ratios the median over rounds is shown, and the range. All use as many threads as they like.
 """
 
+import importlib.metadata
 import itertools
 import os
 import pathlib
@@ -24,7 +25,6 @@ os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
 
 import jax
-import jax.numpy as jnp
 import torch
 
 # First calls are from nothing, whatever ran before.
@@ -36,8 +36,6 @@ if torch.cuda.is_available():
     jax.config.update("jax_default_matmul_precision", "highest")
 
 PAUSE = 0.25
-GEMM = 4096
-"""Side of the square matrices whose product tells the machine's rate."""
 
 
 class Timed(NamedTuple):
@@ -113,26 +111,8 @@ def measured(rounds: int) -> str:
     return f"{machine()}; medians and ranges of {rounds} rounds"
 
 
-def product_rate(dtype: str) -> float:
-    """Floating-point operations a second of the better library's square matrix product."""
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    a = torch.randn(GEMM, GEMM, device=device).to(getattr(torch, dtype))
-    b = jnp.asarray(a.cpu().float().numpy(), dtype)
-    product = jax.jit(jnp.matmul)
-
-    def by_torch() -> None:
-        torch.matmul(a, a)
-        wait()
-
-    def by_jax() -> None:
-        jax.block_until_ready(product(b, b))
-
-    timed = race({"torch": by_torch, "jax": by_jax}, rounds=3, calls=3)
-    return 2 * GEMM**3 / min(1e-3 * min(one.rounds) for one in timed.values())
-
-
-def machine() -> str:
-    """What the figures were measured on."""
+def machine(*packages: str) -> str:
+    """What the figures were measured on, with the versions of jax, torch and more packages."""
     device = jax.devices()[0]
     name = device.device_kind
     if device.platform == "cpu":
@@ -140,4 +120,5 @@ def machine() -> str:
         lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
         models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
         name = f"{models[0] if models else 'CPU'}, {usable_cores()} cores"
-    return f"{name}, jax {jax.__version__}, torch {torch.__version__}"
+    versions = (f"{package} {importlib.metadata.version(package)}" for package in packages)
+    return ", ".join((name, f"jax {jax.__version__}", f"torch {torch.__version__}", *versions))

@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.notes import tell
