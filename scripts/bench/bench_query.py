@@ -1,0 +1,135 @@
+"""From a question to its answer: `crisalad query` with each runtime, beside a script of one's own.
+
+    python scripts/bench/bench_query.py [--out docs/performance] [--page docs/performance.md]
+        [--preset tiny b14] [--runtime jax onnxruntime openvino] [--rounds 5]
+
+Each is a program of its own that is asked where one photograph was taken, in a map of 64. What can
+be kept from one run to the next (compiled programs, exported models) was left there by a run
+before. The script is what a user would write to be quick: numpy, OpenCV and ONNX Runtime, with the
+exported model and the map's descriptors in a file of numpy's.
+"""
+
+import os
+import pathlib
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+
+import cv2
+import jax
+import numpy as np
+from tables import Study, Table, bars, count, flags, leave, read
+from timing import Timed, measured, ratio, times
+
+from crisalad_jax.checkpoints.export import ExportConfig, write_export
+from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.nn.model import init_crisalad
+
+SCRIPT = """
+import sys
+import cv2, numpy as np, onnxruntime
+program, rows, image = sys.argv[1:]
+session = onnxruntime.InferenceSession(program, providers=["CPUExecutionProvider"])
+_, height, width, _ = session.get_inputs()[0].shape
+pixels = cv2.resize(cv2.imread(image)[..., ::-1], (width, height), interpolation=cv2.INTER_AREA)
+(descriptor,) = session.run(None, {"images": pixels[None]})[0]
+similarities = np.load(rows, mmap_mode="r") @ descriptor
+print(np.argsort(-similarities)[:5], np.sort(-similarities)[:5])
+"""
+BY_HAND = "a script with ONNX Runtime"
+IMAGES = 64
+
+
+def write_photographs(folder: pathlib.Path) -> None:
+    """Make pictures of blurred noise, as large as a camera's."""
+    folder.mkdir()
+    generator = np.random.default_rng(0)
+    for number in range(IMAGES):
+        pixels = generator.integers(0, 256, (24, 32, 3), dtype=np.uint8)
+        large = cv2.resize(pixels, (640, 480), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / f"{number:03d}.jpg"), large)
+
+
+def run(command: list[str], cache: pathlib.Path) -> tuple[float, float]:
+    """Run a program; return its seconds by the clock and of the processor."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    started = time.perf_counter()
+    subprocess.run(
+        command,
+        env=environment | {"XDG_CACHE_HOME": str(cache)},
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    seconds, after = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def programs(
+    folder: pathlib.Path, preset: str, runtimes: list[str]
+) -> dict[str, Callable[[], tuple[float, float]]]:
+    """What asks once, by name, with all that is kept already there."""
+    config = PRESETS[preset]
+    photographs, weights, places = (folder / name for name in ("images", "w.safetensors", "map"))
+    write_photographs(photographs)
+    params = init_crisalad(jax.random.key(0), config)
+    save_weights(weights, params, config)
+    write_export(folder / "export", params, config, ExportConfig(format="onnx"))
+    crisalad, cache = [sys.executable, "-m", "crisalad_jax"], folder / "cache"
+    model = ["--weights", str(weights)]
+    shown = ["--images", str(photographs), "--out", str(places), "--quiet"]
+    run([*crisalad, "index", *model, *shown], cache)
+    rows = folder / "rows.npy"
+    np.save(rows, np.load(next((places / "segments").glob("*.npy"))))
+    image = str(photographs / "007.jpg")
+
+    def asking(runtime: str) -> Callable[[], tuple[float, float]]:
+        asked = [image, "--map", str(places), *model, "--runtime", runtime, "--quiet"]
+        return lambda: run([*crisalad, "query", *asked], cache)
+
+    by_hand = [sys.executable, "-c", SCRIPT, str(folder / "export/describe.onnx"), str(rows), image]
+    calls = {BY_HAND: lambda: run(by_hand, cache)}
+    calls |= {f"crisalad query, {runtime}": asking(runtime) for runtime in runtimes}
+    for call in calls.values():
+        call()
+    return calls
+
+
+def main() -> None:
+    parser = flags(__doc__ or "", "docs/performance")
+    parser.add_argument("--preset", nargs="+", default=["tiny", "b14"], choices=PRESETS)
+    engines = ["jax", "onnxruntime", "openvino"]
+    parser.add_argument("--runtime", nargs="+", default=engines, choices=engines)
+    parser.add_argument("--rounds", type=count, default=5)
+    arguments = read(parser, "bench_query")
+    values, rows = [], []
+    for preset in arguments.preset:
+        with tempfile.TemporaryDirectory(prefix="bench-query-") as folder:
+            calls = programs(pathlib.Path(folder), preset, arguments.runtime)
+            clock, processor = ({name: Timed([]) for name in calls} for _ in range(2))
+            for _ in range(arguments.rounds):
+                for name, call in calls.items():
+                    seconds, spent = call()
+                    clock[name].rounds.append(1e3 * seconds)
+                    processor[name].rounds.append(1e3 * spent)
+        for name, one in clock.items():
+            slower = ratio(one, clock[BY_HAND])
+            more = ratio(processor[name], processor[BY_HAND])
+            spent = {"ms": one.rounds, "processor_ms": processor[name].rounds}
+            values.append({"model": preset, "contender": name, **spent, "slower": slower})
+            rows.append((preset, name, times(slower), times(more)))
+    header = ("model", "program", "time over the script's", "processor's time over the script's")
+    caption = (
+        "From the start of a program to the answers to one photograph, what is kept being there: "
+        f"{measured(arguments.rounds)}."
+    )
+    figure = bars(values, lambda value: str(value["model"]), "slower", "time over the script's")
+    leave("bench_query", Study(Table(header, rows, caption, 2), values, figure), arguments)
+
+
+if __name__ == "__main__":
+    main()
