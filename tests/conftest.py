@@ -8,6 +8,7 @@ import dataclasses
 import importlib
 import os
 import pathlib
+import signal
 import sys
 import unittest.mock
 from collections.abc import Callable, Iterator
@@ -39,6 +40,11 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
+
+# A shell that runs the tests in the background has SIGINT ignored, and so would the commands that
+# they interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 MODEL = ModelConfig(
     image_size=(42, 56),
@@ -84,9 +90,10 @@ def write_video(
     step: int = 10,
     first: int = 0,
     colour: tuple[int, int, int] = (1, 1, 1),
+    rate: int = 10,
 ) -> pathlib.Path:
-    """A video of 10 flat frames a second; frame i has the level `step` * (first + i)."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    """A video of `rate` flat frames a second; frame i has the level `step` * (first + i)."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, (64, 48))
     assert writer.isOpened()
     for number in range(first, first + frames):
         writer.write(np.full((48, 64, 3), np.multiply(colour, step * number), np.uint8))

@@ -45,3 +45,9 @@ def test_the_command_line_starts_with_nothing():
 def test_pictures_need_no_jax():
     statement = f"import {PACKAGE}.data.images, {PACKAGE}.data.places, {PACKAGE}.data.benchmarks"
     assert loaded_after(statement, {"jax", "torch", "cv2", "scipy"}) == {"cv2"}
+
+
+def test_a_map_is_asked_without_jax():
+    """What describes by another runtime starts in a fraction of the time that JAX takes."""
+    statement = f"import {PACKAGE}.cli.query, {PACKAGE}.cli; {PACKAGE}.Map, {PACKAGE}.query"
+    assert loaded_after(statement, {"jax", "scipy", "faiss", "numba"}) == set()

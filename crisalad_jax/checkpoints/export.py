@@ -1,21 +1,30 @@
-"""Export a model as one StableHLO program, which runs without this package (`jax.export`).
+"""Export a model as one program that runs without this package: StableHLO, ONNX or OpenVINO's.
 
-An export is a folder. `describe.jax_export` is the program, and `manifest.json` describes its
-inputs and outputs. `weights.safetensors` lies beside them unless the program holds the weights.
+An export is a folder with the program, and `manifest.json` describes its inputs and outputs. The
+weights lie beside them unless the program holds them. StableHLO is of `jax.export`. ONNX is made by
+`onnx_format`, and OpenVINO converts that.
 """
 
 import contextlib
 import dataclasses
 import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import export
 from jaxtyping import Array, Float
 
+from crisalad_jax.checkpoints.engines import (
+    DESCRIPTORS,
+    IMAGES,
+    EngineName,
+    convert_to_openvino,
+    load_program,
+)
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import check_types, choose
 from crisalad_jax.config.io import to_plain
@@ -24,12 +33,22 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Images, check_params, describe, self_mask
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
 from crisalad_jax.utils.pytree import named_leaves
-from crisalad_jax.utils.target import PORTABLE, lowering_for
+from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
 FORMAT = "crisalad-jax export 1"
 PROGRAM, WEIGHTS, MANIFEST = "describe.jax_export", "weights.safetensors", "manifest.json"
+ONNX, ONNX_DATA = "describe.onnx", "describe.onnx.data"
+IR, IR_DATA = "describe.xml", "describe.bin"
+FORMATS = {
+    "stablehlo": "a program of JAX's, for several platforms",
+    "onnx": "a program of ONNX",
+    "openvino": "a program of OpenVINO",
+}
+TOLERANCE = 1e-5
+"""Largest difference of an exported program's descriptors from those of `describe`, of length 1."""
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 """Platforms that `jax.export` knows."""
 GROUPINGS = {
@@ -39,12 +58,14 @@ GROUPINGS = {
 _SOURCES = "jax_traceback_in_locations_limit"
 """JAX's setting: how many lines of source a program has beside each operation."""
 _LARGEST = 2**31
-"""Largest size of a program in bytes: a flatbuffer's offsets have 31 bits."""
+"""Largest size of a program in bytes: offsets of a flatbuffer and of a protobuf have 31 bits."""
+_PROBES = 3
+"""Images that a program of any number of images is checked with."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportConfig:
-    """The inputs and the platforms of an exported program.
+    """The format, the inputs and the platforms of an exported program.
 
     Example:
         >>> ExportConfig(platforms=("cpu",), batch_size=8).grouping
@@ -58,10 +79,24 @@ class ExportConfig:
     weights_inside: bool = False
     """Whether the program holds the weights as constants; else it takes them as an argument."""
     platforms: tuple[str, ...] = ("cpu", "cuda")
+    """Platforms of StableHLO; the other formats are for any that their engines run on."""
+    format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
+    """StableHLO, which JAX runs; ONNX, which most engines read; or OpenVINO's own."""
+    pixels: Literal["bytes", "floats"] | None = None
+    """8-bit pixels, which the program normalises, or floats that already are; None is what the
+    model resizes."""
 
     def __post_init__(self) -> None:
         """Check the values."""
         check_types(self)
+        choose("format", self.format, FORMATS)
+        if self.pixels is not None:
+            choose("pixels", self.pixels, dict.fromkeys(("bytes", "floats")))
+        if self.format == "openvino" and self.weights_inside:
+            raise InputError(
+                "weights inside: found with format openvino, which has them in a file beside its "
+                "program, expected format onnx or stablehlo"
+            )
         choose("grouping", self.grouping, GROUPINGS)
         if self.batch_size is not None and self.batch_size < 1:
             raise InputError(f"batch size: found {self.batch_size}, expected at least 1")
@@ -75,8 +110,9 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
     """Check that a model can be exported in this way, before the work of tracing it.
 
     Raises:
-        InputError: parameters of another configuration; weights inside of 2 GiB or more; or
-            transport that must converge.
+        InputError: parameters of another configuration; weights inside of 2 GiB or more; transport
+            that must converge; normalisation by neighbourhoods, and floats in; or products that are
+            not of float32, in another format than StableHLO.
     """
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
@@ -90,6 +126,16 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
         raise InputError(
             "SinkhornConfig.throw: found True, expected False: an exported program cannot "
             "stop with an error"
+        )
+    if how.pixels == "floats" and config.preprocessing.normalisation != "mean-deviation":
+        raise InputError(
+            f"pixels: found floats for a model whose normalisation is "
+            f"{config.preprocessing.normalisation}, expected bytes, which the program normalises"
+        )
+    if how.format != "stablehlo" and config.compute_dtype != "float32":
+        raise InputError(
+            f"compute dtype: found {config.compute_dtype} with format {how.format}, expected "
+            "float32: an engine chooses its own (docs/export.md)"
         )
 
 
@@ -105,10 +151,23 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
         InputError: as `check_exportable`.
     """
     check_exportable(params, config, how)
+    run, weights, images = _program(params, config, how)
+    with lowering_for(PORTABLE), _without_sources():
+        if how.weights_inside:
+            whole = jax.jit(lambda images: run(weights, images))
+            return export.export(whole, platforms=how.platforms)(images)
+        shapes = {n: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for n, leaf in weights.items()}
+        return export.export(jax.jit(run), platforms=how.platforms)(shapes, images)
+
+
+def _program(
+    params: Crisalad, config: ModelConfig, how: ExportConfig
+) -> tuple[Callable[..., Any], dict[str, Any], jax.ShapeDtypeStruct]:
+    """Return a function of weights and images, the weights by name, and the images' shape."""
     # A dictionary's leaves come in the order of its keys, not in that of the fields.
     weights, tree = named_leaves(params), jax.tree.structure(params)
 
-    def run(weights: dict[str, Array], images: Images) -> Float[Array, "image descriptor"]:
+    def run(weights: Mapping[str, Array], images: Images) -> Float[Array, "image descriptor"]:
         restored = jax.tree.unflatten(tree, [weights[name] for name in named_leaves(params)])
         mask = self_mask(images.shape[0]) if how.grouping == "single" else None
         return describe(restored, images, config, mask=mask)
@@ -116,14 +175,12 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     batch = how.batch_size
     if batch is None:
         (batch,) = export.symbolic_shape("batch")
-    dtype = jnp.uint8 if config.preprocessing.pixels == "bytes" else jnp.float32
-    images = jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
-    with lowering_for(PORTABLE), _without_sources():
-        if how.weights_inside:
-            whole = jax.jit(lambda images: run(weights, images))
-            return export.export(whole, platforms=how.platforms)(images)
-        shapes = {n: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for n, leaf in weights.items()}
-        return export.export(jax.jit(run), platforms=how.platforms)(shapes, images)
+    dtype = jnp.uint8 if _takes_bytes(config, how) else jnp.float32
+    return run, weights, jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
+
+
+def _takes_bytes(config: ModelConfig, how: ExportConfig) -> bool:
+    return (how.pixels or config.preprocessing.pixels) == "bytes"
 
 
 @contextlib.contextmanager
@@ -143,7 +200,10 @@ def write_export(
     config: ModelConfig,
     how: ExportConfig = ExportConfig(),
 ) -> dict[str, Any]:
-    """Write a model as a program for any platform into the new folder `out`, whole or not at all.
+    """Write a model as a program into the new folder `out`, whole or not at all.
+
+    A program in another format than StableHLO is run once, and its descriptors are compared with
+    those of `describe`.
 
     Args:
         out: the folder.
@@ -155,7 +215,9 @@ def write_export(
         The manifest, as manifest.json has it.
 
     Raises:
-        InputError: as `check_exportable`; or `out` is a file, or a folder that holds something.
+        InputError: as `check_exportable`; `out` is a file, or a folder that holds something; or, in
+            another format than StableHLO, an extra is missing, the model has an operation that the
+            format lacks, or the program's descriptors differ from those of `describe`.
 
     Example:
         >>> import jax
@@ -167,54 +229,134 @@ def write_export(
         [2, 576]
     """
     check_new_folder(out)
-    exported = export_model(params, config, how)
+    check_exportable(params, config, how)
     with atomic_folder(out) as folder:
-        (folder / PROGRAM).write_bytes(exported.serialize(vjp_order=0))
-        if not how.weights_inside:
-            save_weights(folder / WEIGHTS, params, config)
-        manifest = _manifest(folder, exported, params, config, how)
+        if how.format == "stablehlo":
+            manifest = _write_stablehlo(folder, params, config, how)
+        else:
+            manifest = _write_onnx(folder, params, config, how, os.fspath(out))
+        manifest |= {
+            "grouping": how.grouping,
+            "grouping_means": GROUPINGS[how.grouping],
+            "jax_version": jax.__version__,
+            "model_sha256": model_hash(params, config),
+            "model": to_plain(config),
+        }
         write_json(folder / MANIFEST, manifest)
     return manifest
 
 
-def _manifest(
-    folder: pathlib.Path,
-    exported: export.Exported,
+def _write_stablehlo(
+    folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig
+) -> dict[str, Any]:
+    """Write the files of `jax.export`, and return what the manifest says of them."""
+    exported = export_model(params, config, how)
+    (folder / PROGRAM).write_bytes(exported.serialize(vjp_order=0))
+    if not how.weights_inside:
+        save_weights(folder / WEIGHTS, params, config)
+    images, (descriptors,) = exported.in_avals[-1], exported.out_avals
+    called = "images" if how.weights_inside else "weights, images"
+    weights = None
+    if not how.weights_inside:
+        words = {"argument": "a dictionary of all arrays in the file by their names"}
+        weights = _file(folder / WEIGHTS) | words
+    return {
+        "format": FORMAT,
+        "program_format": how.format,
+        "call": f"jax.export.deserialize(program).call({called})",
+        "program": _file(folder / PROGRAM),
+        "weights": weights,
+        **_inputs_and_outputs(images, descriptors, config, how),
+        "platforms": list(exported.platforms),
+        "calling_convention_version": exported.calling_convention_version,
+    }
+
+
+def _write_onnx(
+    folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig, out: str
+) -> dict[str, Any]:
+    """Write the files of ONNX or OpenVINO, check them, and return what the manifest says."""
+    try:
+        from crisalad_jax.checkpoints.onnx_format.program import OPSET, write_onnx
+    except ModuleNotFoundError as error:
+        raise InputError(missing_extra(error, f"format {how.format}")) from error
+    run, weights, images = _program(params, config, how)
+    is_onnx = how.format == "onnx"
+    with lowering_for(STRAIGHT):
+        descriptors = jax.eval_shape(run, weights, images)
+        write_onnx(
+            folder / ONNX,
+            run,
+            weights,
+            images,
+            words=f"{IMAGES} to {DESCRIPTORS}; {GROUPINGS[how.grouping]}",
+            beside=not how.weights_inside,
+        )
+    if not is_onnx:
+        convert_to_openvino(folder / ONNX, folder / IR)
+        for name in (ONNX, ONNX_DATA):
+            (folder / name).unlink()
+    engine: EngineName = "onnxruntime" if is_onnx else "openvino"
+    program, beside = (ONNX, ONNX_DATA) if is_onnx else (IR, IR_DATA)
+    called = {
+        "onnx": f"onnxruntime.InferenceSession({ONNX!r}).run(None, {{{IMAGES!r}: images}})",
+        "openvino": f"openvino.Core().compile_model({IR!r}, 'CPU')(images)",
+    }
+    difference = _difference(folder / program, engine, params, config, how)
+    if not difference <= TOLERANCE:
+        raise InputError(
+            f"{out}: found descriptors of {engine} that differ from those of `describe` by "
+            f"{difference:.2g}, expected at most {TOLERANCE:g}: nothing was written"
+        )
+    return {
+        "format": FORMAT,
+        "program_format": how.format,
+        "call": called[how.format],
+        "program": _file(folder / program),
+        "weights": None if how.weights_inside else _file(folder / beside),
+        **_inputs_and_outputs(images, descriptors, config, how),
+        "opset": OPSET,
+        "checked": {"engine": engine, "largest_difference": difference},
+    }
+
+
+def _difference(
+    program: pathlib.Path,
+    engine: EngineName,
     params: Crisalad,
     config: ModelConfig,
     how: ExportConfig,
+) -> float:
+    """Run a program on images of noise, and compare it with `describe`."""
+    count = how.batch_size or _PROBES
+    images = np.random.default_rng(0).integers(0, 256, (count, *config.input_size, 3), np.uint8)
+    if not _takes_bytes(config, how):
+        mean, deviation = (
+            np.array(each, np.float32)
+            for each in (config.preprocessing.mean, config.preprocessing.deviation)
+        )
+        images = (images / np.float32(255) - mean) / deviation
+    found = load_program(engine, program)(images)
+    mask = self_mask(count) if how.grouping == "single" else None
+    expected = np.asarray(describe(params, images, config, mask=mask))
+    longest = np.linalg.norm(expected, axis=1).max()  # 1, unless a projection leaves it
+    return float(np.abs(found - expected).max() / longest)
+
+
+def _inputs_and_outputs(
+    images: Any, descriptors: Any, config: ModelConfig, how: ExportConfig
 ) -> dict[str, Any]:
-    images, (descriptors,) = exported.in_avals[-1], exported.out_avals
-    called = "images" if how.weights_inside else "weights, images"
     return {
-        "format": FORMAT,
-        "call": f"jax.export.deserialize(program).call({called})",
-        "program": _file(folder / PROGRAM),
-        "weights": None
-        if how.weights_inside
-        else _file(folder / WEIGHTS)
-        | {"argument": "a dictionary of all arrays in the file by their names"},
-        "images": {
-            "shape": _shape(images),
-            "dtype": str(images.dtype),
-            **_chain(config),
-        },
+        "images": {"shape": _shape(images), "dtype": str(images.dtype), **_chain(config, how)},
         "descriptors": {
             "shape": _shape(descriptors),
             "dtype": str(descriptors.dtype),
             "norm": "unit length (L2)" if config.unit_length else "any length",
         },
-        "grouping": how.grouping,
-        "grouping_means": GROUPINGS[how.grouping],
-        "platforms": list(exported.platforms),
-        "calling_convention_version": exported.calling_convention_version,
-        "jax_version": jax.__version__,
-        "model_sha256": model_hash(params, config),
-        "model": to_plain(config),
     }
 
 
-def _chain(config: ModelConfig) -> dict[str, Any]:
+def _chain(config: ModelConfig, how_exported: ExportConfig) -> dict[str, Any]:
     """Tell how images are prepared for the program, which has one size, whatever the rule."""
     how = config.preprocessing
     values: dict[str, Any] = {
@@ -224,7 +366,7 @@ def _chain(config: ModelConfig) -> dict[str, Any]:
     fixed = dataclasses.replace(how, size_rule="fixed", round_to_patch=False)
     if fixed.in_words(config.input_size) != PreprocessingConfig().in_words(config.input_size):
         values["resize"] = f"{fixed.in_words(config.input_size)}, aspect ratio not kept"
-    if how.pixels == "floats":
+    if not _takes_bytes(config, how_exported):
         values["layout"] = "RGB, rows from the top, (pixels / 255 - mean) / deviation"
         values |= {"mean": list(how.mean), "deviation": list(how.deviation)}
     return values

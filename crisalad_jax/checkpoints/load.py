@@ -5,8 +5,6 @@ import pathlib
 import re
 from typing import TYPE_CHECKING, NamedTuple
 
-from crisalad_jax.checkpoints.published import PUBLISHED
-from crisalad_jax.checkpoints.published.base import nearest_names
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 
@@ -79,8 +77,15 @@ def find_weights(weights: str | os.PathLike[str], *, quiet: bool = False) -> pat
     """
     path = pathlib.Path(weights)
     name = os.fspath(weights)
+    is_there = os.path.isfile(path)
+    if is_there and path.suffix:
+        return path
+    # Imported here: the published models, whose names have no suffix, need JAX.
+    from crisalad_jax.checkpoints.published import PUBLISHED
+    from crisalad_jax.checkpoints.published.base import nearest_names
+
     model = PUBLISHED.get(name)
-    if os.path.isfile(path):
+    if is_there:
         if model is not None:
             tell(f"{name}: found a file of this name here, and took that, not the published model")
         return path

@@ -37,7 +37,7 @@ _COMMANDS = {
     "query": "Ask a map where images were taken.",
     "serve": "Answer over HTTP, and in a browser, where photographs were taken.",
     "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
-    "export": "Write a model as a StableHLO program that needs nothing of this package.",
+    "export": "Write a model as a program that needs nothing of this package.",
     "pca": "Fit principal components to descriptors, for shorter ones.",
     "compile-check": "Compile for GPUs and TPUs that need not be here, and table memory and work.",
     "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
@@ -119,7 +119,6 @@ def _limit_pixels(given: Sequence[str]) -> None:
 
 def _run(name: str, given: list[str], keep_programs: bool) -> None:
     from crisalad_jax.cli import renamed
-    from crisalad_jax.utils import compiler, kept
 
     require("" not in given, "arguments: found an empty one, expected a value")
     _limit_pixels(given)
@@ -128,10 +127,16 @@ def _run(name: str, given: list[str], keep_programs: bool) -> None:
     module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
     chosen = _parse(name, module, arguments)
     _check_numbers(chosen)
+    _set_up_jax(keep_programs)
+    module.run(chosen)
+
+
+def _set_up_jax(keep_programs: bool) -> None:
+    from crisalad_jax.utils import compiler, kept
+
     compiler.set_up()
     if keep_programs and not has_plugins():
         kept.keep_programs()
-    module.run(chosen)
 
 
 _LARGEST = 2**40

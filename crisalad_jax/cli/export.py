@@ -12,12 +12,15 @@ EXAMPLE = "crisalad export --weights salad --out exported"
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write a model as a StableHLO program that scripts without this package can run."""
+    """Write a model as a program that runs without this package: StableHLO, ONNX or OpenVINO's."""
 
     weights: pathlib.Path
     """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
     out: pathlib.Path
     """New folder for the program, its manifest.json and its weights."""
+    format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
+    """stablehlo, for JAX; onnx, for onnxruntime, TensorRT and others; or openvino. The last two are
+    run once, and compared with this package (docs/export.md)."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
@@ -29,8 +32,11 @@ class Export:
     """Every image described alone, or the images of a call looking at each other."""
     weights_inside: bool = False
     """The weights as constants of the program, and no file of them beside it."""
+    pixels: Literal["bytes", "floats"] | None = None
+    """Bytes, which the program normalises, or floats that already are; by default what the model
+    resizes."""
     platforms: str = "cpu,cuda"
-    """Comma-separated: cpu, cuda, rocm, tpu."""
+    """Of stablehlo, comma-separated: cpu, cuda, rocm, tpu."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -51,6 +57,8 @@ def run(arguments: Export) -> None:
         batch_size=None if arguments.batch_size == "symbolic" else arguments.batch_size,
         weights_inside=arguments.weights_inside,
         platforms=tuple(dict.fromkeys(arguments.platforms.split(","))),
+        format=arguments.format,
+        pixels=arguments.pixels,
     )
     params, config, _ = load_model(
         arguments.weights,
@@ -63,9 +71,17 @@ def run(arguments: Export) -> None:
         f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"
         for name in ("images", "descriptors")
     )
+    if how.format == "stablehlo":
+        last = f"for {', '.join(manifest['platforms'])}"
+    else:
+        checked = manifest["checked"]
+        last = (
+            f"{how.format}; {checked['engine']} differs by at most "
+            f"{checked['largest_difference']:.1g} from this package"
+        )
     say(
         f"{arguments.out}: images {' -> descriptors '.join(shapes)}; "
         f"{manifest['grouping_means']}; weights {'inside' if how.weights_inside else 'beside'}; "
-        f"for {', '.join(manifest['platforms'])}"
+        f"{last}"
     )
     give_json(arguments.json, {"out": str(arguments.out), "manifest": manifest})

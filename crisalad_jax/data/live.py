@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.images import IMAGE_SUFFIXES, read_image
 from crisalad_jax.data.opencv import QUIET
-from crisalad_jax.data.video import check_rate, frame_name
+from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 
@@ -264,14 +264,15 @@ class Camera:
         begun, grabbed = time.monotonic(), True  # the first frame was grabbed to try the camera
         while grabbed and not self._closing.is_set():
             with QUIET:
-                at = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                at = milliseconds_of(self._capture)
                 found, image = self._capture.retrieve()
             if self._is_file:
-                self._closing.wait(max(0.0, begun + at - time.monotonic()))
-            taken, seconds = time.perf_counter(), at if self._is_file else time.time()
+                self._closing.wait(max(0.0, begun + at / 1000 - time.monotonic()))
+            taken = time.perf_counter()
+            when = at if self._is_file else round(1000 * time.time())
             if found:
                 image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                frame = Frame(frame_name(self.name, seconds), round(seconds, 3), image, taken)
+                frame = Frame(frame_name(self.name, when), when / 1000, image, taken)
                 with self._lock:
                     self.dropped += self._newest is not None
                     self._newest = frame

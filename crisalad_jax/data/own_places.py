@@ -1,9 +1,8 @@
 """Training places of one's own: one folder a place, or a table of names and places."""
 
-import csv
 import math
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +10,8 @@ from jaxtyping import Float64
 
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, has_sides, has_split, listing
 from crisalad_jax.data.images import list_images
+from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, check_source
 
 TABLE = "places.csv"
 _COLUMNS = "name,place[,lat,lon[,heading]]"
@@ -74,54 +73,23 @@ def _read_folders(root: pathlib.Path) -> OwnPlaces:
 
 def _read_table(table: pathlib.Path) -> OwnPlaces:
     places: dict[str, list[str]] = {}
-    place_of: dict[str, str] = {}
     views: dict[str, tuple[float, float, float]] = {}
-    has_positions = False
-    for where, row in _rows(table):
-        name, place = row["name"], row["place"]
-        if not name or not place:
-            missing = "name" if not name else "place"
-            raise InputError(f"{where}: found no {missing}, expected {_COLUMNS}")
-        if name in place_of:
-            raise InputError(
-                f"{where}: found {name!r} twice, in places {place_of[name]} and {place}, expected "
-                "it once"
-            )
-        place_of[name] = place
-        places.setdefault(place, []).append(name)
-        if "lat" in row:
-            has_positions = True
-            views[name] = _view(where, row)
+    names: list[str] = []
+    for row in named_rows(table, lambda header: _check_header(table, header)):
+        place = row.fields["place"]
+        if not place:
+            raise InputError(f"{row.where}: found no place, expected {_COLUMNS}")
+        names.append(row.name)
+        places.setdefault(place, []).append(row.name)
+        if "lat" in row.fields:
+            views[row.name] = _view(row)
     if not places:
         raise InputError(f"{table}: found no row below the header, expected {_COLUMNS}")
-    find_images(table, table.parent, place_of)
-    return OwnPlaces(table.parent, places, views if has_positions else None)
+    find_images(table, table.parent, names)
+    return OwnPlaces(table.parent, places, views or None)
 
 
-def _rows(table: pathlib.Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield where each row stands, and its fields by column."""
-    check_source(table, "a table of UTF-8 CSV", largest=LARGEST)
-    try:
-        # utf-8-sig: a spreadsheet's byte order mark would spoil the first column's name.
-        with table.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = [name.strip() for name in next(reader, [])]
-            _check_header(table, header)
-            for row in reader:
-                where = f"{table}: line {reader.line_num}"
-                if not row:
-                    continue
-                if len(row) != len(header):
-                    raise InputError(
-                        f"{where}: found {len(row)} fields, expected {len(header)} "
-                        f"({','.join(header)})"
-                    )
-                yield where, {n: v.strip() for n, v in zip(header, row, strict=True)}
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{table}: cannot be read as UTF-8 CSV: {error}") from error
-
-
-def _check_header(table: pathlib.Path, header: list[str]) -> None:
+def _check_header(table: pathlib.Path, header: Sequence[str]) -> None:
     known = {"name", "place", *_VIEW}
     twice = [name for name in header if name in known and header.count(name) > 1]
     halves = ("lat" in header) != ("lon" in header) or ("heading" in header and "lat" not in header)
@@ -131,18 +99,16 @@ def _check_header(table: pathlib.Path, header: list[str]) -> None:
         )
 
 
-def _view(where: str, row: dict[str, str]) -> tuple[float, float, float]:
+def _view(row: NamedRow) -> tuple[float, float, float]:
     """Read latitude, longitude and heading in degrees."""
     values = []
-    for name, limit in zip(_VIEW, (90.0, 180.0, math.inf), strict=True):
-        if name not in row:
+    for column, limit in zip(_VIEW, (90.0, 180.0, math.inf), strict=True):
+        if column not in row.fields:
             values.append(math.nan)
             continue
-        try:
-            value = float(row[name])
-        except ValueError:
-            value = math.nan
+        value = row.number(column)
         if not (math.isfinite(value) and abs(value) <= limit):
-            raise InputError(f"{where}: {name}: found {row[name]!r}, expected degrees")
+            found = row.fields[column]
+            raise InputError(f"{row.where}: {column}: found {found!r}, expected degrees")
         values.append(value)
     return values[0], values[1], values[2]

@@ -1,14 +1,13 @@
 """Read where images were taken, from their @UTM names or from a table."""
 
-import csv
 import math
 import os
 import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, check_source
 
 AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
 """Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
@@ -74,7 +73,7 @@ def read_image_table(path: str | os.PathLike[str]) -> ImageTable:
 
     Raises:
         InputError: the file cannot be read, has another header, one with both other pairs or with
-            a column twice, no row, a row with more fields than that, without a name, a name twice,
+            a column twice, a row with other than as many fields, without a name, a name twice,
             or a value that is no finite number, or no latitude or longitude.
     """
     return _read_table(pathlib.Path(path), must=False)
@@ -82,40 +81,17 @@ def read_image_table(path: str | os.PathLike[str]) -> ImageTable:
 
 def _read_table(path: pathlib.Path, *, must: bool) -> ImageTable:
     """Read a table; with `must`, every row has a position."""
-    lines: list[tuple[int, str]] = []
-    seen: set[str] = set()
-    positions: dict[str, tuple[float, float]] = {}
-    check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            first = file.readline()
-            file.seek(0)
-            separator = ";" if first.count(";") > first.count(",") else ","
-            rows = csv.DictReader(file, delimiter=separator)
-            header = rows.fieldnames = [name.strip() for name in rows.fieldnames or []]
-            axes = _axes(path, header, must=must)
-            for row in rows:
-                where, name = f"{path}: line {rows.line_num}", row["name"]
-                if None in row:
-                    raise InputError(
-                        f"{where}: found more fields than the header's {len(header)}, expected as "
-                        "many (between commas a decimal is written with a point)"
-                    )
-                if not name:
-                    raise InputError(f"{where}: found no name, expected an image's")
-                if name in seen:
-                    raise InputError(f"{where}: found {name!r} twice, expected it once")
-                seen.add(name)
-                lines.append((rows.line_num, name))
-                # A field that is missing is an error, and no empty one.
-                if axes is not None and (must or any(row[axis] != "" for axis in axes)):
-                    positions[name] = _position(row, axes, separator, where)
-    except (OSError, ValueError, csv.Error) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot read these positions: {reason}") from error
-    return ImageTable(lines, None if axes is None else Positions(axes, positions))
+    found: list[tuple[str, str] | None] = []
+    rows = list(named_rows(path, lambda header: found.append(_axes(path, header, must=must))))
+    (axes,) = found
+    positions = {
+        row.name: _position(row, axes)
+        for row in rows
+        if axes is not None and (must or any(row.fields[axis] for axis in axes))
+    }
+    return ImageTable(
+        [(row.line, row.name) for row in rows], None if axes is None else Positions(axes, positions)
+    )
 
 
 _NEEDED = "name,east,north or name,lat,lon or name,x,y"
@@ -143,22 +119,13 @@ def _axes(path: pathlib.Path, header: Sequence[str], *, must: bool) -> tuple[str
     return None
 
 
-def _position(
-    row: dict[str, str], axes: tuple[str, str], separator: str, where: str
-) -> tuple[float, float]:
-    texts = [row[axis] for axis in axes]
-    # With two marks a comma may stand before thousands: that is no number.
-    commas = separator == ";" and not any("," in text and "." in text for text in texts if text)
-    try:
-        first, second = (float(text.replace(",", ".") if commas else text) for text in texts)
-    except (TypeError, AttributeError, ValueError):
-        first = second = math.nan
+def _position(row: NamedRow, axes: tuple[str, str]) -> tuple[float, float]:
+    first, second = map(row.number, axes)
+    found = f"{row.where}: found {[row.fields[axis] for axis in axes]}"
     if not (math.isfinite(first) and math.isfinite(second)):
-        raise InputError(f"{where}: found {texts}, expected two finite numbers")
+        raise InputError(f"{found}, expected two finite numbers")
     if axes == AXES[1] and not (abs(first) <= 90 and abs(second) <= 180):
-        raise InputError(f"{where}: found {texts}, expected a latitude and a longitude")
+        raise InputError(f"{found}, expected a latitude and a longitude")
     if max(abs(first), abs(second)) > MOST_METRES:
-        raise InputError(
-            f"{where}: found {texts}, expected metres {' and '.join(axes)}, at most {MOST_METRES:g}"
-        )
+        raise InputError(f"{found}, expected metres {' and '.join(axes)}, at most {MOST_METRES:g}")
     return first, second

@@ -9,7 +9,14 @@ from typing import NamedTuple
 
 from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, names_in
 from crisalad_jax.data.positions import Positions, read_image_table
-from crisalad_jax.data.video import check_rate, file_of, frame_time, is_video, list_frames
+from crisalad_jax.data.video import (
+    check_rate,
+    file_of,
+    frame_time,
+    is_video,
+    list_frames,
+    name_frame,
+)
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, read_text
 
@@ -93,9 +100,11 @@ def _source(
 
 
 def _with_frames(paths: Sequence[pathlib.Path], fps: float) -> list[pathlib.Path]:
-    """Put a video's frames in its place."""
+    """Put a video's frames in its place, and name single frames by their own times."""
     return [
-        each for path in paths for each in (list_frames(path, fps) if is_video(path) else [path])
+        each
+        for path in paths
+        for each in (list_frames(path, fps) if is_video(path) else [name_frame(path)])
     ]
 
 
@@ -135,13 +144,14 @@ def _listed(
         # Written out, so that a name has no .. in it, and a path that is there twice is found.
         path = pathlib.Path(os.path.normpath(folder / line))
         where = f"{source}: line {number}"
-        if path in lines:
-            raise InputError(
-                f"{where}: found {line!r}, which is on line {lines[path]} too, expected it once"
-            )
-        lines[path] = number
         try:
             check_source(file_of(path), _AN_IMAGE)
+            path = name_frame(path)
+            if path in lines:
+                raise InputError(
+                    f"found {line!r}, which is on line {lines[path]} too, expected it once"
+                )
+            lines[path] = number
             if positions is not None and is_video(path):
                 raise InputError(
                     f"{path}: found a video, expected {_AN_IMAGE}, or a frame such as "

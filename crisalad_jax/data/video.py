@@ -1,16 +1,20 @@
 """Frames of video files, under names that say when they were taken: `walk.mp4#t=12.500`.
 
 Such a name stands for an image wherever a path does. Times are those in the file, so that a rate
-that varies does no harm.
+that varies does no harm. Every verb names a frame by its own time in whole milliseconds, however a
+user wrote it: `frame_name` writes the name, `milliseconds_of` reads the time, `name_frame` finds
+the frame.
 """
 
+import bisect
 import collections
 import contextlib
+import functools
 import os
 import pathlib
 import re
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -44,9 +48,30 @@ def is_video(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(VIDEO_SUFFIXES)
 
 
-def frame_name(video: str | os.PathLike[str], seconds: float) -> str:
-    """Return the name of a frame."""
-    return f"{os.fspath(video)}#t={seconds:.3f}"
+def frame_name(video: str | os.PathLike[str], milliseconds: int) -> str:
+    """Return the name of a frame.
+
+    Example:
+        >>> frame_name("walk.mp4", 12_500)
+        'walk.mp4#t=12.500'
+    """
+    return f"{os.fspath(video)}#t={milliseconds // 1000}.{milliseconds % 1000:03d}"
+
+
+def spelled(name: str) -> str:
+    """Return a frame's name as `frame_name` writes it; other names as they are.
+
+    Example:
+        >>> spelled("walk.mp4#t=12.5"), spelled("a.jpg")
+        ('walk.mp4#t=12.500', 'a.jpg')
+    """
+    time = frame_time(name)
+    return name if time is None else frame_name(_FRAME.sub(r"\1", name), round(1000 * time))
+
+
+def milliseconds_of(capture: cv2.VideoCapture) -> int:
+    """Read the time of the frame that a video is at."""
+    return round(capture.get(cv2.CAP_PROP_POS_MSEC))
 
 
 def frame_time(path: str | os.PathLike[str]) -> float | None:
@@ -89,7 +114,28 @@ def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib
     """
     check_rate(fps)
     chosen = _sampled(_frame_times(video), fps)
-    return [pathlib.Path(frame_name(video, time / 1000)) for time in chosen]
+    return [pathlib.Path(frame_name(video, time)) for time in chosen]
+
+
+def name_frame(path: pathlib.Path) -> pathlib.Path:
+    """Name a frame by its own time: of a time between two, the frame that `read_frame` reads.
+
+    Args:
+        path: the name of a frame, or another path, which stays as it is.
+
+    Returns:
+        The name. A time behind the video's last frame stays, for the reader to tell.
+
+    Raises:
+        InputError: the video is missing or does not decode.
+    """
+    time = frame_time(path)
+    if time is None:
+        return path
+    video, wanted = file_of(path), round(1000 * time)
+    times = _frame_times(video)
+    at = bisect.bisect_left(times, wanted)
+    return pathlib.Path(frame_name(video, times[at] if at < len(times) else wanted))
 
 
 def _sampled(times: Iterable[int], fps: float) -> list[int]:
@@ -103,15 +149,23 @@ def _sampled(times: Iterable[int], fps: float) -> list[int]:
     return chosen
 
 
-def _frame_times(video: str | os.PathLike[str]) -> list[int]:
+def _frame_times(video: str | os.PathLike[str]) -> Sequence[int]:
     """Read the times of all frames in milliseconds, in order, each once."""
+    check_source(video, _VIDEO)
+    there = os.stat(video)
+    return _times_as_of(os.fspath(video), there.st_size, there.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=_OPEN)  # a list may name thousands of frames of a video
+def _times_as_of(video: str, size: int, changed: int) -> tuple[int, ...]:
+    """Read the times of the frames of a file of this size and time of change."""
     times = _grabbed_times(video, decoded=False)
     # A video that was trimmed without encoding it again keeps frames that are not shown.
     if not times or not _can_read(pathlib.Path(video), times[-1]):
         times = _grabbed_times(video, decoded=True)
     if not times:
         raise InputError(f"{video}: found no frame, expected {_VIDEO}")
-    return times
+    return tuple(times)
 
 
 def _grabbed_times(video: str | os.PathLike[str], *, decoded: bool) -> list[int]:
@@ -121,7 +175,7 @@ def _grabbed_times(video: str | os.PathLike[str], *, decoded: bool) -> list[int]
             capture.set(cv2.CAP_PROP_FORMAT, -1)
         times = set()
         while capture.grab():
-            times.add(round(capture.get(cv2.CAP_PROP_POS_MSEC)))
+            times.add(milliseconds_of(capture))
         capture.release()
     return sorted(time for time in times if time >= 0)
 
@@ -158,7 +212,7 @@ class _Reader:
     def _grab(self) -> bool:
         if not self._capture.grab():
             return False
-        self._at = round(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        self._at = milliseconds_of(self._capture)
         return True
 
     def _seek(self, wanted: int) -> None:

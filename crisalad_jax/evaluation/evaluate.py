@@ -17,7 +17,7 @@ from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
-from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens, useful_batch_size
+from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
 from crisalad_jax.retrieval.euclidean import to_unit_vectors
 from crisalad_jax.retrieval.grouping import (
     DEFAULT_GROUPINGS,
@@ -25,10 +25,12 @@ from crisalad_jax.retrieval.grouping import (
     batches_of,
     check_grouping,
     parse_groupings,
+    useful_batch_size,
 )
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
-from crisalad_jax.retrieval.search import Neighbours, search
+from crisalad_jax.retrieval.search import search
 
 KS = (1, 5, 10, 20)
 

@@ -20,7 +20,7 @@ from crisalad_jax.evaluation.metrics import (
 from crisalad_jax.evaluation.operating_point import OperatingPoint, operating_point
 from crisalad_jax.evaluation.operating_point import to_json as point_json
 from crisalad_jax.retrieval.grouping import Grouping
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 
 ANY = "any"
 """The grouping of a model whose descriptors depend on no batch."""

@@ -3,31 +3,21 @@
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32
 
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
-from crisalad_jax.retrieval.describe import group, tokens_in_batches, useful_batch_size
-from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.describe import group, tokens_in_batches
+from crisalad_jax.retrieval.described import Described
+from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
-
-
-class Described(NamedTuple):
-    """Descriptors of a few images."""
-
-    indices: Int64[np.ndarray, " n"]
-    """Indices of the readable images in the list of paths."""
-    descriptors: Float32[np.ndarray, "n d"]
-    unreadable: Int64[np.ndarray, " _"]
-    """Indices of the images that could not be read."""
 
 
 def describe_alone(

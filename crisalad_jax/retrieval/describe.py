@@ -23,9 +23,6 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.progress import progress_bar
 
-_SMALL = 16
-"""Largest batch that is padded to a power of two, so that few sizes are compiled."""
-
 
 class FolderTokens(NamedTuple):
     """Tokens of many images on the host (see `Tokens`), and which images could be read."""
@@ -50,17 +47,6 @@ class HeldTokens(Protocol):
     def of(self, images: Int64[np.ndarray, " n"]) -> Tokens:
         """Return the tokens of some images, by number."""
         ...
-
-
-def useful_batch_size(batch_size: int, images: int) -> int:
-    """Return the batch size, or less where it would be padding for the most part.
-
-    Example:
-        >>> [useful_batch_size(32, images) for images in (1, 3, 12, 20, 50)]
-        [1, 4, 16, 20, 32]
-    """
-    padded = images if images > _SMALL else 1 << max(0, images - 1).bit_length()
-    return min(batch_size, padded)
 
 
 def read_tokens(

@@ -10,11 +10,10 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import check_lines
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import open_source
-from crisalad_jax.data.video import frame_time
+from crisalad_jax.data.video import frame_time, name_frame
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.chunks import check_all_rows
-from crisalad_jax.retrieval.describe import useful_batch_size
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
     check_suffix,
@@ -22,7 +21,7 @@ from crisalad_jax.retrieval.descriptor_files import (
     targets,
     write_descriptors,
 )
-from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.sets import (
@@ -278,7 +277,7 @@ def _listed(
         source = open_source(images, fps=fps)
         inside = _inside(source.root, root) if root is not None else pathlib.PurePath()
         return source.paths, [(inside / name).as_posix() for name in source.names]
-    paths = [pathlib.Path(path) for path in images]
+    paths = [name_frame(pathlib.Path(path)) for path in images]
     if not paths:
         raise InputError("images: found none, expected at least one")
     names = [(path if root is None else _inside(path, root)).as_posix() for path in paths]

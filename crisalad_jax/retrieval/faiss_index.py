@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, Int
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, check_rows, pieces, sample
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.checksums import append_checksum, check_appended
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source

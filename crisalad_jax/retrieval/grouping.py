@@ -168,3 +168,18 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
         starts[:, None] + np.arange(batch_size) % np.minimum(count - starts, batch_size)[:, None]
     )
     return Batches(order[wrapped], filled, filled, mutual=grouping != "single")
+
+
+_SMALL = 16
+"""Largest batch that is padded to a power of two, so that few sizes are compiled."""
+
+
+def useful_batch_size(batch_size: int, images: int) -> int:
+    """Return the batch size, or less where it would be padding for the most part.
+
+    Example:
+        >>> [useful_batch_size(32, images) for images in (1, 3, 12, 20, 50)]
+        [1, 4, 16, 20, 32]
+    """
+    padded = images if images > _SMALL else 1 << max(0, images - 1).bit_length()
+    return min(batch_size, padded)

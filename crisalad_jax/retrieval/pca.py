@@ -7,21 +7,22 @@ import json
 import os
 import pathlib
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import check_seed, check_types
 from crisalad_jax.config.io import from_plain, to_plain
-from crisalad_jax.nn.layers import Linear
-from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import Bar, progress_bar
+
+if TYPE_CHECKING:
+    from crisalad_jax.nn.layers import Linear
+    from crisalad_jax.nn.projection import ProjectionConfig
 
 FORMAT = "crisalad-jax pca 2"
 """The one key of a file's metadata; its value is JSON: the file's checksum and the `PcaConfig`."""
@@ -108,12 +109,18 @@ class Pca(NamedTuple):
             yield part
             start += len(rows)
 
-    def projection(self) -> tuple[Linear, ProjectionConfig]:
+    def projection(self) -> "tuple[Linear, ProjectionConfig]":
         """Return the same components as a model's last layer.
 
         Returns:
             Parameters in float32, and configuration, of `Crisalad.projection`.
         """
+        # Imported here: applying components needs no JAX.
+        import jax.numpy as jnp
+
+        from crisalad_jax.nn.layers import Linear
+        from crisalad_jax.nn.projection import ProjectionConfig
+
         scale = np.sqrt(self.variances) if self.config.whiten else np.float32(1)
         weight = self.components.astype(np.float64).T / scale
         layer = Linear(jnp.asarray(weight, WIDE), jnp.asarray(-(self.mean @ weight), WIDE))

@@ -8,18 +8,17 @@ import itertools
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Float32, Int, Int32, Int64
+from jaxtyping import Array, Float, Float32, Int, Int32
 
 from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.retrieval.chunks import (
     KEPT,
-    UNIT_TOLERANCE,
     WIDE,
     Block,
     aligned,
@@ -29,6 +28,7 @@ from crisalad_jax.retrieval.chunks import (
     is_mapped,
     views,
 )
+from crisalad_jax.retrieval.neighbours import Neighbours, exact_similarities, rounding
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
@@ -43,19 +43,10 @@ _GROUP = 16
 Of 8, 16, 32 and 64 this is the fastest on a CPU: half the time of one large top_k."""
 _SPARE = 16
 """Candidates kept beyond k, for products that float32 cannot tell apart."""
-_PIECE = 2**17
-"""Size of a piece that is multiplied in float64, in numbers: 1 MiB, which fits a core's cache."""
 _READ = 2**22
 """Size of the candidates that are read from a database at a time, in numbers: 16 MiB."""
 _Pairs = tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"], Float32[np.ndarray, " pair"]]
 """Queries in rising order, rows of a block in rising order for each, and their products."""
-
-
-class Neighbours(NamedTuple):
-    """The most similar database images of each query, best first."""
-
-    indices: Int64[np.ndarray, "q k"]
-    similarities: Float32[np.ndarray, "q k"]
 
 
 def search(
@@ -320,32 +311,6 @@ def _of_candidates(part: _Part, block: Block, *arrays: Array) -> _Pairs:
         value = np.concatenate([value, products[also, there]])
     order = np.lexsort((row, query))
     return query[order], row[order], value[order]
-
-
-def rounding(length: int) -> float:
-    """Bound the rounding error of a float32 product of two descriptors, in any order of sums.
-
-    The probabilistic bound of Higham and Mary (2019), lambda sqrt(n) u, at lambda = 8, where it
-    fails less than once in 10^9 products; the sum of |a_i b_i| is at most the lengths' product.
-    """
-    return 8 * math.sqrt(length) * 2.0**-24 * (1 + UNIT_TOLERANCE) ** 2
-
-
-def exact_similarities(
-    queries: Float32[np.ndarray, "q d"],
-    rows: Float[np.ndarray, "n d"],
-    query: Int[np.ndarray, " pair"],
-    row: Int[np.ndarray, " pair"],
-) -> Float32[np.ndarray, " pair"]:
-    """Compute products of pairs in float64, in a fixed order of sums, rounded to float32."""
-    similarities = np.empty(len(query), np.float32)
-    size = max(1, _PIECE // queries.shape[1])
-    for start in range(0, len(query), size):
-        piece = slice(start, start + size)
-        products = rows[row[piece]].astype(np.float64)
-        products *= queries[query[piece]]
-        similarities[piece] = products.sum(axis=1)
-    return similarities + np.float32(0)  # turns -0.0 into 0.0, so that both sort alike
 
 
 def _similarities_of(

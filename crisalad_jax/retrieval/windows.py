@@ -1,8 +1,10 @@
 """Descriptors of a moving camera's frames: each with those just before it (grouping `window`)."""
 
 import collections
+import itertools
 import pathlib
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,8 +15,9 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, attend_across_images, cast_params, extract_tokens
 from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.retrieval.alone import Described, describe_images
+from crisalad_jax.retrieval.alone import describe_alone, describe_images
 from crisalad_jax.retrieval.describe import FolderTokens, group, tokens_in_batches
+from crisalad_jax.retrieval.described import Described
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
@@ -66,6 +69,38 @@ def describe_windows(
         indices = batch.indices[batch.indices >= 0]
         yield Described(indices[new.readable], descriptors[new.readable], indices[~new.readable])
         before = FolderTokens(*(leaf[1 - window :] for leaf in both))
+
+
+def describe_sources(
+    params: Crisalad,
+    config: ModelConfig,
+    sources: Sequence[list[pathlib.Path]],
+    *,
+    window: int,
+    batch_size: int,
+    on_bad_image: OnBadImage = "stop",
+    components: Pca | None = None,
+) -> Iterator[Described]:
+    """Describe the images of all sources in order; a window holds images of one source alone.
+
+    Indices count the images of all sources.
+
+    Raises:
+        InputError: what `describe_alone` raises.
+    """
+    options: dict[str, Any] = {
+        "batch_size": batch_size,
+        "on_bad_image": on_bad_image,
+        "components": components,
+    }
+    if window == 1:
+        yield from describe_alone(params, config, list(itertools.chain(*sources)), **options)
+        return
+    first = 0
+    for source in sources:
+        for part in describe_windows(params, config, source, window=window, **options):
+            yield Described(part.indices + first, part.descriptors, part.unreadable + first)
+        first += len(source)
 
 
 def _join(first: np.ndarray, second: np.ndarray) -> np.ndarray:

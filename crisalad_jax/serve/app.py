@@ -85,6 +85,10 @@ class Health:
     images: int
     model: str
     """Digest of the model that made the map."""
+    search: str
+    """exact, hnsw or ivf-pq."""
+    stale_search: str | None
+    """An approximate search that is not used, for it lacks images; build it anew. Else null."""
     uptime_s: float
 
 
@@ -184,7 +188,7 @@ def make_app(
 
     @app.get("/health")
     async def health() -> Health:
-        """Tell that the service runs, of which model, and since when."""
+        """Tell that the service runs, of which model, how it searches, and since when."""
         return Health(**service.health())
 
     @app.get("/map", responses={401: _PROBLEMS[401]})
@@ -377,7 +381,10 @@ def _handle_errors(app: fastapi.FastAPI) -> None:
 
 
 class _Gate:
-    """Check who asks before anything is read, and add the headers that every answer carries."""
+    """Check who asks before anything is read, and add the headers that every answer carries.
+
+    HEAD is answered as GET, without the body.
+    """
 
     def __init__(self, app: ASGIApp, access: Access, page: bytes) -> None:
         self._app, self._access = app, access
@@ -407,8 +414,11 @@ class _Gate:
                 message["headers"] = [*given, *self._headers]
                 if not any(name.lower() == b"cache-control" for name, _ in given):
                     message["headers"].append((b"Cache-Control", b"no-store"))
+            elif is_head and message["type"] == "http.response.body":
+                message["body"] = b""
             await send(message)
 
+        is_head = scope["method"] == "HEAD"
         headers = starlette.datastructures.Headers(scope=scope)
         try:
             self._access.check(scope["method"], scope["path"], headers)
@@ -416,6 +426,8 @@ class _Gate:
             answer = _problem(error.status, error, error.headers)
             await answer(scope, receive, send_with_headers)
             return
+        if is_head:
+            scope = {**scope, "method": "GET"}
         await self._app(scope, receive, send_with_headers)
 
 

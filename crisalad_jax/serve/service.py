@@ -12,6 +12,7 @@ import numpy as np
 
 from crisalad_jax.data.images import decode_image, read_image
 from crisalad_jax.data.resize import Pixels, resize_image
+from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_similarity, position_fields
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.serve.names import check_new_name
@@ -54,11 +55,14 @@ class MapService:
         self._threads.shutdown()
 
     def health(self) -> dict[str, Any]:
-        """Tell that the service runs, of which model, and since when."""
+        """Tell that the service runs, of which model, how it searches, and since when."""
+        places = self._worker.places
         return {
             "status": "ok",
-            "images": len(self._worker.places),
-            "model": self._worker.places.description.model,
+            "images": len(places),
+            "model": places.description.model,
+            "search": places.search_kind,
+            "stale_search": places.stale_search,
             "uptime_s": round(time.monotonic() - self._since, 1),
         }
 
@@ -173,7 +177,7 @@ class MapService:
             folders.insert(0, self._images)
         paths = (folder / image.name for folder in folders)
         # A file of another size is another picture, as `crisalad index` has it.
-        path = next((p for p in paths if p.is_file() and p.stat().st_size == image.bytes), None)
+        path = next((path for path in paths if _has_size(path, image.bytes)), None)
         if path is None:
             raise InputError(f"{image.name}: found no such picture any more, see --map-images")
         try:
@@ -181,6 +185,12 @@ class MapService:
         except InputError as error:
             raise InputError(f"{image.name}: found a picture that cannot be read") from error
         return _as_jpeg(pixels)
+
+
+def _has_size(path: pathlib.Path, size: int) -> bool:
+    """Return whether an image's file, of a frame its video, is there and has so many bytes."""
+    file = file_of(path)
+    return file.is_file() and file.stat().st_size == size
 
 
 def _as_jpeg(pixels: Pixels) -> bytes:

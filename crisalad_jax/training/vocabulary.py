@@ -26,7 +26,7 @@ from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
-from crisalad_jax.retrieval.describe import useful_batch_size
+from crisalad_jax.retrieval.grouping import useful_batch_size
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
 from crisalad_jax.utils.devices import devices_for

@@ -13,6 +13,7 @@ from crisalad_jax.transport.config import GRADIENTS, Gradient, SinkhornConfig, S
 from crisalad_jax.transport.iterate import iterate
 from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem, product
 from crisalad_jax.transport.steps import solve_columns
+from crisalad_jax.utils.target import target
 
 PARTS = 2
 """Number of parts of a batch that choose a domain, one after the other: the memory for a choice's
@@ -23,7 +24,8 @@ def solve_in_domain(
     problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
 ) -> Solution:
     """Iterate in the configured domain; scores too far apart for scaling use the log domain."""
-    if config.domain == "log":
+    # Out of its range the other domain is left, by a branch.
+    if config.domain == "log" or not target().branches:
         return iterate(problem, config, params, init)
     scaled = ScalingProblem.scaled(problem)
     solution = iterate(scaled, config, params, init)

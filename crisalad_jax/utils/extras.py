@@ -8,6 +8,8 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "maps": ("faiss", "h5py", "PIL", *_CLI),
     "report": ("jinja2", "matplotlib", *_CLI),
     "export": ("flatbuffers", *_CLI),
+    "onnx": ("onnx", "onnxruntime", *_CLI),
+    "openvino": ("openvino", "onnx", *_CLI),
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),

@@ -6,6 +6,7 @@ the code of this package, the versions of the libraries, settings, configuration
 """
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
@@ -187,10 +188,13 @@ def _key(
 
 def _whole(value: Any) -> str:
     """Describe a static argument by all its fields: its repr may leave some out."""
-    from crisalad_jax.config.io import to_plain
-
-    plain = to_plain(value) if hasattr(value, "__dataclass_fields__") else value
-    return f"{type(value).__qualname__} {plain!r}"
+    kind = f"{type(value).__module__}.{type(value).__qualname__}"
+    if dataclasses.is_dataclass(value):
+        words = [f"{f.name}={_whole(getattr(value, f.name))}" for f in dataclasses.fields(value)]
+        return f"{kind}({', '.join(words)})"
+    if isinstance(value, tuple | list):
+        return f"{kind}({', '.join(map(_whole, value))})"
+    return f"{kind} {value!r}"
 
 
 @functools.cache

@@ -29,6 +29,8 @@ class Target:
     """The platform; "portable" is any of them, which a program is exported for."""
     cudnn: bool = False
     """Whether cuDNN's fused attention, which never writes scores to memory, compiles there."""
+    branches: bool = True
+    """Whether a program may take one of two ways, by numbers that it computes."""
 
     def product_dtype(self, dtype: Any) -> Any:
         """Return the fastest output type for a product of matrices of `dtype`, before rounding.
@@ -43,6 +45,8 @@ class Target:
 CPU, GPU, TPU = Target("cpu"), Target("gpu", cudnn=True), Target("tpu")
 PORTABLE = Target("portable")
 """No choice by platform: a program runs on all of them."""
+STRAIGHT = Target("portable", branches=False)
+"""No choice by platform, and no branches: a program of another format, for any engine."""
 TARGETS = {"cpu": CPU, "gpu": GPU, "tpu": TPU, "portable": PORTABLE}
 # JAX keeps traces apart by it: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
@@ -132,7 +136,9 @@ def lowering_platforms() -> tuple[str, ...] | None:
     None is JAX's own choice, outside of `lowering_for` and for a portable program.
     """
     chosen = _chosen.value
-    return None if chosen is None or chosen == PORTABLE else (_LOWERED_AS[chosen.platform],)
+    return (
+        None if chosen is None or chosen.platform == "portable" else (_LOWERED_AS[chosen.platform],)
+    )
 
 
 @contextlib.contextmanager

@@ -406,7 +406,7 @@ def map_files(folder: pathlib.Path) -> dict[str, bytes]:
 def attack_maps(bench: Bench, kills: int) -> list[Row]:
     """Kill `index`, read maps after each kill, and search a map while it grows."""
     import crisalad_jax.retrieval.maps.build
-    from crisalad_jax.retrieval.maps.manifest import has_images
+    from crisalad_jax.retrieval.maps.head import has_images
     from crisalad_jax.retrieval.maps.map import Map
 
     folder = bench.folder / "maps"
@@ -486,7 +486,7 @@ def attack_readers(
 ) -> list[Row]:
     """Search a map in a loop while another process makes it, then move it and ask it again."""
     from crisalad_jax.retrieval.maps.map import Map
-    from crisalad_jax.retrieval.search import exact_similarities
+    from crisalad_jax.retrieval.neighbours import exact_similarities
 
     out, ended = folder / "growing", folder / "ended"
     query, place = (each.ravel() for each in np.indices((IMAGES, IMAGES)))

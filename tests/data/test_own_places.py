@@ -110,7 +110,12 @@ def test_classes_by_position_say_what_they_lack(folders, table, lacking):
     ("text", "message"),
     [
         ("", r"places\.csv: found columns none, expected name,place\[,lat,lon\[,heading\]\]$"),
-        ("name;place\n", "found columns name;place, expected name,place"),
+        ("name;place\n", "found no row below the header"),
+        (
+            "name;place;lat;lon\nlone/1.jpg;a;91,5;0\n",
+            "line 2: lat: found '91,5', expected degrees",
+        ),
+        ("name,place\n,a\n", "line 2: found no name, expected"),
         ("name,place,lat\n", "found columns name, place, lat, expected"),
         ("name,place,heading\n", "found columns name, place, heading, expected"),
         ("name,place\n", "found no row below the header"),
@@ -118,7 +123,7 @@ def test_classes_by_position_say_what_they_lack(folders, table, lacking):
         ("name,place\nlone/1.jpg,\n", "line 2: found no place, expected"),
         (
             "name,place\nlone/1.jpg,a\nlone/1.jpg,b\n",
-            "line 3: found 'lone/1.jpg' twice, in places a",
+            "line 3: found 'lone/1.jpg' twice, on line 2 too",
         ),
         ("name,place\nlone/9.jpg,a\n", "found 1 of 1 images missing"),
         ("name,place,lat,lon\nlone/1.jpg,a,91,0\n", "line 2: lat: found '91', expected degrees"),

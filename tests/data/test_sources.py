@@ -12,6 +12,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from crisalad_jax.data.exif import exif_position
 from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.live import Camera
 from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.positions import read_positions
 from crisalad_jax.data.sources import open_source
@@ -152,7 +153,7 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
         ("a.csv", "file,lat,lon\n", "found columns file, lat, lon, expected one called name"),
         ("a.csv", "name\n", "a.csv: found no image, expected a path a line"),
         ("a.csv", "name,year\n,1\n", "line 2: found no name, expected an image's"),
-        ("a.csv", "name,lat,lon\n{run}/left/0.png,1,5,2,5\n", "line 2: found more fields than"),
+        ("a.csv", "name,lat,lon\n{run}/left/0.png,1,5,2,5\n", "line 2: found 5 fields, expected 3"),
         ("a.csv", "name;lat;lon\n{run}/left/0.png;1.000,5;2\n", "expected two finite numbers"),
         ("a.csv", "name,lat,lon\n{run}/left/0.png,1,\n", "line 2: .*expected two finite numbers"),
         ("a.csv", "name,x,x,y\n", "found the column x twice, expected it once"),
@@ -208,6 +209,36 @@ def test_frames_in_any_order_and_times_between_them(root):
         read_image(f"{video}#t=2.5")
     with pytest.raises(InputError, match=r"none\.avi: found no such file, expected a video"):
         read_image(f"{video.with_name('none.avi')}#t=0")
+
+
+def test_a_frame_has_one_name_however_it_is_written(root, tmp_path):
+    """Frames are 0.1 s apart; of a time between two, the later one is read."""
+    video = root / "run" / "walk.avi"
+    for written in ("1.2", "1.20000", "1.15", "01.2", "1.1004"):
+        expected = 1.1 if written == "1.1004" else 1.2  # names have milliseconds
+        assert open_source(f"{video}#t={written}").names == [f"walk.avi#t={expected:.3f}"]
+    assert open_source(f"{video}#t=9").names == ["walk.avi#t=9.000"]  # is told where it is read
+    work = pathlib.Path(shutil.copytree(root / "run", tmp_path / "run"))
+    (work / "list.txt").write_text("walk.avi#t=1.2\nwalk.avi#t=1.15\n")
+    with pytest.raises(
+        InputError, match=r"line 2: found 'walk\.avi#t=1\.15', which is on line 1 too"
+    ):
+        open_source(work / "list.txt")
+    (work / "table.csv").write_text("name,x,y\nwalk.avi#t=0.15,1,2\n")
+    assert open_source(work / "table.csv").positions == (("x", "y"), {"walk.avi#t=0.200": (1, 2)})
+    (work / "positions.csv").write_text("name,x,y\nwalk.avi#t=0.2,1,2\n")
+    assert read_positions(work / "positions.csv").of == {"walk.avi#t=0.200": (1, 2)}
+
+
+def test_a_camera_and_a_list_call_a_frame_the_same(tmp_path):
+    """At 80 frames a second, every other time is half a millisecond, which rounds to even."""
+    video = write_video(tmp_path / "fast.avi", 4, rate=80)
+    names = [path.name for path in list_frames(video, 1000)]
+    with Camera(video) as camera:
+        live = [frame.name for frame in camera.frames()]
+    assert names == [f"fast.avi#t=0.{milliseconds:03d}" for milliseconds in (0, 12, 25, 38)]
+    assert {pathlib.Path(name).name for name in live} <= set(names)
+    assert pathlib.Path(live[-1]).name == names[-1]
 
 
 def test_a_video_that_changes_is_read_again(tmp_path):

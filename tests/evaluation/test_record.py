@@ -10,7 +10,7 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
 from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
 from crisalad_jax.evaluation.similarity import FirstSimilarities, similarity_map
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from tests.conftest import BATCH, MODEL
 
 NEIGHBOURS = Neighbours(np.zeros((1, 1), np.int64), np.ones((1, 1), np.float32))

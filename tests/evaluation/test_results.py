@@ -9,7 +9,7 @@ from rich.console import Console
 from crisalad_jax.cli.tables import grouping_table
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise, to_json
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 
 KS = (1, 2)
 # Five queries, the last without a positive.

@@ -19,12 +19,14 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import read_image
+from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
-from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.query import answer_fields, query
 from crisalad_jax.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import BATCH
+from crisalad_jax.utils.notes import Note
+from tests.conftest import BATCH, MODEL, write_video
 from tests.serve.conftest import LIMIT, serving
 
 # Batches of other sizes round otherwise; similarities are printed with six digits.
@@ -153,10 +155,39 @@ def test_health_and_interface(service, folder):
         assert described["positions"] == [
             [number, *image.position] for number, image in enumerate(places.images)
         ]
+    assert (health["search"], health["stale_search"]) == ("exact", None)
     assert health["uptime_s"] >= 0
     interface = service.ask("GET", "/openapi.json").json
     assert set(interface["paths"]) == {"/health", "/map", "/locate", "/images", "/images/{number}"}
     assert "image/*" in interface["paths"]["/locate"]["post"]["requestBody"]["content"]
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/health", "/map", "/images/2", "/openapi.json", "/images/99", "/locate"]
+)
+def test_head_is_get_without_a_body(service, path):
+    """As RFC 9110 has it, also of an error; /locate is for POST alone."""
+    asked, head = service.ask("GET", path), service.ask("HEAD", path)
+    assert head.status == asked.status == {"/images/99": 404, "/locate": 405}.get(path, 200)
+    assert head.data == b""
+    differing = {"date", "content-length"} if path == "/health" else {"date"}  # an uptime grows
+    assert {k: v for k, v in head.headers.items() if k not in differing} == {
+        k: v for k, v in asked.headers.items() if k not in differing
+    }
+
+
+@pytest.mark.parametrize("appends", [False, True])
+def test_a_stale_search_is_told_at_the_start_and_by_health(own_map, params, pictures, appends):
+    with Map.open(own_map) as places, open_for_appending(own_map, places.description) as target:
+        target.build_search("hnsw")
+        first = target.descriptors
+        row = next(iter(first))[:1]
+        target.append(["new.jpg"], [7], row, root="/images")
+    with serving(own_map, params, appends=appends) as own:
+        health = own.ask("GET", "/health").json
+        assert (health["search"], health["stale_search"]) == ("exact", "hnsw")
+        with pytest.warns(Note, match=r"own\.map: found an approximate search of fewer .* hnsw"):
+            own.worker.compile(quiet=True)  # what `serve_map` does at its start
 
 
 def test_the_page_holds_all_it_shows(service):
@@ -198,6 +229,22 @@ def test_pictures_of_the_map(service, sides, own_map, params):
         ]
         assert own.ask("GET", "/images/3").status == 404
         assert own.ask("GET", "/images/4").status == 200
+
+
+def test_a_frame_of_a_video_is_shown_under_its_name(shared, params, tmp_path):
+    video = write_video(tmp_path / "walk.avi", 13)
+    weights = shared / "weights.safetensors"
+    out = tmp_path / "walk.map"
+    index(params, MODEL, f"{video}#t=1.2", out, weights=weights, batch_size=BATCH, quiet=True)
+    with serving(out, params) as own:
+        (found,) = own.ask(
+            "POST", "/locate", cv2.imencode(".png", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+        ).json["neighbours"]
+        assert found["name"] == "walk.avi#t=1.200"
+        reply = own.ask("GET", f"/images/{found['number']}")
+    assert reply.headers["content-type"] == "image/jpeg"
+    shown = cv2.imdecode(np.frombuffer(reply.data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert abs(shown.mean() - 120) < 4  # frame 12 is flat of level 120; two JPEGs move it little
 
 
 def test_a_token(folder, params, pictures):

@@ -23,7 +23,7 @@ from crisalad_jax.evaluation.evaluate import GroupingResult, evaluate
 from crisalad_jax.nn.config import with_aggregator
 from crisalad_jax.nn.model import Crisalad, extract_tokens
 from crisalad_jax.nn.tokens import Tokens, TransportStatistics
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.training import run as run_module
 from crisalad_jax.training import run_files
 from crisalad_jax.training.config import TrainConfig

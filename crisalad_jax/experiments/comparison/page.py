@@ -40,7 +40,10 @@ def write_page(summary: Summary, out: pathlib.Path) -> pathlib.Path:
     """Write index.html and its charts, recall_N.png, into `out`; return the page's path."""
     charts = [_chart(summary, name, out, n) for n, name in enumerate(summary.sets)]
     rows = [
-        ([tables.title_of(row, summary.rows), *row.labels[1:]], _recall_cells(summary, number))
+        (
+            [tables.title_of(row, summary.rows), *tables.described(row)],
+            _recall_cells(summary, number),
+        )
         for number, row in enumerate(summary.rows)
     ]
     costs = [(row.labels[0], tables.costs_of(row)) for row in tables.one_of_each(summary)]

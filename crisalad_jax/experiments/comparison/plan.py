@@ -182,7 +182,7 @@ class Variant:
 
     name: str
     labels: tuple[str, ...]
-    """Cells before its numbers."""
+    """Cells before its numbers; empty where a row changes nothing."""
     run: str
     """Name of the run that makes its model, which other variants may share."""
     training: TrainConfig
@@ -350,7 +350,7 @@ def _drafts(config: ComparisonConfig, weights: Mapping[str, pathlib.Path]) -> It
             described = row_labels(training)
             if config.rows:
                 described = (row.words if row is not None else _changed_words(described, config),)
-            labels, run = (name, *(words or "-" for words in described)), name
+            labels, run = (name, *described), name
         if config.image_size is not None or config.resize:
             way = training.model.preprocessing.changed_by(config.resize)
             size = config.image_size or training.model.image_size

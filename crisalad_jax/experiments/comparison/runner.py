@@ -113,7 +113,7 @@ def take_runs(
         Stopped: what `fit` raises; the same call resumes.
     """
     numbers = numbers_of(out, prepared.config)
-    started, made, waits = time.monotonic(), 0, False
+    made, waits = 0, False
     while left := [unit for unit in prepared.units if not _is_done(out, numbers, *unit)]:
         before = made
         for variant, seed in left:
@@ -124,8 +124,7 @@ def take_runs(
                     continue
                 if _is_done(out, numbers, variant, seed):  # by another process, a moment ago
                     continue
-                seconds = (time.monotonic() - started) / made / jobs if made else None
-                say(_run_words(prepared, out, numbers, variant, seed, seconds))
+                say(_run_words(prepared, out, numbers, variant, seed, jobs))
                 _one(prepared, out, numbers, variant, seed, quiet, beside)
                 made += 1
         if made == before:
@@ -141,16 +140,65 @@ def _run_words(
     numbers: list[int],
     variant: Variant,
     seed: int,
-    seconds: float | None,
+    jobs: int,
 ) -> str:
-    """Say which run begins, of how many, and how long the rest takes if a run takes so long."""
+    """Say which run begins, of how many, and how long the rest takes."""
     total = len(prepared.units)
     done = sum(_is_done(out, numbers, *unit) for unit in prepared.units)
     line = (
         f"{variant.name}, seed {seed}: method {_place(prepared, variant)} of "
         f"{len(prepared.variants)}, {done} of {total} runs done"
     )
-    return line if seconds is None else f"{line}, about {_words(seconds * (total - done))} left"
+    seconds, told = time_left(prepared, out, numbers)
+    if not told:
+        return line
+    of = "" if told == total - done else f" for {told} of the {total - done}"
+    return f"{line}, about {_words(seconds / jobs)} left{of}"
+
+
+def time_left(prepared: Prepared, out: pathlib.Path, numbers: list[int]) -> tuple[float, int]:
+    """Estimate the time of the runs that are left from finished ones of the same method.
+
+    Methods take times that differ tenfold, so that a mean of all tells nothing. Results of other
+    processes and of earlier calls count, too; compiling does not.
+
+    Args:
+        prepared: the comparison.
+        out: its folder.
+        numbers: of its sets, as `numbers_of` returns them.
+
+    Returns:
+        Seconds in one process, and of how many runs they are: those whose method has finished one.
+    """
+    trained: dict[str, dict[int, float]] = {}
+    evaluated: dict[str, list[float]] = {}
+    left = []
+    for variant, seed in prepared.units:
+        record = folder_of(out, variant.run, seed) / "training.json"
+        if variant.trains and record.exists():
+            trained.setdefault(variant.run, {})[seed] = _seconds_in(record, "seconds_of_steps")
+        if _is_done(out, numbers, variant, seed):
+            paths = (result_path(out, variant, seed, number) for number in numbers)
+            taken = sum(_seconds_in(path, "seconds") for path in paths)
+            evaluated.setdefault(variant.name, []).append(taken)
+        else:
+            left.append((variant, seed))
+    seconds, told, training = 0.0, 0, set[tuple[str, int]]()
+    for variant, seed in left:
+        if variant.name not in evaluated:
+            continue
+        seconds += statistics.fmean(evaluated[variant.name])
+        told += 1
+        run, known = (variant.run, seed), trained.get(variant.run, {})
+        # Methods that share a run train it once.
+        if variant.trains and seed not in known and run not in training:
+            training.add(run)
+            seconds += statistics.fmean(known.values())
+    return seconds, told
+
+
+def _seconds_in(path: pathlib.Path, name: str) -> float:
+    return float(read_json(path, "a result of a comparison").get(name, 0.0))
 
 
 def _start_words(prepared: Prepared) -> str:

@@ -28,6 +28,11 @@ def title_of(row: Row, rows: Sequence[Row]) -> str:
     return f"{row.labels[0]}, {row.grouping}" if several else row.labels[0]
 
 
+def described(row: Row) -> list[str]:
+    """Return a row's labels after the first, for a reader: a hyphen stands where there is none."""
+    return [label or NOTHING for label in row.labels[1:]]
+
+
 def mean_words(recall: Recall) -> str:
     """Format the mean, and the standard deviation if there is one."""
     spread = "" if recall.spread is None else f" ± {percent(recall.spread)}"
@@ -77,7 +82,7 @@ def recall_table(summary: Summary) -> Table:
     for name in summary.sets:
         table.add_column(f"{name}\nmean ± sd, 95 %", no_wrap=True, justify="right")
     for row in summary.rows:
-        cells = [title_of(row, summary.rows), *row.labels[1:], "\n".join(map(str, KS))]
+        cells = [title_of(row, summary.rows), *described(row), "\n".join(map(str, KS))]
         for recalls in row.recalls.values():
             lines = (f"{mean_words(r)}  {interval_words(r):>10}" for r in recalls.values())
             cells.append("\n".join(lines))
@@ -184,7 +189,7 @@ def markdown(summary: Summary) -> str:
         recalls = (r for by_k in row.recalls.values() for r in by_k.values())
         cells = [f"{mean_words(r)} ({interval_words(r)})" for r in recalls]
         title = title_of(row, summary.rows)
-        rows.append([title, *row.labels[1:], costs[0], *cells, *costs[1:]])
+        rows.append([title, *described(row), costs[0], *cells, *costs[1:]])
     text = _markdown(header, rows, labels=len(summary.headers))
     if compared := compared_rows(summary):
         header = [f"{summary.headers[0]}, less {title_of_reference(summary)}"]

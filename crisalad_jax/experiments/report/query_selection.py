@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 
 
 class Verdicts(NamedTuple):

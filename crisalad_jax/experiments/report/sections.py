@@ -17,7 +17,7 @@ from crisalad_jax.experiments.report.placeholders import Placed, find_placed
 from crisalad_jax.experiments.report.positions import position_map
 from crisalad_jax.experiments.report.query_selection import Shown, Verdicts, judge
 from crisalad_jax.experiments.report.similarity import similarity_matrix
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 
 RETRIEVALS = 4
 """Number of retrievals shown for each query."""

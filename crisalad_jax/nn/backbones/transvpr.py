@@ -187,8 +187,8 @@ def embed(
         convs.append(layer)
         parts.append(conv(params.tokenizers[number], x, stride=_side(number), padding=0))
     tokens = jnp.concatenate(parts, axis=-1)
-    tokens = tokens.reshape(len(images), -1, tokens.shape[-1])
-    first = jnp.broadcast_to(params.cls_token, (len(images), 1, tokens.shape[-1]))
+    tokens = tokens.reshape(images.shape[0], -1, tokens.shape[-1])
+    first = jnp.broadcast_to(params.cls_token, (images.shape[0], 1, tokens.shape[-1]))
     tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
     return tokens, dataclasses.replace(params, convs=tuple(convs))
 

@@ -451,7 +451,7 @@ def _with_inserted(
     before, after = _cut_at(params.blocks, (request.insertion, config.depth))
     run = functools.partial(_run_stacks, grid=grid, config=config, remat=remat, valid=valid)
     tokens, first = run(before, tokens)
-    front = jnp.broadcast_to(request.inserted, (len(tokens), *request.inserted.shape))
+    front = jnp.broadcast_to(request.inserted, (tokens.shape[0], *request.inserted.shape))
     tokens, last = run(after, jnp.concatenate([front.astype(tokens.dtype), tokens], axis=1))
     return tokens, first + last
 

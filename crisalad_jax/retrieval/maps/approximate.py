@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.notes import tell
@@ -78,21 +78,11 @@ def open_approximate(
 ) -> Approximate | None:
     """Open the approximate search of the map in `folder`; None where it has none of its images.
 
-    A note tells of one that was built from other images.
-
     Raises:
         InputError: it is damaged, or changed where `verify` asks for that.
     """
-    found = sorted((folder / FOLDER).glob("*.index"))
-    if not found:
-        return None
-    digest = _digest(additions)
-    path = next((path for path in found if path.stem.endswith(digest)), None)
+    path = next(iter(_of_these(_indices(folder), additions)), None)
     if path is None:
-        tell(
-            f"{folder}: found an approximate search of fewer or other images; the map is searched "
-            f"exactly; `crisalad index --search {_kind(found[0])}` builds it anew"
-        )
         return None
     from crisalad_jax.retrieval.faiss_index import load_index
 
@@ -102,6 +92,22 @@ def open_approximate(
     if index.size != count:
         raise InputError(f"{path}: found {index.size} descriptors, expected {count} as in the map")
     return Approximate(index.kind, index, float(record["recall"]))
+
+
+def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
+    """Return the kind of a map's approximate search of fewer or other images; None without any."""
+    found = _indices(folder)
+    return None if not found or _of_these(found, additions) else _kind(found[0])
+
+
+def tell_stale(folder: pathlib.Path, additions: Additions) -> None:
+    """Tell of an approximate search that is not used, since it is of fewer or other images."""
+    kind = stale_kind(folder, additions)
+    if kind is not None:
+        tell(
+            f"{folder}: found an approximate search of fewer or other images; the map is searched "
+            f"exactly; `crisalad index --search {kind}` builds it anew"
+        )
 
 
 def build_approximate(
@@ -172,6 +178,16 @@ def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 def _digest(additions: Additions) -> str:
     lines = (f"{first} {count} {digest}\n" for first, count, digest in additions)
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
+
+
+def _indices(folder: pathlib.Path) -> list[pathlib.Path]:
+    return sorted((folder / FOLDER).glob("*.index"))
+
+
+def _of_these(found: Sequence[pathlib.Path], additions: Additions) -> list[pathlib.Path]:
+    """Return which indices were built from these additions."""
+    digest = _digest(additions)
+    return [path for path in found if path.stem.endswith(digest)]
 
 
 def _kind(path: pathlib.Path) -> str:

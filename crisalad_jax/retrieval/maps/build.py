@@ -19,19 +19,12 @@ from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params
-from crisalad_jax.retrieval.alone import Described, describe_alone
-from crisalad_jax.retrieval.describe import useful_batch_size
-from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.alone import describe_alone
+from crisalad_jax.retrieval.described import Described
+from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
 from crisalad_jax.retrieval.maps.approximate import SEARCHES
-from crisalad_jax.retrieval.maps.manifest import (
-    SHARES,
-    MapDescription,
-    check_model,
-    describe_map,
-    has_images,
-    read_components,
-    read_description,
-)
+from crisalad_jax.retrieval.maps.head import SHARES, check_model, has_images, read_components
+from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, read_description
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.shared import SharedMap
 from crisalad_jax.retrieval.maps.store import store_name

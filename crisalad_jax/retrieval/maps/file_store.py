@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32, Int64
 
 from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.ties import lower_first
-from crisalad_jax.retrieval.search import Neighbours, exact_similarities, rounding
+from crisalad_jax.retrieval.neighbours import Neighbours, exact_similarities, rounding
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, durable_path, npy_header, write_npy
 

@@ -3,20 +3,21 @@
 import pathlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.live import Frame
-from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.maps.follow import Follower
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, asked_similarity, json_rows, json_text
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
-from crisalad_jax.retrieval.windows import FrameDescriber, check_window
 from crisalad_jax.utils.errors import InputError
+
+if TYPE_CHECKING:  # answers are searched without JAX
+    from crisalad_jax.nn.model import Crisalad
 
 
 class FrameSource(Protocol):
@@ -49,7 +50,7 @@ class LiveAnswer(NamedTuple):
 
 def query_live(
     places: Map,
-    params: Crisalad,
+    params: "Crisalad",
     source: FrameSource,
     *,
     k: int = 5,
@@ -97,6 +98,9 @@ def query_live(
         >>> [answer.image.name for _, ranked in found.answers.rows() for answer in ranked]
         ['2.png']
     """
+    from crisalad_jax.nn.model import check_params
+    from crisalad_jax.retrieval.windows import FrameDescriber, check_window
+
     if k < 1:
         raise InputError(f"k: found {k}, expected at least 1")
     config = places.description.config

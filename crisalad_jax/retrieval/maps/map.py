@@ -6,52 +6,54 @@ is as it was before the addition or after it. docs/maps.md has the format.
 """
 
 import contextlib
+import functools
 import hashlib
 import os
 import pathlib
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from crisalad_jax.checkpoints.weights import load_with_hash, model_hash
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.resize import Pixels
-from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.alone import describe_images
 from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
     open_approximate,
+    stale_kind,
+    tell_stale,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.maps.manifest import (
+from crisalad_jax.retrieval.maps.head import (
     COMPONENTS,
     SEGMENTS,
-    MapDescription,
+    MapHead,
     check_model,
     has_images,
     is_checked,
     read_components,
-    read_description,
-    undone_without_images,
-    write_description,
+    read_head,
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import Store, open_store
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
-from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.locks import one_writer
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
+
+if TYPE_CHECKING:  # a map is searched without JAX
+    from crisalad_jax.nn.model import Crisalad
+    from crisalad_jax.retrieval.maps.manifest import MapDescription
 
 
 class MapImage(NamedTuple):
@@ -102,9 +104,11 @@ class Map:
         '2.png'
     """
 
-    def __init__(self, folder: pathlib.Path, description: MapDescription, store: Store) -> None:
+    def __init__(self, folder: pathlib.Path, head: MapHead, store: Store) -> None:
         """Read all records, and check that the store has all of their descriptors."""
-        self.folder, self.description = folder, description
+        self.folder = folder
+        self.head = head
+        """All of map.json but the model's configuration."""
         self.images: list[MapImage] = []
         """The images by number."""
         self._numbers: dict[str, int] = {}
@@ -114,9 +118,11 @@ class Map:
         self._close = weakref.finalize(self, store.close)
         self.calibration: Calibration | None = None
         """What `calibrate` measured; None where it did not, or the map is open for appending."""
-        self.components = read_components(folder, description)
+        self.components = read_components(folder, head)
         """The components that shorten descriptors, and those of queries; None is none."""
         self._approximate: Approximate | None = None
+        self._tells_stale = True
+        """Whether the next search that is not asked to be exact tells why it is."""
         self._checked: Crisalad | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
@@ -128,7 +134,7 @@ class Map:
             listed.discard(path)
         if listed:
             raise InputError(f"{min(listed)}: expected {path.name} before it, found no such file")
-        if not is_checked(description.format):
+        if not is_checked(head.format):
             tell_unchecked(folder)
         store.check([(first, count) for first, count, _ in self._segments])
 
@@ -157,17 +163,17 @@ class Map:
             crisalad_jax.utils.errors.InputError: no-map: found no map, expected a folder that ...
         """
         folder = pathlib.Path(folder)
-        description = read_description(folder)
-        if description is None:
+        head = read_head(folder)
+        if head is None:
             raise InputError(
                 f"{folder}: found no map, expected a folder that `crisalad index` wrote"
             )
         if not has_images(folder):
             raise InputError(f"{folder}: found a map without images, expected at least one")
-        opened = cls._opened(folder, description)
+        opened = cls._opened(folder, head)
         try:
-            opened.calibration = read_calibration(folder, description.model)
-            if verify and description.store == "files":
+            opened.calibration = read_calibration(folder, head.model)
+            if verify and head.store == "files":
                 opened.verify()
             opened._approximate = open_approximate(folder, opened._segments, verify=verify)
         except BaseException:
@@ -176,17 +182,17 @@ class Map:
         return opened
 
     @classmethod
-    def _opened(cls, folder: pathlib.Path, description: MapDescription) -> Self:
+    def _opened(cls, folder: pathlib.Path, head: MapHead) -> Self:
         store = open_store(
-            description.store,
+            head.store,
             folder,
-            collection=description.collection,
-            length=description.descriptor_length,
-            dtype=description.dtype,
+            collection=head.collection,
+            length=head.descriptor_length,
+            dtype=head.dtype,
             new=not has_images(folder),
         )
         try:
-            return cls(folder, description, store)
+            return cls(folder, head, store)
         except BaseException:
             store.close()
             raise
@@ -201,12 +207,26 @@ class Map:
 
     def __repr__(self) -> str:
         """Return one line for a notebook."""
-        length = self.description.descriptor_length
+        length = self.head.descriptor_length
         return f"Map({str(self.folder)!r}: {len(self)} images, {length} numbers each)"
 
     def __len__(self) -> int:
         """Return the number of images."""
         return len(self.images)
+
+    @functools.cached_property
+    def description(self) -> "MapDescription":
+        """The map's description: its `head`, and the model's configuration.
+
+        Raises:
+            InputError: the configuration is not one that this package knows.
+        """
+        from crisalad_jax.retrieval.maps.manifest import read_description
+
+        found = read_description(self.folder)
+        if found is None:
+            raise InputError(f"{self.folder}: found no map any more, expected the one that is open")
+        return found
 
     def image(self, name: str) -> MapImage | None:
         """Return what the map knows of the image of this name; None if it has none."""
@@ -220,7 +240,7 @@ class Map:
         record = read_json(
             path,
             "a record of images",
-            must=lambda _: is_checked(self.description.format),
+            must=lambda _: is_checked(self.head.format),
             quiet=True,
         )
         try:
@@ -259,6 +279,7 @@ class Map:
 
         Search is exact, by inner product; of equal similarities the earlier image stands first.
         A map with an approximate search finds nearly all of them. Their similarities are exact.
+        A note tells, once, of an approximate search that is not of all images, and is not used.
 
         Args:
             queries: unit descriptors, of the map's model, shortened by its `components`.
@@ -277,7 +298,20 @@ class Map:
         k = min(k, len(self))
         if self._approximate is not None and isinstance(self._store, FileStore) and not exact:
             return self._approximate.search(self._store, queries, k, len(self))
+        if self._tells_stale and not exact:
+            tell_stale(self.folder, self._segments)
+            self._tells_stale = False
         return self._store.search(queries, k, len(self))
+
+    @property
+    def search_kind(self) -> str:
+        """How `search` searches: "exact", "hnsw" or "ivf-pq"."""
+        return "exact" if self._approximate is None else self._approximate.kind
+
+    @property
+    def stale_search(self) -> str | None:
+        """Kind of an approximate search that is not used, as it is of fewer or other images."""
+        return stale_kind(self.folder, self._segments) if self._approximate is None else None
 
     def shorten(self, descriptors: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n short"]:
         """Shorten a model's descriptors by the map's `components`; without any they stay."""
@@ -303,7 +337,7 @@ class Map:
             self._segments,
             self._store,
             lambda: self.descriptors,
-            self.description.descriptor_length,
+            self.head.descriptor_length,
             quiet=quiet,
         )
         return None if self._approximate is None else self._approximate.recall
@@ -313,7 +347,7 @@ class Map:
         image: Pixels | str | os.PathLike[str],
         k: int = 5,
         *,
-        params: Crisalad | None = None,
+        params: "Crisalad | None" = None,
     ) -> list[Answer]:
         """Find the images of the map that are most similar to one picture.
 
@@ -344,6 +378,8 @@ class Map:
             >>> [(answer.rank, answer.image.name) for answer in answers][0]
             (1, '3.png')
         """
+        from crisalad_jax.retrieval.alone import describe_images
+
         if k < 1:
             raise InputError(f"k: found {k}, expected at least 1")
         picture = read_image(image) if isinstance(image, str | os.PathLike) else image
@@ -372,7 +408,7 @@ class Map:
         return np.concatenate(parts, axis=1)
 
     def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
-        length = self.description.descriptor_length
+        length = self.head.descriptor_length
         if descriptors.ndim != 2 or not len(descriptors) or descriptors.shape[1] != length:
             raise InputError(
                 f"{name}: found shape {descriptors.shape}, expected (images, {length})"
@@ -428,7 +464,7 @@ class Map:
             for name, size in zip(names, sizes, strict=True)
         ]
         axes = self.axes_of(names, positions)
-        rows = np.ascontiguousarray(descriptors, self.description.dtype)
+        rows = np.ascontiguousarray(descriptors, self.head.dtype)
         segment = _Segment(len(self), len(images), hashlib.sha256(rows.data).hexdigest())
         self._store.add(segment.first, rows)
         record = {
@@ -455,7 +491,7 @@ class Map:
             InputError: one has changed; the message says of which images.
         """
         for segment, descriptors in zip(self._segments, self.descriptors, strict=True):
-            rows = np.ascontiguousarray(descriptors, self.description.dtype)
+            rows = np.ascontiguousarray(descriptors, self.head.dtype)
             if hashlib.sha256(rows.data).hexdigest() != segment.sha256:
                 raise InputError(
                     f"{self._record(segment.first).with_suffix('')}: descriptors {segment.first} "
@@ -486,7 +522,8 @@ class Map:
             "resize": description.config.images_in_words,
             "grouping": description.grouping,
             "store": description.store,
-            "search": "exact" if self._approximate is None else self._approximate.kind,
+            "search": self.search_kind,
+            "stale_search": self.stale_search or "none",
             "components": description.pca or "none",
             "model": description.model,
             "weights": description.weights,
@@ -495,7 +532,7 @@ class Map:
             "verified": verify,
         }
 
-    def load_params(self, weights: str | os.PathLike[str] | None = None) -> Crisalad:
+    def load_params(self, weights: str | os.PathLike[str] | None = None) -> "Crisalad":
         """Load the parameters of the model that made the map.
 
         Args:
@@ -507,26 +544,30 @@ class Map:
         Raises:
             InputError: there is no such file, or it is of another model.
         """
-        file = pathlib.Path(self.description.weights) if weights is None else weights
+        from crisalad_jax.checkpoints.weights import load_with_hash
+
+        file = pathlib.Path(self.head.weights) if weights is None else weights
         if weights is None and not pathlib.Path(file).is_file():
             raise InputError(
                 f"{self.folder}: found no {file}, which made this map, expected it there or as "
                 "--weights"
             )
         params, _, digest = load_with_hash(file)
-        check_model(self.description, self.folder, digest, file)
+        check_model(self.head, self.folder, digest, file)
         self._checked = params
         return params
 
-    def check_params(self, params: Crisalad) -> None:
+    def check_params(self, params: "Crisalad") -> None:
         """Check that parameters are of the model that made the map; the same ones only once.
 
         Raises:
             InputError: they are not.
         """
+        from crisalad_jax.checkpoints.weights import model_hash
+
         if params is not self._checked:
             digest = model_hash(params, self.description.config)
-            check_model(self.description, self.folder, digest, "the given parameters")
+            check_model(self.head, self.folder, digest, "the given parameters")
             self._checked = params
 
     def close(self) -> None:
@@ -537,7 +578,7 @@ class Map:
 @contextlib.contextmanager
 def open_for_appending(
     folder: str | os.PathLike[str],
-    description: MapDescription,
+    description: "MapDescription",
     components: Pca | None = None,
 ) -> Iterator[Map]:
     """Open the map with this description to append to it, or make it, with its components.
@@ -549,6 +590,12 @@ def open_for_appending(
         InputError: another process appends, the map there is another one or what `Map.open` raises,
             or the folder cannot be written to.
     """
+    from crisalad_jax.retrieval.maps.manifest import (
+        read_description,
+        undone_without_images,
+        write_description,
+    )
+
     folder = pathlib.Path(folder)
     read_description(folder)  # raises where something else is there, before anything is made
     with contextlib.ExitStack() as stack:

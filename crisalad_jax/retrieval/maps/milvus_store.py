@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from crisalad_jax.retrieval.maps.ties import lower_first
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"

@@ -1,11 +1,10 @@
 """Queries to a map: which of its images are most similar to others, and where they were taken."""
 
-import itertools
 import json
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -13,22 +12,20 @@ from jaxtyping import Bool, Float32, Float64
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import frame_time
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, check_params
-from crisalad_jax.retrieval.alone import Described, describe_alone
-from crisalad_jax.retrieval.describe import useful_batch_size
-from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.retrieval.described import Described
+from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.follow import Followed, Follower
-from crisalad_jax.retrieval.maps.manifest import DESCRIPTION
+from crisalad_jax.retrieval.maps.head import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
-from crisalad_jax.retrieval.pca import Pca
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
-from crisalad_jax.retrieval.windows import check_window, describe_windows
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.progress import progress_bar
+
+if TYPE_CHECKING:  # answers are searched without JAX
+    from crisalad_jax.nn.model import Crisalad
 
 AT_ONCE = 1024
 """Number of queries that are searched for together: the map is read once for so many."""
@@ -86,7 +83,7 @@ class Answers(NamedTuple):
 
 def query(
     places: Map,
-    params: Crisalad,
+    params: "Crisalad",
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     k: int = 5,
@@ -146,28 +143,16 @@ def query(
     sources = _listed(images, fps)
     paths = [path for source in sources for path in source]
     batch_size = useful_batch_size(batch_size, len(paths))
-    places.check_params(params)
-    config = places.description.config
-    check_window(config, window)
-    try:
-        check_params(params, config)
-    except InputError as error:
-        raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
+    descriptions = _described(
+        places, params, sources, window=window, batch_size=batch_size, on_bad_image=on_bad_image
+    )
     follower = None if sequence is None else Follower(places, sequence)
     parts: list[Neighbours | Followed] = []
     waiting: list[np.ndarray] = []
     unreadable: list[pathlib.Path] = []
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
-        for part in _described(
-            params,
-            config,
-            sources,
-            window=window,
-            batch_size=batch_size,
-            on_bad_image=on_bad_image,
-            components=places.components,
-        ):
+        for part in descriptions:
             waiting.append(part.descriptors)
             unreadable += (paths[index] for index in part.unreadable)
             tried = len(part.indices) + len(part.unreadable)
@@ -210,29 +195,34 @@ def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
 
 
 def _described(
-    params: Crisalad,
-    config: ModelConfig,
+    places: Map,
+    params: "Crisalad",
     sources: Sequence[list[pathlib.Path]],
     *,
     window: int,
     batch_size: int,
     on_bad_image: OnBadImage,
-    components: Pca | None,
 ) -> Iterator[Described]:
-    """Describe the images of all sources; a window holds images of one source alone."""
-    options: dict[str, Any] = {
-        "batch_size": batch_size,
-        "on_bad_image": on_bad_image,
-        "components": components,
-    }
-    if window == 1:
-        yield from describe_alone(params, config, list(itertools.chain(*sources)), **options)
-        return
-    first = 0
-    for source in sources:
-        for part in describe_windows(params, config, source, window=window, **options):
-            yield Described(part.indices + first, part.descriptors, part.unreadable + first)
-        first += len(source)
+    """Check that the model made the map, then describe the images of all sources."""
+    from crisalad_jax.nn.model import check_params
+    from crisalad_jax.retrieval.windows import check_window, describe_sources
+
+    places.check_params(params)
+    config = places.description.config
+    check_window(config, window)
+    try:
+        check_params(params, config)
+    except InputError as error:
+        raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
+    return describe_sources(
+        params,
+        config,
+        sources,
+        window=window,
+        batch_size=batch_size,
+        on_bad_image=on_bad_image,
+        components=places.components,
+    )
 
 
 def _listed(images: Any, fps: float) -> list[list[pathlib.Path]]:

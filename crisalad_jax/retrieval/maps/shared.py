@@ -9,12 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.data.positions import Positions
-from crisalad_jax.retrieval.maps.manifest import (
-    SHARES,
-    MapDescription,
-    has_images,
-    read_description,
-)
+from crisalad_jax.retrieval.maps.head import SHARES, has_images
+from crisalad_jax.retrieval.maps.manifest import MapDescription, read_description
 from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.shares import Share

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 

@@ -15,9 +15,9 @@ from crisalad_jax.config.checks import choose
 from crisalad_jax.data.loader import ImageBatch, ImageCache
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, cast_params
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.retrieval.reranking import patch_netvlad, selavpr, transvpr
-from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar

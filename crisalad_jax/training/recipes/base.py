@@ -82,6 +82,11 @@ def recipe(preset: str, name: str | None = None) -> TrainConfig:
         >>> recipe("b14", "crisalad+gem").model.descriptor_dim
         768
     """
+    if preset not in PRESETS and preset.partition("+")[0] in RECIPES:
+        raise InputError(
+            f"preset: found {preset!r}, which is a recipe (--recipe {preset}), expected a size of "
+            f"the model: {', '.join(sorted(PRESETS))}"
+        )
     model = choose("preset", preset, PRESETS)
     name = ("scratch" if preset == "tiny" else "crisalad") if name is None else name
     if name in RENAMED:
@@ -177,6 +182,11 @@ def find_part(
         if matches:
             break
     if not matches:
+        if name in PRESETS:
+            raise InputError(
+                f"{what}: found {name!r}, which is a preset (--preset {name}), expected one of "
+                f"{', '.join(sorted(others))}"
+            )
         raise InputError(
             f"{what}: found {name!r}, expected one of {', '.join(sorted(others))}, or a "
             f"registered part as NAME or KIND:NAME, with a kind of {', '.join(_PLACES)} (is a "

@@ -121,7 +121,7 @@ def test_a_table_says_what_a_row_changes(ablation):
     config = ComparisonConfig(**ablation | {"names": names, "rows": rows})
     assert labels_of(config) == ("row", "changed")
     assert [variant.labels for variant in prepare(config).variants] == [
-        ("crisalad", "-"),
+        ("crisalad", ""),
         ("no-encoder-step", "cross-image encoder no, scheduler step"),
         ("hot", "optimiser.learning-rate=0.01"),
     ]

@@ -405,3 +405,40 @@ def test_a_run_beside_others_tells_no_training_time(finished, flags, capfd):
     assert "| beside others |" in (finished / "table.md").read_text()
     (row,) = json.loads((finished / "results.json").read_text())["rows"]
     assert (row["training"], row["training_seconds"], row["beside"]) == (None, None, True)
+
+
+def test_the_time_left_is_told_by_runs_of_the_same_method(tmp_path):
+    """A slow method's seconds say nothing of a fast one; re-ranking shares its training."""
+
+    def variant(name, run, *, trains=True):
+        return types.SimpleNamespace(name=name, run=run, trains=trains)
+
+    slow, again, fast = variant("slow", "slow"), variant("slow+r", "slow"), variant("fast", "fast")
+    file = variant("file", "file", trains=False)
+    units = [(v, seed) for v in (slow, again, fast) for seed in (0, 1, 2)] + [(file, 0)]
+    prepared = types.SimpleNamespace(units=units)
+    assert runner.time_left(prepared, tmp_path, [0]) == (0, 0)
+
+    def trained(run, seed, seconds):
+        path = runner.folder_of(tmp_path, run, seed) / "training.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, {"seconds_of_steps": seconds})
+
+    def evaluated(which, seed, seconds):
+        path = runner.result_path(tmp_path, which, seed, 0)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, {"seconds": seconds})
+
+    trained("slow", 0, 1000.0)
+    evaluated(slow, 0, 10.0)
+    # Seeds 1 and 2 of slow; of the others none has finished.
+    assert runner.time_left(prepared, tmp_path, [0]) == (2 * 1010, 2)
+    evaluated(again, 0, 30.0)
+    # Two evaluations each, and one training of each seed.
+    assert runner.time_left(prepared, tmp_path, [0]) == (2 * (1000 + 10 + 30), 4)
+    trained("slow", 1, 2000.0)
+    # Seed 1 is to be evaluated only; seed 2 trains as long as the two did on average.
+    assert runner.time_left(prepared, tmp_path, [0]) == (1500 + 2 * (10 + 30), 4)
+    trained("fast", 0, 5.0)
+    evaluated(fast, 0, 1.0)
+    assert runner.time_left(prepared, tmp_path, [0]) == (1500 + 2 * (10 + 30) + 2 * 6, 6)

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import types
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import rich.console
 
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.experiments.comparison import AdapterCost, Recall, Row, Summary, tables
+from crisalad_jax.experiments.comparison.page import write_page
 from crisalad_jax.experiments.comparison.paired import Difference
 from crisalad_jax.experiments.comparison.summary import recall_of
 from crisalad_jax.experiments.comparison.timing import Race, race
@@ -107,6 +109,30 @@ def test_csv_has_a_line_for_each_number():
         **dict.fromkeys(("difference", "difference_low", "difference_high", "verdict"), ""),
     }
     assert lines[-1]["standard_deviation"] == lines[-1]["training"] == ""
+
+
+def test_a_row_that_changes_nothing_has_an_empty_cell_in_csv_and_a_hyphen_for_readers():
+    plain = row("first", "single", LONE, labels=("base", ""))
+    summary = SUMMARY._replace(headers=("row", "changed"), rows=[plain], sets={"town": None})
+    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(summary))))
+    assert [line["changed"] for line in lines] == ["", "", ""]
+    assert not {"-", "'-", "\N{EM DASH}"} & {cell for line in lines for cell in line.values()}
+    assert tables.markdown(summary).splitlines()[2].startswith("| base | - | 8,448 | 25.0")
+
+
+def test_on_a_narrow_page_what_a_row_changes_stands_below_its_name(tmp_path):
+    """A column of its own pushed all recalls out of sight, at 390 pixels."""
+    words = "model.aggregator=gem, <b>"
+    plain = row("first", "single", LONE, labels=("base", words))
+    town = types.SimpleNamespace(queries=[0], database=[0], rule="within 25 m")
+    summary = SUMMARY._replace(kind="ablate", headers=("row", "changed"), rows=[plain])
+    page = write_page(summary._replace(sets={"town": town}), tmp_path).read_text()
+    shown = "model.<wbr>aggregator=gem, &lt;b&gt;"
+    assert f'base<small class="under">{shown}</small></th>' in page
+    assert f'<td class="label">{shown}</td>' in page
+    narrow = page.partition("@media (max-width: 40rem) {\n  /* Beside")[2].partition("\n}")[0]
+    assert "td.label { display: none; }" in narrow
+    assert ".under { display: block; }" in narrow
 
 
 def test_json_is_json():

@@ -19,7 +19,7 @@ from crisalad_jax.evaluation.results import GroupingResult, Scores
 from crisalad_jax.experiments.report import write_report
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from crisalad_jax.experiments.report.query_selection import choose_shown, judge
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 
 
 def test_verdicts_by_hand():

@@ -11,7 +11,7 @@ import crisalad_jax as cj
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report.transport import CLUSTER_COLOURS
 from crisalad_jax.nn.model import parameter_shapes
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from tests.conftest import MODEL
 
 

@@ -24,7 +24,7 @@ from crisalad_jax.retrieval.maps.calibration import (
 )
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query
-from crisalad_jax.retrieval.search import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, random_params

@@ -17,13 +17,8 @@ import pytest
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.maps.manifest import (
-    MapDescription,
-    check_model,
-    describe_map,
-    read_description,
-    write_record,
-)
+from crisalad_jax.retrieval.maps.head import check_model, write_record
+from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, read_description
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.utils.checksums import sealed_json
 from crisalad_jax.utils.errors import InputError

@@ -11,7 +11,8 @@ import pytest
 from crisalad_jax.retrieval.maps import milvus_store as milvus
 from crisalad_jax.retrieval.maps.store import Store, open_store, store_name
 from crisalad_jax.retrieval.maps.ties import lower_first
-from crisalad_jax.retrieval.search import Neighbours, search
+from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.search import search
 from crisalad_jax.utils.errors import InputError
 
 LENGTH = 24

@@ -14,6 +14,7 @@ from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.projection import ProjectionConfig
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import (
     Reranker,
     Reranking,
@@ -22,7 +23,6 @@ from crisalad_jax.retrieval.reranking import (
     stage,
     transvpr,
 )
-from crisalad_jax.retrieval.search import Neighbours
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, random_params
 

@@ -1,0 +1,103 @@
+"""Engines that run exported programs: onnxruntime and OpenVINO. Nothing here needs jax."""
+
+import importlib
+import pathlib
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from crisalad_jax.config.checks import choose
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
+
+EngineName = Literal["onnxruntime", "openvino"]
+Precision = Literal["float32", "bfloat16"]
+Program = Callable[[np.ndarray], np.ndarray]
+"""A loaded program: images to descriptors."""
+IMAGES, DESCRIPTORS = "images", "descriptors"
+"""Names of a program's input and output."""
+_TOOLS = "openvino.tools.ovc"
+
+
+def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
+    import onnxruntime
+
+    if precision != "float32":
+        raise InputError(
+            f"compute dtype: found {precision} with onnxruntime, expected float32 (or openvino)"
+        )
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    return lambda images: np.asarray(session.run([DESCRIPTORS], {IMAGES: images})[0])
+
+
+def import_openvino() -> Any:
+    """Import OpenVINO without its tools, whose import takes time, and tells its makers of it."""
+    is_first = "openvino" not in sys.modules
+    if is_first:
+        sys.modules[_TOOLS] = None  # type: ignore[assignment]
+    try:
+        return importlib.import_module("openvino")
+    finally:
+        if is_first:
+            del sys.modules[_TOOLS]
+
+
+def _openvino(path: pathlib.Path, precision: Precision) -> Program:
+    openvino = import_openvino()
+    # Left to itself it takes fewer bits where the processor has units for them.
+    hint = {"float32": "f32", "bfloat16": "bf16"}[precision]
+    compiled = openvino.Core().compile_model(path, "CPU", {"INFERENCE_PRECISION_HINT": hint})
+    return lambda images: np.array(compiled([images])[0])
+
+
+_ENGINES: Mapping[str, Callable[[pathlib.Path, Precision], Program]] = {
+    "onnxruntime": _onnxruntime,
+    "openvino": _openvino,
+}
+
+
+def load_program(
+    engine: EngineName, path: pathlib.Path, precision: Precision = "float32"
+) -> Program:
+    """Load a program into an engine, on the CPU.
+
+    Args:
+        engine: its name.
+        path: a file .onnx, or .xml of OpenVINO, which reads both.
+        precision: type of the matrix products; onnxruntime has float32 alone.
+
+    Returns:
+        A function of images to descriptors.
+
+    Raises:
+        InputError: the engine is unknown, is not installed, or cannot read the file.
+    """
+    load = choose("runtime", engine, _ENGINES)
+    try:
+        return load(path, precision)
+    except ModuleNotFoundError as error:
+        raise InputError(missing_extra(error, f"runtime {engine}")) from error
+    except InputError:
+        raise
+    except Exception as error:  # each engine has its own, and some are of no class of theirs
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: {engine} cannot load it: {reason}") from error
+
+
+def convert_to_openvino(program: pathlib.Path, out: pathlib.Path) -> None:
+    """Convert an ONNX program to OpenVINO's two files, `out` and the weights beside it (.bin).
+
+    Raises:
+        InputError: OpenVINO is not installed.
+    """
+    try:
+        openvino = import_openvino()
+    except ModuleNotFoundError as error:
+        raise InputError(missing_extra(error, "format openvino")) from error
+    model = openvino.Core().read_model(program)
+    # By default the weights lose half of their bits.
+    openvino.save_model(model, out, compress_to_fp16=False)

@@ -1,0 +1,137 @@
+"""Walk through a traced program, and convert it equation by equation."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from crisalad_jax.checkpoints.onnx_format import elementwise, products, reductions, shapes
+from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known
+from crisalad_jax.checkpoints.onnx_format.registry import CONVERTERS, Unsupported
+
+MODULES = elementwise, products, reductions, shapes
+"""Modules whose import registers converters."""
+_CALLED = ("jaxpr", "call_jaxpr")
+"""Parameters of primitives that call a program once: `jax.jit`, rematerialisation, own gradients"""
+
+
+def convert(graph: Graph, traced: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
+    """Append the nodes of a program.
+
+    Args:
+        graph: takes them.
+        traced: the program, of `jax.make_jaxpr`.
+        inputs: its arguments, constants or not.
+
+    Returns:
+        The outputs. Those that an unknown primitive is part of say so in `Value.missing`.
+    """
+    return _run(graph, traced.jaxpr, [Value.of(each) for each in traced.consts], inputs)
+
+
+def _run(
+    graph: Graph, program: Jaxpr, constants: Sequence[Value], inputs: Sequence[Value]
+) -> list[Value]:
+    values = dict(zip((*program.constvars, *program.invars), (*constants, *inputs), strict=True))
+
+    def read(atom: Any) -> Value:
+        if isinstance(atom, Literal):
+            aval: Any = atom.aval
+            return Value.of(np.asarray(atom.val, aval.dtype))
+        return values[atom]
+
+    for eqn in program.eqns:
+        given = [read(atom) for atom in eqn.invars]
+        values.update(zip(eqn.outvars, _equation(graph, given, eqn), strict=True))
+    return [read(atom) for atom in program.outvars]
+
+
+def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
+    """Convert an equation. What it lacks is remembered, and raised only if it turns out needed."""
+    name = eqn.primitive.name
+    called = next((eqn.params[key] for key in _CALLED if key in eqn.params), None)
+    if name == "scan":
+        return _unrolled(graph, inputs, eqn)
+    if name == "cond" and inputs[0].constant is not None:
+        which = int(inputs[0].constant.item())
+        branch = eqn.params["branches"][min(max(which, 0), len(eqn.params["branches"]) - 1)]
+        return convert(graph, branch, inputs[1:])
+    if called is not None and not name.startswith(("while", "custom_linear")):
+        closed = isinstance(called, ClosedJaxpr)
+        constants = [Value.of(each) for each in called.consts] if closed else []
+        return _run(graph, called.jaxpr if closed else called, constants, inputs)
+    missing = next((value.missing for value in inputs if value.missing), "")
+    if not missing and all(0 in var.aval.shape for var in eqn.outvars):
+        # Of arrays without numbers engines cannot tell the symbolic side.
+        return [_nothing(var.aval) for var in eqn.outvars]
+    if not missing:
+        try:
+            if name in CONVERTERS:
+                return CONVERTERS[name](graph, inputs, eqn)
+            return _folded(inputs, eqn)
+        except Unsupported as error:
+            missing = str(error)
+    nothing = np.dtype(np.float32)  # of types of JAX's own, such as a key's, there is no other
+    return [Value(var.aval.shape, nothing, missing=missing) for var in eqn.outvars]
+
+
+def _nothing(aval: Any) -> Value:
+    return Value.of(np.zeros([s if is_known(s) else 1 for s in aval.shape], aval.dtype))
+
+
+def _folded(inputs: list[Value], eqn: Any) -> list[Value]:
+    """Compute what has constant inputs, by any primitive."""
+    arrays = [value.constant for value in inputs]
+    wholes = [var.aval.shape for var in eqn.invars]
+    known = all(is_known(size) for shape in wholes for size in shape)
+    plain = all(isinstance(var.aval.dtype, np.dtype) for var in eqn.outvars)  # no keys
+    if any(array is None for array in arrays) or not (known and plain and inputs):
+        raise Unsupported(eqn.primitive.name)
+    full = [np.broadcast_to(a, shape) for a, shape in zip(arrays, wholes, strict=True)]  # type: ignore
+    results = eqn.primitive.bind(*map(np.asarray, full), **eqn.params)
+    return [Value.of(each) for each in (results if eqn.primitive.multiple_results else [results])]
+
+
+def _unrolled(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
+    """Convert a loop of so many turns, turn by turn: its slices of weights are then constants."""
+    params, length = eqn.params, eqn.params["length"]
+    body, count = params["jaxpr"], params["num_carry"]
+    fixed, carry, rows = _parts(inputs, params["num_consts"], count)
+    if not is_known(length):
+        return [
+            Value(var.aval.shape, np.dtype(np.float32), missing="scan over the images")
+            for var in eqn.outvars
+        ]
+    results: list[list[Value]] = []
+    order = range(length)[::-1] if params["reverse"] else range(length)
+    for number in order:
+        own = [_row(graph, x, number) for x in rows]
+        outputs = convert(graph, body, [*fixed, *carry, *own])
+        carry, made = outputs[:count], outputs[count:]
+        results.append(made)
+    if params["reverse"]:
+        results.reverse()
+    stacks = [_stack(graph, each) for each in zip(*results, strict=True)]
+    return [*carry, *stacks]
+
+
+def _parts(values: list[Value], *ends: int) -> Iterator[list[Value]]:
+    """Yield the first so many values, then the next, and the rest."""
+    for count in ends:
+        yield values[:count]
+        values = values[count:]
+    yield values
+
+
+def _row(graph: Graph, x: Value, number: int) -> Value:
+    if x.missing:
+        return x
+    start = 0 if x.shape[0] == 1 else number
+    part = graph.slice(x, {0: (start, start + 1, 1)})
+    return graph.reshape(part, part.shape[1:])
+
+
+def _stack(graph: Graph, values: Sequence[Value]) -> Value:
+    broken = next((value for value in values if value.missing), None)
+    return broken or shapes.stacked(graph, values, 0)

@@ -1,0 +1,289 @@
+"""The nodes of an ONNX graph as they are made, and the values that run between them."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from crisalad_jax.utils.version import VERSION
+
+OPSET = 17
+"""Version of the operators: all engines of the last years take it, TensorRT since 8.5."""
+_IR_VERSION = 8
+"""Version of the file format that came with these operators."""
+Size = Any
+"""A side of an array: an integer, or JAX's expression in the symbolic number of images."""
+Shape = tuple[Size, ...]
+
+
+def is_known(size: Size) -> bool:
+    """Return whether a side is a number, and not symbolic."""
+    return isinstance(size, int | np.integer)
+
+
+def is_one(size: Size) -> bool:
+    """Return whether a side is 1, as of what a node broadcasts by itself."""
+    return is_known(size) and size == 1
+
+
+def common_shape(*shapes: Shape) -> Shape:
+    """Broadcast shapes as numpy does; their sides are known to fit."""
+    rank = max(map(len, shapes))
+    padded = [(1,) * (rank - len(shape)) + tuple(shape) for shape in shapes]
+    columns = zip(*padded, strict=True)
+    return tuple(next((size for size in sides if not is_one(size)), 1) for sides in columns)
+
+
+def _with_side(shape: Shape, axis: int, size: Size) -> Shape:
+    return (*shape[:axis], size, *shape[axis + 1 :])
+
+
+@dataclasses.dataclass(frozen=True)
+class Value:
+    """A constant, or an output of a node.
+
+    It is broadcast lazily: sides of `shape` are 1 where those of the array in JAX's program are
+    more, and all rows along them alike.
+    """
+
+    shape: Shape
+    dtype: np.dtype
+    name: str = ""
+    constant: np.ndarray | None = None
+    missing: str = ""
+    """What could not be converted, of which this would be the result; empty where it is there."""
+
+    @classmethod
+    def of(cls, array: Any) -> "Value":
+        """Return a constant."""
+        array = np.asarray(array)
+        return cls(array.shape, array.dtype, constant=array)
+
+
+class Graph:
+    """The nodes so far."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[str, np.ndarray] = {}
+        self.symbolic: dict[Any, str] = {}
+        """Names of int64 vectors of one number by the symbolic sides that they hold."""
+        self._names: dict[Any, str] = {}
+
+    def constant(self, array: np.ndarray) -> str:
+        """Return the name of a constant; small ones that are alike share it."""
+        small = array.nbytes <= 1024
+        key = (str(array.dtype), array.shape, array.tobytes()) if small else id(array)
+        if key not in self._names:
+            self._names[key] = f"c{len(self.constants)}"
+            self.constants[self._names[key]] = array
+        return self._names[key]
+
+    def name(self, value: Value) -> str:
+        """Return the name of a value, which becomes a constant of the graph where it is one."""
+        return value.name if value.constant is None else self.constant(value.constant)
+
+    def ints(self, *numbers: int) -> str:
+        """Return the name of a constant vector of int64, as nodes take sides and axes."""
+        return self.constant(np.array(numbers, np.int64))
+
+    def node(
+        self, operator: str, inputs: Sequence[str], outputs: int = 1, **attributes: Any
+    ) -> list[str]:
+        """Append a node, and return its outputs' names."""
+        names = [f"{operator}_{len(self.nodes)}{f'_{i}' if i else ''}" for i in range(outputs)]
+        self.nodes.append(helper.make_node(operator, inputs, names, name=names[0], **attributes))
+        return names
+
+    def add(
+        self,
+        operator: str,
+        inputs: Sequence[Value | str],
+        shape: Shape,
+        dtype: Any,
+        **attributes: Any,
+    ) -> Value:
+        """Append a node of one output, and return it."""
+        names = [each if isinstance(each, str) else self.name(each) for each in inputs]
+        (name,) = self.node(operator, names, **attributes)
+        return Value(tuple(shape), np.dtype(dtype), name)
+
+    def side(self, size: Size) -> str:
+        """Return the name of a vector of one int64: a side's number, computed where symbolic."""
+        if is_known(size):
+            return self.ints(int(size))
+        if size not in self.symbolic:
+            for unit, name in list(self.symbolic.items()):
+                factor = size // unit
+                if factor * unit == size:
+                    (product,) = self.node("Mul", [name, self.side(factor)])
+                    self.symbolic[size] = product
+                    break
+            else:
+                raise ValueError(f"a side of {size}")
+        return self.symbolic[size]
+
+    def sides(self, shape: Shape) -> str:
+        """Return the name of an int64 vector of a shape's numbers."""
+        if all(map(is_known, shape)):
+            return self.ints(*map(int, shape))
+        return self.node("Concat", [self.side(size) for size in shape], axis=0)[0]
+
+    def full(self, value: Value, shape: Shape, axes: Sequence[int] | None = None) -> Value:
+        """Broadcast a value to the whole shape of its array, or along some axes."""
+        axes = range(len(shape)) if axes is None else axes
+        wanted = tuple(
+            size if axis in axes else own
+            for axis, (own, size) in enumerate(zip(value.shape, shape, strict=True))
+        )
+        if wanted == value.shape:
+            return value
+        if value.constant is not None and all(map(is_known, wanted)):
+            return Value.of(np.broadcast_to(value.constant, wanted))
+        # A side of 1 keeps what is there: only those that grow need a number while it runs.
+        grown = [s if is_one(o) else 1 for o, s in zip(value.shape, wanted, strict=True)]
+        return self.add("Expand", [value, self.sides(tuple(grown))], wanted, value.dtype)
+
+    def reshape(self, value: Value, shape: Shape) -> Value:
+        """Reshape a value that is not broadcast along any side that changes."""
+        if tuple(value.shape) == tuple(shape):
+            return value
+        if value.constant is not None:
+            return Value.of(value.constant.reshape(shape))
+        unknown = [size for size in shape if not is_known(size)]
+        if len(unknown) > 1:
+            return self.add("Reshape", [value, self.sides(shape)], shape, value.dtype)
+        numbers = self.ints(*(int(size) if is_known(size) else -1 for size in shape))
+        return self.add("Reshape", [value, numbers], shape, value.dtype)
+
+    def transpose(self, value: Value, axes: Sequence[int]) -> Value:
+        """Reorder axes."""
+        if list(axes) == list(range(len(axes))):
+            return value
+        if value.constant is not None:
+            return Value.of(value.constant.transpose(axes))
+        shape = tuple(value.shape[axis] for axis in axes)
+        return self.add("Transpose", [value], shape, value.dtype, perm=list(axes))
+
+    def cast(self, value: Value, dtype: Any) -> Value:
+        """Convert to another type."""
+        if value.dtype == np.dtype(dtype):
+            return value
+        if value.constant is not None:
+            return Value.of(value.constant.astype(dtype))
+        return self.add("Cast", [value], value.shape, dtype, to=tensor_type(dtype))
+
+    def slice(self, value: Value, ranges: Mapping[int, tuple[int, int, int]]) -> Value:
+        """Take some of each axis: start, end and step by axis."""
+        ranges = {
+            axis: (start, end, step)
+            for axis, (start, end, step) in ranges.items()
+            if (start, end, step) != (0, value.shape[axis], 1)
+        }
+        if not ranges:
+            return value
+        if value.constant is not None:
+            cuts = [slice(*ranges.get(axis, (None,))) for axis in range(value.constant.ndim)]
+            return Value.of(value.constant[tuple(cuts)])
+        shape = [
+            len(range(*ranges[axis])) if axis in ranges else size
+            for axis, size in enumerate(value.shape)
+        ]
+        starts, ends, steps = zip(*ranges.values(), strict=True)
+        vectors = [self.ints(*each) for each in (starts, ends, tuple(ranges), steps)]
+        return self.add("Slice", [value, *vectors], tuple(shape), value.dtype)
+
+    def concatenate(self, values: Sequence[Value], axis: int) -> Value:
+        """Join values, which are of one shape but for the axis, and whole along it."""
+        values = [value for value in values if value.shape[axis] != 0] or values[:1]
+        shape = common_shape(*(_with_side(v.shape, axis, 1) for v in values))
+        parts = [self.full(v, _with_side(shape, axis, v.shape[axis])) for v in values]
+        shape = _with_side(shape, axis, sum(v.shape[axis] for v in values))
+        if all(part.constant is not None for part in parts):
+            return Value.of(np.concatenate([part.constant for part in parts], axis))  # type: ignore
+        return self.add("Concat", parts, shape, parts[0].dtype, axis=axis)
+
+    def model(
+        self, inputs: Sequence[Value], outputs: Sequence[tuple[str, Value]], words: str
+    ) -> onnx.ModelProto:
+        """Return the program of what the outputs need.
+
+        The arrays of large constants are left out: `write_model` puts them beside it or into it.
+        """
+        for name, value in outputs:
+            self.nodes.append(helper.make_node("Identity", [self.name(value)], [name]))
+        needed, nodes = {name for name, _ in outputs}, []
+        for node in reversed(self.nodes):
+            if not needed.isdisjoint(node.output):
+                nodes.append(node)
+                needed.update(node.input)
+        self.constants = {name: each for name, each in self.constants.items() if name in needed}
+        graph = helper.make_graph(
+            nodes[::-1],
+            "describe",
+            [_info(value.name, value) for value in inputs],
+            [_info(name, value) for name, value in outputs],
+            doc_string=words,
+        )
+        opset = helper.make_opsetid("", OPSET)
+        return helper.make_model(
+            graph,
+            opset_imports=[opset],
+            ir_version=_IR_VERSION,
+            producer_name="crisalad-jax",
+            producer_version=VERSION,
+        )
+
+
+def tensor_type(dtype: Any) -> int:
+    """Return ONNX's number of a type."""
+    return helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+
+
+def _info(name: str, value: Value) -> onnx.ValueInfoProto:
+    shape = [int(size) if is_known(size) else str(size) for size in value.shape]
+    return helper.make_tensor_value_info(name, tensor_type(value.dtype), shape)
+
+
+_PAGE = 4096
+"""Bytes that arrays beside a program begin at multiples of, so that they can be mapped."""
+
+
+def place_constants(
+    model: onnx.ModelProto, constants: Mapping[str, np.ndarray], beside: str | None
+) -> list[tuple[int, np.ndarray]]:
+    """Put constants into a program, or tell it where they lie in a file beside it.
+
+    Args:
+        model: the program, which is changed.
+        constants: the arrays by name.
+        beside: name of the file for those of a page or more; None puts all into the program.
+
+    Returns:
+        Where each array begins in the file, in order.
+    """
+    places, end = [], 0
+    for name, array in constants.items():
+        if beside is None or array.nbytes < _PAGE:
+            # A view of transposed numbers is written in the order of its axes.
+            tensor = numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
+        else:
+            tensor = TensorProto(
+                name=name,
+                data_type=tensor_type(array.dtype),
+                dims=array.shape,
+                data_location=TensorProto.EXTERNAL,
+            )
+            start = math.ceil(end / _PAGE) * _PAGE
+            where = {"location": beside, "offset": str(start), "length": str(array.nbytes)}
+            for key, value in where.items():
+                tensor.external_data.add(key=key, value=value)
+            places.append((start, array))
+            end = start + array.nbytes
+        model.graph.initializer.append(tensor)
+    return places

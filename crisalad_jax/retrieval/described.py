@@ -1,0 +1,16 @@
+"""What describing some images gives."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+
+class Described(NamedTuple):
+    """Descriptors of a few images."""
+
+    indices: Int64[np.ndarray, " n"]
+    """Indices of the readable images in the list of paths."""
+    descriptors: Float32[np.ndarray, "n d"]
+    unreadable: Int64[np.ndarray, " _"]
+    """Indices of the images that could not be read."""

@@ -1,0 +1,191 @@
+"""The head of a map: all of map.json but the model's configuration, and the names of its files.
+
+It needs no JAX, so that what describes images by another runtime starts without it.
+"""
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from crisalad_jax.config.io import from_plain
+from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
+from crisalad_jax.utils.checksums import sealed_json
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import durable_path, read_json
+from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.temporaries import LOCK, is_temporary
+
+FORMAT = 4
+"""Newest version of the format that this package reads, and that of a map with components. Others
+are written as format 3, which earlier versions read. Maps of format 2
+have records without checksums; those of format 1 (package version 0.1) also have a hash of all
+fields that a model had then."""
+DESCRIPTION, SEGMENTS, LOCKS = "map.json", "segments", (LOCK, ".lock")
+"""Names of the description, of the folder of additions, and of the locks for appending, today's
+first."""
+COMPONENTS, SHARES = "pca.safetensors", "shares"
+"""Names of the components that shorten descriptors, and of the folder of shares to be joined."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MapHead:
+    """The contents of map.json without the model's configuration, which needs JAX."""
+
+    model: str
+    """The `model_hash` of the weights that describe its images, and its queries."""
+    weights: str
+    """Where those weights were."""
+    descriptor_length: int
+    store: str = "files"
+    """Where descriptors are stored; see `store.store_name`."""
+    dtype: str = "float32"
+    """Type of the stored descriptors."""
+    grouping: str = "single"
+    """Every image is described alone, so that no descriptor depends on neighbouring images."""
+    collection: str = ""
+    """Name of Milvus' collection of the descriptors."""
+    created: str = ""
+    pca: str = ""
+    """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
+    none."""
+    format: int = 3
+
+
+_Head = TypeVar("_Head", bound=MapHead)
+
+
+def read_value(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Read map.json as JSON values; None where a new map can be made.
+
+    Raises:
+        InputError: the folder is a file or holds other things than a map, or the map is damaged or
+            of a newer version of this package.
+    """
+    folder = pathlib.Path(folder)
+    path = folder / DESCRIPTION
+    if not path.exists():
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: found a file, expected a map's folder")
+        # A process killed before it has made the map leaves its lock and temporary files behind.
+        others = sorted(other_files(folder, *LOCKS, SEGMENTS, COMPONENTS, SHARES))
+        if other_files(folder / SEGMENTS):
+            others.append(SEGMENTS)
+        if others:
+            raise InputError(
+                f"{folder}: found {others[0]} and no {DESCRIPTION}, expected a map or an empty "
+                "folder"
+            )
+        return None
+    # Who edits the description removes its checksum. A changed key would be an unknown field.
+    value = read_json(path, "a map", quiet=True)
+    version = _version(value)
+    if version > FORMAT:
+        raise InputError(
+            f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
+            "crisalad-jax"
+        )
+    return value
+
+
+def read_head(folder: str | os.PathLike[str]) -> MapHead | None:
+    """Read all of a map's description but the model's configuration; None where there is no map.
+
+    Raises:
+        InputError: the folder is a file or holds other things than a map, or the map is damaged or
+            of a newer version of this package.
+    """
+    folder = pathlib.Path(folder)
+    value = read_value(folder)
+    if value is None:
+        return None
+    if isinstance(value, dict):
+        value.pop("config", None)
+    return checked(from_plain(MapHead, value, source=str(folder / DESCRIPTION)), folder)
+
+
+def checked(head: _Head, folder: pathlib.Path) -> _Head:
+    """Return a description whose store this package knows.
+
+    Raises:
+        InputError: it does not.
+    """
+    try:
+        store_name(head.store, folder, head.dtype)
+    except InputError as error:
+        raise InputError(f"{folder / DESCRIPTION}: {error}") from error
+    return head
+
+
+def read_components(folder: pathlib.Path, description: MapHead) -> Pca | None:
+    """Read the components of a map; None where it has none.
+
+    Raises:
+        InputError: the file is gone, damaged, or of other components.
+    """
+    if not description.pca:
+        return None
+    pca = load_pca(folder / COMPONENTS)
+    if pca_hash(pca) != description.pca:
+        raise InputError(
+            f"{folder / COMPONENTS}: found other components, expected those that {DESCRIPTION} says"
+        )
+    return pca
+
+
+def _version(value: Any) -> int:
+    """Return the format that a description says; 0 where it says none."""
+    version = value.get("format") if isinstance(value, dict) else None
+    return version if type(version) is int else 0
+
+
+def is_checked(version: int) -> bool:
+    """Return whether the records of a map of this format hold checksums."""
+    return version >= 3
+
+
+def other_files(folder: pathlib.Path, *names: str) -> list[str]:
+    """Return the names in `folder` that are neither temporary nor in `names`."""
+    if not folder.is_dir():
+        return []
+    return [p.name for p in folder.iterdir() if p.name not in names and not is_temporary(p)]
+
+
+def has_images(folder: pathlib.Path) -> bool:
+    """Return whether a folder holds a map with images; a map without any counts as none."""
+    return any((folder / SEGMENTS).glob("[0-9]*.json"))
+
+
+def check_model(
+    description: MapHead, folder: str | os.PathLike[str], digest: str, weights: object
+) -> None:
+    """Check that a map was made by the model with the hash `digest`.
+
+    A map of version 0.1 cannot be checked; a note tells so.
+
+    Raises:
+        InputError: the hashes differ; the message has both.
+    """
+    if description.format < 2:
+        tell(
+            f"{folder}: found a map of crisalad-jax 0.1, which cannot tell whether {weights} made "
+            "it; `crisalad index` into a new folder makes one that can"
+        )
+    elif digest != description.model:
+        raise InputError(
+            f"{folder}: found a map made by model {description.model[:12]} "
+            f"({description.weights}), but {weights} is model {digest[:12]}"
+        )
+
+
+def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | None = None) -> None:
+    """Write an object as JSON with its checksum, whole or not at all, and flush it to the disk.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written to.
+    """
+    data = sealed_json(value, indent)
+    with durable_path(path) as temporary:
+        temporary.write_bytes(data)

@@ -1,0 +1,118 @@
+"""Export every kind of published model in every format, and measure what the formats change.
+
+    python scripts/bench/export_zoo.py [--models salad cricavpr] [--page docs/export.md]
+
+Weights are random: no file of a model is needed, but for the shapes in parity/. A line of the table
+is a model, and a number is the largest difference of any number of a few descriptors from those of
+`describe`. With --page the table takes its place in the page.
+"""
+
+import argparse
+import gc
+import pathlib
+import sys
+import tempfile
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+import safetensors.numpy
+
+from crisalad_jax.checkpoints.export import FORMATS, ExportConfig, write_export
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import around
+
+ROOT = pathlib.Path(__file__).parents[2]
+MODELS = (
+    *("tiny", "b14", "salad", "salad-cm", "megaloc", "cricavpr", "boq-dinov2", "boq-resnet50"),
+    *("mixvpr-4096", "conv-ap-4096", "cosplace-vgg16-512", "cosplace-resnet18-512"),
+    *("eigenplaces-resnet50-2048", "netvlad-nanne", "netvlad-hloc", "patch-netvlad-mapillary-4096"),
+    *("selavpr-msls", "transvpr-msls", "supervlad", "supervlad-crossimage", "supervlad-1-cluster"),
+    *("edtformer", "image", "dino-mix", "vlad-buff-4096", "vlad-buff-8192", "fol-base"),
+    *("salad-indoor-gb1-10-25", "dinov2-vits14", "dinov2-vitb14-reg4", "dinov3-vits16"),
+    *("dinov3-vits16plus", "anyloc-indoor"),
+)
+"""One of each kind; its other sizes have the same operations."""
+IMAGES = 3
+
+
+def config_of(name: str) -> ModelConfig:
+    """The configuration of a preset, or of a published model by the shapes of its file."""
+    if name in PRESETS:
+        return PRESETS[name]
+    sys.path.insert(0, str(ROOT))
+    from tests.checkpoints.test_published import inferred
+
+    return inferred(name)
+
+
+def difference(
+    folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig
+) -> float:
+    """The largest difference of a format's descriptors, or InputError where it cannot hold it."""
+    manifest = write_export(folder, params, config, how)
+    if how.format != "stablehlo":
+        return manifest["checked"]["largest_difference"]
+    program = jax.export.deserialize(bytearray((folder / "describe.jax_export").read_bytes()))
+    weights = safetensors.numpy.load_file(folder / "weights.safetensors")
+    images = np.random.default_rng(0).integers(0, 256, (IMAGES, *config.input_size, 3), np.uint8)
+    if manifest["images"]["dtype"] == "float32":
+        mean, deviation = (
+            np.array(each, np.float32)
+            for each in (config.preprocessing.mean, config.preprocessing.deviation)
+        )
+        images = (images / np.float32(255) - mean) / deviation
+    mask = self_mask(IMAGES) if how.grouping == "single" else None
+    expected = np.asarray(describe(params, images, config, mask=mask))
+    longest = np.linalg.norm(expected, axis=1).max()
+    return float(np.abs(program.call(weights, images) - expected).max() / longest)
+
+
+def row(name: str) -> list[str]:
+    """A line of the table: the model, its size, and each format under each grouping."""
+    config = config_of(name)
+    params = init_crisalad(jax.random.key(0), config)
+    cells = [name, " x ".join(map(str, config.input_size)), str(config.descriptor_dim)]
+    for grouping in ("single", "batch"):
+        for format in FORMATS:
+            if grouping == "batch" and params.cross_image is None:
+                cells.append("")
+                continue
+            how = ExportConfig(grouping, platforms=("cpu",), format=format)  # type: ignore
+            with tempfile.TemporaryDirectory() as folder:
+                try:
+                    found = difference(pathlib.Path(folder) / "export", params, config, how)
+                    cells.append(f"{found:.0e}")
+                except InputError as error:
+                    print(f"{name}, {format}: {error}", file=sys.stderr)
+                    cells.append("no")
+    return cells
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """The table of these lines, in Markdown."""
+    formats = [f"{each}, {grouping}" for grouping in ("single", "batch") for each in FORMATS]
+    head = ["model", "images", "numbers", *formats]
+    lines = [head, ["---", "---", *["---:"] * (len(head) - 2)], *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--models", nargs="+", default=MODELS)
+    parser.add_argument("--page", type=pathlib.Path)
+    given = parser.parse_args()
+    rows = []
+    for name in given.models:
+        rows.append(row(name))
+        print(f"| {' | '.join(rows[-1])} |", flush=True)
+        gc.collect()
+    if given.page is not None:
+        before, after = around(given.page, "zoo")
+        given.page.write_text(before + table(rows) + after, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,338 @@
+"""Programs in ONNX and OpenVINO against the model, and each conversion against JAX."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import pathlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from jax import export
+
+from crisalad_jax.checkpoints import export as exports
+from crisalad_jax.checkpoints.engines import import_openvino, load_program
+from crisalad_jax.checkpoints.export import ExportConfig, write_export
+from crisalad_jax.checkpoints.onnx_format.program import write_onnx
+from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
+from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
+from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.utils.errors import InputError
+from tests.checkpoints.test_export import TOLERANCE, pictures
+from tests.conftest import BATCH, MODEL
+
+ALONE = CrossImageConfig(layers=0)
+# Operators that TensorRT's parser has had since version 8.4, of those that programs here may use:
+# github.com/onnx/onnx-tensorrt, docs/operators.md.
+TENSORRT = """
+Abs Add And ArgMax ArgMin Cast Ceil Concat Conv Cos Div Equal Erf Exp Expand Floor Gather Greater
+GreaterOrEqual Identity Less LessOrEqual Log MatMul Max MaxPool Min Mul Neg Not Or Pad Pow Range
+ReduceMax ReduceMin ReduceProd ReduceSum Reshape Shape Sigmoid Sign Sin Slice Sqrt Squeeze Sub Tanh
+Transpose Where Xor
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _symbolic_shapes() -> Iterator[None]:
+    """The check of annotations while tests run cannot broadcast symbolic dimensions."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="module")
+def beside(params: Crisalad, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """An ONNX export of any number of images, each alone, weights beside it."""
+    out = tmp_path_factory.mktemp("exports") / "onnx"
+    write_export(out, params, MODEL, ExportConfig(format="onnx"))
+    return out
+
+
+def alone(params: Crisalad, images: np.ndarray, config: ModelConfig = MODEL) -> np.ndarray:
+    return np.asarray(describe(params, images, config, mask=self_mask(len(images))))
+
+
+def test_onnx_gives_our_descriptors_for_any_number_of_images(
+    beside: pathlib.Path, params: Crisalad
+):
+    session = onnxruntime.InferenceSession(beside / "describe.onnx")
+    for count in (1, BATCH):
+        images = pictures(count)
+        (found,) = session.run(None, {"images": images})
+        np.testing.assert_allclose(found, alone(params, images), rtol=0, atol=TOLERANCE)
+
+
+def test_openvino_gives_our_descriptors_for_any_number_of_images(
+    params: Crisalad, tmp_path: pathlib.Path
+):
+    manifest = write_export(tmp_path / "out", params, MODEL, ExportConfig(format="openvino"))
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["describe.bin", "describe.xml", "manifest.json"]
+    openvino = import_openvino()
+    model = openvino.Core().read_model(tmp_path / "out" / "describe.xml")
+    precision = {"INFERENCE_PRECISION_HINT": "f32"}
+    compiled = openvino.Core().compile_model(model, "CPU", precision)
+    for count in (1, BATCH):
+        images = pictures(count)
+        found = compiled([images])[0]
+        np.testing.assert_allclose(found, alone(params, images), rtol=0, atol=TOLERANCE)
+    assert manifest["checked"]["engine"] == "openvino"
+    # Weights as halves would be within the tolerance of nothing.
+    floats = {str(each.get_element_type()) for each in model.get_ops() if each.get_output_size()}
+    assert not any("'f16'" in each for each in floats)
+
+
+def test_a_batch_of_one_size_with_the_weights_inside(params: Crisalad, tmp_path: pathlib.Path):
+    how = ExportConfig("batch", batch_size=BATCH, weights_inside=True, format="onnx")
+    write_export(tmp_path / "out", params, MODEL, how)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "describe.onnx",
+        "manifest.json",
+    ]
+    images = pictures(BATCH)
+    program = load_program("onnxruntime", tmp_path / "out" / "describe.onnx")
+    expected = describe(params, images, MODEL)
+    np.testing.assert_allclose(program(images), expected, rtol=0, atol=TOLERANCE)
+    # Who looks at whom matters: another grouping would not pass.
+    assert np.abs(alone(params, images) - expected).max() > 1e-3
+
+
+def test_floats_that_are_normalised_already(params: Crisalad, tmp_path: pathlib.Path):
+    how = ExportConfig(format="onnx", pixels="floats")
+    manifest = write_export(tmp_path / "out", params, MODEL, how)
+    assert manifest["images"]["dtype"] == "float32"
+    images = pictures(2)
+    mean, deviation = (np.array(manifest["images"][name]) for name in ("mean", "deviation"))
+    floats = ((images / 255 - mean) / deviation).astype(np.float32)
+    found = load_program("onnxruntime", tmp_path / "out" / "describe.onnx")(floats)
+    np.testing.assert_allclose(found, alone(params, images), rtol=0, atol=TOLERANCE)
+
+
+def test_the_manifest_tells_what_lies_there(beside: pathlib.Path):
+    manifest = json.loads((beside / "manifest.json").read_text())
+    assert manifest["program_format"] == "onnx"
+    for part in ("program", "weights"):
+        data = (beside / manifest[part]["file"]).read_bytes()
+        assert manifest[part]["bytes"] == len(data)
+        assert manifest[part]["sha256"] == hashlib.sha256(data).hexdigest()
+    assert manifest["images"]["shape"] == ["batch", 42, 56, 3]
+    assert manifest["descriptors"]["shape"] == ["batch", MODEL.descriptor_dim]
+    assert 0 < manifest["checked"]["largest_difference"] < 1e-5
+
+
+def test_what_tensorrt_needs_of_a_program(beside: pathlib.Path):
+    """No TensorRT is here: its parser's operators, known types, and shapes that can be inferred."""
+    model = onnx.load(beside / "describe.onnx")
+    onnx.checker.check_model(model, full_check=True)
+    whole = onnx.shape_inference.infer_shapes(model, strict_mode=True, data_prop=True)
+    (opset,) = model.opset_import
+    assert (opset.domain, opset.version) == ("", 17)
+    nodes = model.graph.node
+    assert {node.op_type for node in nodes} <= set(TENSORRT.split())
+    assert not any(attribute.HasField("g") for node in nodes for attribute in node.attribute)
+    known = {value.name: value.type.tensor_type for value in whole.graph.value_info}
+    assert {name for node in nodes[:-1] for name in node.output} == known.keys()
+    allowed = {onnx.TensorProto.FLOAT, onnx.TensorProto.INT32, onnx.TensorProto.INT64}
+    assert {each.elem_type for each in known.values()} <= allowed | {onnx.TensorProto.BOOL}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "config",
+    [
+        dataclasses.replace(MODEL, aggregator="gem-pyramid"),
+        dataclasses.replace(MODEL, aggregator="gem"),
+        dataclasses.replace(MODEL, aggregator=ConvApConfig(channels=16)),
+        dataclasses.replace(MODEL, aggregator=CosPlaceConfig(dim=16)),
+        dataclasses.replace(MODEL, aggregator=MixVprConfig(16, 2, 2)),
+        dataclasses.replace(MODEL, aggregator=BoqConfig(16, 3, 2, 5)),
+        dataclasses.replace(MODEL, aggregator="netvlad", cross_image=ALONE),
+        dataclasses.replace(MODEL, aggregator="supervlad"),
+        dataclasses.replace(MODEL, aggregator="class-token", cross_image=ALONE),
+        dataclasses.replace(
+            MODEL,
+            image_size=(64, 96),
+            backbone=ResNetConfig(layers=18),
+            aggregator=ConvApConfig(channels=16),
+            cross_image=ALONE,
+        ),
+        PRESETS["tiny"],
+    ],
+    ids=[
+        *("pyramid", "GeM", "Conv-AP", "CosPlace", "MixVPR", "BoQ", "NetVLAD", "SuperVLAD"),
+        *("class token", "ResNet", "tiny"),
+    ],
+)
+@pytest.mark.parametrize("format", ["onnx", "openvino"])
+def test_other_models(config: ModelConfig, format: Any, tmp_path: pathlib.Path):
+    params = init_crisalad(jax.random.key(0), config)
+    manifest = write_export(tmp_path / "out", params, config, ExportConfig(format=format))
+    assert manifest["checked"]["largest_difference"] < TOLERANCE
+
+
+ROWS, COLUMNS = 3, 4
+FUNCTIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "clamp": lambda x: jnp.clip(x, 0.2, 0.7),
+    "logarithms": lambda x: jnp.log1p(x) + jnp.expm1(x) + jnp.exp2(x),
+    "powers": lambda x: x**2 + x**3 + jax.lax.rsqrt(x + 1) + x**0.3,
+    "logic": lambda x: ((x > 0.3) & ~(x > 0.6) | (x != 0.5)).astype(jnp.float32),
+    "finite": lambda x: jnp.isfinite(x / jnp.where(x > 0.5, 0, 1)).astype(jnp.float32),
+    "sums": lambda x: x.sum(1) + x.max(1) + x.min(1) + x.prod(1),
+    "any and all": lambda x: ((x > 0.5).any(1) | (x > 0.1).all(1)).astype(jnp.float32),
+    "argmax": lambda x: jax.nn.one_hot(x.argmax(2), COLUMNS),
+    "of all images": lambda x: x - x.mean(0),
+    "slices": lambda x: jax.lax.slice_in_dim(x, 0, 3, 2, axis=1)[..., 1:3] + x[:, :1, :2],
+    "the last": lambda x: x[:, -1],
+    "some rows": lambda x: x[:, jnp.array([2, 0, 0])],
+    "the largest's row": lambda x: jnp.linspace(0, 1, COLUMNS * 5).reshape(COLUMNS, 5)[x.argmax(2)],
+    "pad": lambda x: jnp.pad(x, ((0, 0), (1, 2), (0, 1)), constant_values=3),
+    "split": lambda x: jnp.concatenate(jnp.split(x, [1, 3], axis=2)[::-1], axis=2),
+    "stack": lambda x: jnp.stack([x, 2 * x, jnp.ones_like(x)], axis=2),
+    "nothing": lambda x: jnp.concatenate([x[:, :0], x], axis=1),
+    "broadcast": lambda x: jnp.concatenate([jnp.broadcast_to(x[:, :1], x.shape), x], axis=1),
+    "reshape": lambda x: jnp.broadcast_to(x[:, None], (x.shape[0], 2, ROWS, COLUMNS)).reshape(
+        x.shape[0], -1
+    ),
+    "numbers": lambda x: x + jnp.arange(COLUMNS) + jnp.arange(x.shape[0])[:, None, None],
+    "outer": lambda x: jnp.einsum("bij,cij->bc", x, x) * jnp.eye(x.shape[0]),
+    "products": lambda x: jnp.einsum("bij,bkj->bik", x, x) @ jnp.ones((ROWS, 2)),
+    "two sums": lambda x: jnp.einsum("bij,ijk->bk", x, jnp.ones((ROWS, COLUMNS, 2))),
+    "all rows": lambda x: jnp.einsum("bij,jkl->bikl", x, jnp.ones((COLUMNS, 2, 3))),
+    "matrix first": lambda x: jnp.einsum("kj,bij->kbi", jnp.ones((2, COLUMNS)), x),
+    "row alone": lambda x: jnp.einsum("bij,bj->bi", x, x[:, 0]),
+    "loop": lambda x: jax.lax.scan(
+        lambda c, r: (c + r, c * r), x[:, 0], jnp.moveaxis(x, 1, 0), reverse=True
+    )[1],
+    "loop over weights": lambda x: jax.lax.scan(
+        lambda c, w: (jnp.tanh(c * w), None), x, jnp.arange(3.0)
+    )[0],
+    "a branch that is known": lambda x: jax.lax.cond(True, jnp.sin, jnp.cos, x),
+    "convolution": lambda x: jax.lax.conv_general_dilated(
+        x[..., None],
+        jnp.arange(12.0).reshape(2, 3, 1, 2),
+        (1, 2),
+        [(1, 0), (0, 1)],
+        rhs_dilation=(1, 1),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    ),
+    "largest of windows": lambda x: jax.lax.reduce_window(
+        x[..., None], -jnp.inf, jax.lax.max, (1, 2, 3, 1), (1, 1, 2, 1), "SAME"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_conversion_computes_what_jax_does(name: str, tmp_path: pathlib.Path):
+    """By both engines, for two numbers of images."""
+
+    def run(weights: dict[str, Any], images: jax.Array) -> jax.Array:
+        return FUNCTIONS[name](images)
+
+    (batch,) = export.symbolic_shape("batch")
+    shape = jax.ShapeDtypeStruct((batch, ROWS, COLUMNS), jnp.float32)
+    path = tmp_path / "program.onnx"
+    write_onnx(path, run, {}, shape, words="a test", beside=False)
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    programs = [load_program("onnxruntime", path), load_program("openvino", path)]
+    for count in (1, 5):
+        images = np.random.default_rng(count).random((count, ROWS, COLUMNS), np.float32)
+        expected = run({}, jnp.asarray(images))
+        for program in programs:
+            # A few operations on numbers up to 100, of which float32 keeps seven digits.
+            np.testing.assert_allclose(program(images), expected, rtol=1e-5, atol=1e-6)
+
+
+def refused(config: ModelConfig, how: ExportConfig, out: pathlib.Path) -> str:
+    """What is said; nothing is left behind."""
+    params = init_crisalad(jax.random.key(0), config)
+    with pytest.raises(InputError) as caught:
+        write_export(out, params, config, how)
+    assert list(out.parent.iterdir()) == []
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sinkhorn", "operation"),
+    [
+        (SinkhornConfig(tolerance=1e-3, gradient="stop"), "while"),
+        (SinkhornConfig(step="newton", iterations=2), "while"),
+    ],
+    ids=["until it converges", "linear systems"],
+)
+def test_an_operation_that_onnx_lacks_is_named(
+    sinkhorn: SinkhornConfig, operation: str, tmp_path: pathlib.Path
+):
+    aggregator = dataclasses.replace(MODEL.aggregator, sinkhorn=sinkhorn)
+    config = dataclasses.replace(MODEL, aggregator=aggregator)
+    said = refused(config, ExportConfig(format="onnx"), tmp_path / "out")
+    assert said.startswith(f"format onnx: found the operation {operation}")
+
+
+def test_products_of_fewer_bits_are_the_engines_own(tmp_path: pathlib.Path):
+    config = dataclasses.replace(MODEL, compute_dtype="bfloat16")
+    said = refused(config, ExportConfig(format="openvino"), tmp_path / "out")
+    assert said.startswith("compute dtype: found bfloat16 with format openvino, expected float32")
+
+
+def test_floats_of_a_model_that_looks_at_neighbourhoods(tmp_path: pathlib.Path):
+    said = refused(PRESETS["tiny"], ExportConfig(pixels="floats"), tmp_path / "out")
+    assert said.startswith("pixels: found floats for a model whose normalisation is local-contrast")
+
+
+def test_a_program_that_differs_is_not_written(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(exports, "TOLERANCE", 1e-12)
+    said = refused(MODEL, ExportConfig(format="onnx"), tmp_path / "out")
+    assert said.startswith(f"{tmp_path}/out: found descriptors of onnxruntime that differ")
+
+
+@pytest.mark.parametrize(
+    ("format", "module"),
+    [("onnx", "onnx"), ("onnx", "onnxruntime"), ("openvino", "openvino")],
+)
+def test_what_is_not_installed_is_named_with_its_extra(
+    format: Any, module: str, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name in list(sys.modules):
+        if name.startswith("crisalad_jax.checkpoints.onnx_format"):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    said = refused(MODEL, ExportConfig(format=format), tmp_path / "out")
+    assert f"found no module {module}" in said
+    assert f"pip install 'crisalad-jax[{format}]'" in said
+
+
+def test_openvino_has_its_weights_beside_it():
+    with pytest.raises(InputError, match=r"^weights inside: found with format openvino"):
+        ExportConfig(format="openvino", weights_inside=True)
+
+
+def test_a_file_that_an_engine_cannot_read(tmp_path: pathlib.Path):
+    (tmp_path / "broken.onnx").write_bytes(b"no program")
+    for engine in ("onnxruntime", "openvino"):
+        with pytest.raises(InputError, match=rf"broken\.onnx: {engine} cannot load it: "):
+            load_program(engine, tmp_path / "broken.onnx")
+
+
+def test_a_product_of_bytes_is_read_by_all(beside: pathlib.Path):
+    """OpenVINO reads ONNX too, so the two engines can be compared on one file."""
+    program = functools.partial(load_program, path=beside / "describe.onnx")
+    images = pictures(2)
+    np.testing.assert_allclose(
+        program("openvino")(images), program("onnxruntime")(images), rtol=0, atol=TOLERANCE
+    )
