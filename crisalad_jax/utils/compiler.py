@@ -18,17 +18,19 @@ from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 _LIBRARIES: dict[str, dict[str, bool | str]] = {
-    # By default jaxlib compiles a whole attention to the library YNN, which is slower than single
-    # products by Eigen. For a single product both are equally fast (docs/performance.md).
+    # Half as fast as the others where a row of the result is a multiple of 4,096 bytes, as `b14`'s
+    # widest is: the rows that it writes at once then share one place of the first cache.
     "Eigen": {_FUSIONS: ""},
-    # A few percent faster than Eigen for large matrices, and slower for small ones. A program with
-    # its products cannot be stored in the compile cache.
+    # As fast as YNN for large matrices, and slower for small ones. A program with its products
+    # cannot be stored in the compile cache.
     "oneDNN": {
         _FUSIONS: "",
         "xla_cpu_use_onednn": True,
         "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
     },
-    # The only library that uses a processor's bfloat16 instructions.
+    # At the processor's own rate for all shapes, and the only one that uses its bfloat16
+    # instructions. By default jaxlib compiles a whole attention to it, which is slower than its
+    # single products.
     "YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"},
 }
 # By default XLA copies all weights of a layer out of their stack before the layer runs, which takes
@@ -75,10 +77,10 @@ def jit(
     """Wrap a function in `jax.jit` with `compiler_options`, outside of other transformations.
 
     Inside another transformation the outermost `jit` decides, because JAX takes no other options.
-    Eigen computes the products. oneDNN computes those of a large model that `runs_long`, which the
-    compile cache does not store. YNN computes those where the `compute_dtype` of a configuration
-    among the arguments is bfloat16. Nothing else decides, so results have the same bits with and
-    without a compile cache. A function that does not run long is scheduled for the least memory.
+    YNN computes the products, but for a float32 model that `runs_long`: oneDNN computes those of a
+    large one, which the compile cache does not store, and Eigen those of a small one. Nothing else
+    decides, so results have the same bits with and without a compile cache. A function that does
+    not run long is scheduled for the least memory.
     On accelerators float32 products have the `precision` of a configuration among the arguments.
     The returned function has `lower` too, which lowers for the `target`.
     """
@@ -89,11 +91,11 @@ def jit(
         return jax.jit(function, compiler_options=dict(chosen), **options) if chosen else inner
 
     def outermost(leaves: Sequence[Any]) -> Any:
-        if any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves):
+        narrow = any(getattr(leaf, "compute_dtype", None) == "bfloat16" for leaf in leaves)
+        if narrow or not runs_long:
             library = "YNN"
         else:
-            large = runs_long and _numbers(leaves) >= _SMALL
-            library = "oneDNN" if large else "Eigen"
+            library = "oneDNN" if _numbers(leaves) >= _SMALL else "Eigen"
         chosen = compiler_options(library, least_memory=not runs_long)
         return with_options(tuple(chosen.items()))
 

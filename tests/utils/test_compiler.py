@@ -82,7 +82,7 @@ class Configured:
 @pytest.mark.parametrize(
     ("runs_long", "size", "dtype", "asked"),
     [
-        (False, compiler._SMALL, "float32", "Eigen"),
+        (False, compiler._SMALL, "float32", "YNN"),
         (True, compiler._SMALL, "float32", "oneDNN"),
         (True, compiler._SMALL - 1, "float32", "Eigen"),
         (True, compiler._SMALL, "bfloat16", "YNN"),
