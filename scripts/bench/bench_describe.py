@@ -327,14 +327,16 @@ def report(name: str, what: str, values: Sequence[Value], arguments: argparse.Na
         for value in one
         if value["batch"] == DRAWN
     ]
-    figure = drawn and bars(
-        drawn,
-        lambda value: f"{value['model']}, {value['dtype']}",
-        "faster",
-        f"{DRAWN} images: times the fastest other",
-    )
+    figure = None
+    if drawn:
+        figure = bars(
+            drawn,
+            lambda value: f"{value['model']}, {value['dtype']}",
+            "faster",
+            f"{DRAWN} images: times the fastest other",
+        )
     caption = f"{what}: images a second. {where}; medians and ranges of {rounds} rounds or more."
-    study = Study(speeds(values, caption), values, figure or None)
+    study = Study(speeds(values, caption), values, figure)
     leave(name, study, arguments)
     caption = f"{what}: the first call, compiling included, and memory. {where}."
     names = ("model", "batch", "dtype", "contender", "first call", "memory")
