@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Sets up what is missing, then times descriptors and training beside torch, a folder of photographs
+# Sets up what is missing, then times descriptors and training beside torch and other engines, a folder of photographs
 # from end to end, the start of a program, and bfloat16 beside float32, and says where our time goes;
 # then what training at the paper's size takes, and search. Writes the tables and pictures of
 # docs/performance.md, docs/training.md and docs/search.md. For figures that mean something, on a
 # machine with nothing else to do. Flags go to the first two, such as
-#     --presets b14 --batches 256 --dtype bfloat16
+#     --presets b14 --batches 256 --dtypes bfloat16
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-source scripts/environment.sh "[dev]"
+source scripts/environment.sh "[dev,bench]"
 page=(--page docs/performance.md)
 python scripts/bench/bench_describe.py "${page[@]}" "$@"
 python scripts/bench/bench_published.py "${page[@]}"

@@ -248,6 +248,12 @@ def per_second(value: Value) -> tuple[float, float, float]:
     return 1e3 * value["batch"] / Timed(value["ms"]).median, min(found), max(found)
 
 
+def speed(value: Value) -> str:
+    found = per_second(value)
+    digits = 0 if found[0] >= 100 else 1
+    return "{:.{d}f} ({:.{d}f} to {:.{d}f})".format(*found, d=digits)
+
+
 def faster(values: Sequence[Value]) -> dict[str, tuple[float, float, float]]:
     """How many times as fast as the fastest engine that is not ours each contender is, by name."""
     timed = {value["contender"]: Timed(value["ms"]) for value in values}
@@ -261,7 +267,7 @@ def speeds(values: Sequence[Value], caption: str) -> Table:
     for one in races(values):
         found = {value["contender"]: value for value in one}
         ours = min(set(OURS) & set(found), key=lambda name: Timed(found[name]["ms"]).median)
-        cells = (times(per_second(found[name])) if name in found else "" for name in columns)
+        cells = (speed(found[name]) if name in found else "" for name in columns)
         share = f"{100 * found[ours]['share of the machine']:.0f} %"
         rows.append((*labels(one), *cells, times(faster(one)[ours]), share))
     header = (*LABELS, *columns, "ours: times the fastest other", "ours: of the machine")
@@ -321,14 +327,16 @@ def report(name: str, what: str, values: Sequence[Value], arguments: argparse.Na
         for value in one
         if value["batch"] == DRAWN
     ]
-    figure = bars(
-        drawn,
-        lambda value: f"{value['model']}, {value['dtype']}",
-        "faster",
-        f"{DRAWN} images: times the fastest other",
-    )
+    figure = None
+    if drawn:
+        figure = bars(
+            drawn,
+            lambda value: f"{value['model']}, {value['dtype']}",
+            "faster",
+            f"{DRAWN} images: times the fastest other",
+        )
     caption = f"{what}: images a second. {where}; medians and ranges of {rounds} rounds or more."
-    study = Study(speeds(values, caption), values, figure if drawn else None)
+    study = Study(speeds(values, caption), values, figure)
     leave(name, study, arguments)
     caption = f"{what}: the first call, compiling included, and memory. {where}."
     names = ("model", "batch", "dtype", "contender", "first call", "memory")

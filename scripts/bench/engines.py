@@ -25,6 +25,7 @@ import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
 import torch  # isort: skip
 
+from crisalad_jax.checkpoints.engines import import_openvino
 from crisalad_jax.utils.compiler import compiler_options
 from crisalad_jax.utils.host import usable_cores
 from parity.reference.model import Crisalad
@@ -61,7 +62,7 @@ def by_openvino(path: pathlib.Path, inputs: np.ndarray, dtype: str) -> Run:
         "INFERENCE_PRECISION_HINT": {"float32": "f32", "bfloat16": "bf16"}[dtype],
         "INFERENCE_NUM_THREADS": usable_cores(),
     }
-    compiled = importlib.import_module("openvino").compile_model(path, "CPU", settings)
+    compiled = import_openvino().compile_model(path, "CPU", settings)
     request = compiled.create_infer_request()
     return lambda: request.infer([inputs], share_inputs=True)[0]
 
@@ -70,7 +71,7 @@ def has_openvino(dtype: str) -> bool:
     """Whether OpenVINO computes in this type: where it cannot, it takes float32 without a word."""
     if not _installed("openvino"):
         return False
-    core = importlib.import_module("openvino").Core()
+    core = import_openvino().Core()
     return dtype == "float32" or "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 

@@ -1,6 +1,8 @@
 """What the benchmarks reckon with: turns, ratios, memory, waiting. No time is asserted."""
 
 import concurrent.futures
+import copy
+import dataclasses
 import itertools
 import json
 import pathlib
@@ -20,6 +22,7 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.training.recipes import recipe
+from parity.reference.model import Crisalad as TorchCrisalad
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +85,100 @@ def test_descriptors_that_differ_are_not_raced(scripts: Any) -> None:
     bench.check([contender("torch", theirs), contender("ours", ours)], tolerance=2e-3)
     with pytest.raises(RuntimeError, match=r"ours: differs from torch by 1\.0e-03"):
         bench.check([contender("torch", theirs), contender("ours", ours)], tolerance=5e-4)
+
+
+def raced(contender: str, *ms: float, batch: int = 8, **others: Any) -> dict[str, Any]:
+    """What is kept of a contender whose rounds took so long."""
+    found = {"model": "tiny at 98 x 98", "batch": batch, "dtype": "float32", "machine": "here"}
+    found |= {"share of the machine": 0.5, "first call": 1.5, "memory": None}
+    return found | {"contender": contender, "ms": list(ms)} | others
+
+
+def test_ours_is_compared_with_the_fastest_of_the_others(scripts: Any) -> None:
+    """By medians of 16, 8 and 10 ms; by single rounds torch would be it."""
+    bench = scripts("bench_describe")
+    race = [
+        raced("OpenVINO", 7.0, 8.0, 9.0),
+        raced("torch eager", 16.0, 16.0, 1.0),
+        raced("ours", 10.0, 10.0, 10.0, memory=2_000_000),
+    ]
+    table = bench.speeds(race, "Speeds.")
+    assert table.header[:3] == ("model", "images", "type")
+    (row,) = table.rows
+    assert dict(zip(table.header[3:], row[3:], strict=True)) == {
+        "torch eager": "500 (500 to 8000)",
+        "OpenVINO": "1000 (889 to 1143)",
+        "ours": "800 (800 to 800)",
+        "ours: times the fastest other": "0.80 (0.70 to 0.90)",
+        "ours: of the machine": "50 %",
+    }
+    (row,) = bench.costs(race, "Costs.").rows
+    assert row[3:] == ("1.5 s", "1.5 s", "1.5 s, 2.0 MB")
+
+
+def test_an_engine_that_is_not_in_a_race_has_no_figure_there(scripts: Any) -> None:
+    bench = scripts("bench_describe")
+    values = [
+        *(raced("ONNX Runtime", 8.0), raced("ours", 8.0)),
+        *(raced("torch eager", 8.0, dtype="bfloat16"), raced("ours", 8.0, dtype="bfloat16")),
+    ]
+    rows = bench.speeds(values, "Speeds.").rows
+    assert [row[3:6] for row in rows] == [
+        ("", "1000 (1000 to 1000)", "1000 (1000 to 1000)"),
+        ("1000 (1000 to 1000)", "", "1000 (1000 to 1000)"),
+    ]
+
+
+def test_races_of_this_machine_stay_unless_they_are_run_anew(scripts: Any) -> None:
+    bench = scripts("bench_describe")
+    again, other = raced("ours", 1.0), raced("ours", 1.0, batch=1)
+    elsewhere = raced("ours", 1.0, batch=2, machine="there")
+    new = [raced("ours", 2.0), raced("OpenVINO", 2.0)]
+    assert bench.kept([again, other, elsewhere, {"contender": "ours"}], new) == [other]
+    # By model as they are listed, type, size of the batch.
+    values = [
+        raced("ours", 1.0, dtype="bfloat16", batch=1),
+        *(raced("ours", 1.0), raced("ours", 1.0, batch=1)),
+    ]
+    found = [(value["dtype"], value["batch"]) for value in bench.in_order(values)]
+    assert found == [("float32", 1), ("float32", 8), ("bfloat16", 1)]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_what_users_write_computes_what_the_reference_does(scripts: Any, dtype: str) -> None:
+    """Attention, biases and narrow weights; a mask too."""
+    usual = scripts("usual")
+    config = dataclasses.replace(recipe("tiny").model, compute_dtype=dtype)
+    torch.manual_seed(0)
+    reference = TorchCrisalad(config).eval()
+    written = usual.as_users_write_it(copy.deepcopy(reference))
+    images, mask = torch.randn(3, 3, 98, 98), torch.eye(3, dtype=torch.bool)
+    with torch.inference_mode():
+        for model in (written, usual.narrowed(copy.deepcopy(written))):
+            for args in ((images,), (images, mask)):
+                off = (model(*args) - reference(*args)).abs().max()
+                # Of unit vectors, that are rounded elsewhere: float32's 24 bits, bfloat16's 8.
+                assert off < (1e-6 if dtype == "float32" else 2e-2)
+        assert usual.widened(written)(images).dtype == torch.float32
+    kinds = {type(layer).__name__ for layer in written.modules()}
+    assert {"_Attention", "_MultiheadAttention", "_Linear", "_Conv2d"} <= kinds
+    assert not {"Attention", "MultiheadAttention", "Linear", "Conv2d"} & kinds
+
+
+def test_engines_read_what_torch_writes(scripts: Any) -> None:
+    """A layer's product, by each that is installed."""
+    engines = scripts("engines")
+    found = engines.readers("float32")
+    if not found:
+        pytest.skip("the bench extra is not installed")
+    torch.manual_seed(0)
+    layer, inputs = torch.nn.Linear(5, 3), torch.randn(4, 5)
+    expected = layer(inputs).detach().numpy()
+    with engines.onnx_file(layer, inputs) as path:
+        for read in found.values():
+            # Sums of five numbers, in another order.
+            np.testing.assert_allclose(read(path, inputs.numpy())(), expected, atol=1e-6)
+    assert "ONNX Runtime" not in engines.readers("bfloat16")
 
 
 def test_only_what_no_program_hides_is_waited_for(
