@@ -21,26 +21,16 @@ from crisalad_jax.checkpoints.weights import CACHE_RECORD, save_weights
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, user_cache, write_json
+from crisalad_jax.utils.files import CACHE as CACHE
+from crisalad_jax.utils.files import cache_folder as cache_folder
+from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.locks import next_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.version import VERSION
 
-CACHE, OFFLINE, MIRROR = "CRISALAD_CACHE", "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
-"""Variables of the environment: the cache's folder, whether to use no network, and where to look
-for files by their names before their published addresses."""
-
-
-def cache_folder() -> pathlib.Path:
-    """Return the folder of the cache, which need not be there yet.
-
-    It is what `CRISALAD_CACHE` names, else `crisalad_jax` in the user's cache, which
-    `XDG_CACHE_HOME` may name.
-    """
-    own = os.environ.get(CACHE)
-    if own:
-        return pathlib.Path(own).expanduser()
-    return user_cache() / "crisalad_jax"
+OFFLINE, MIRROR = "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
+"""Variables of the environment: whether to use no network, and where to look for files by their
+names before their published addresses."""
 
 
 def is_offline() -> bool:

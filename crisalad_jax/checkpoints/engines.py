@@ -14,10 +14,8 @@ from crisalad_jax.utils.extras import missing_extra
 
 EngineName = Literal["onnxruntime", "openvino"]
 Precision = Literal["float32", "bfloat16"]
-Program = Callable[[np.ndarray], np.ndarray]
-"""A loaded program: images to descriptors."""
-IMAGES, DESCRIPTORS = "images", "descriptors"
-"""Names of a program's input and output."""
+Program = Callable[..., np.ndarray]
+"""A loaded program: its inputs, in their order, to its output."""
 _TOOLS = "openvino.tools.ovc"
 
 
@@ -31,7 +29,8 @@ def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    return lambda images: np.asarray(session.run([DESCRIPTORS], {IMAGES: images})[0])
+    names = [each.name for each in session.get_inputs()]
+    return lambda *inputs: np.asarray(session.run(None, dict(zip(names, inputs, strict=True)))[0])
 
 
 def import_openvino() -> Any:
@@ -51,7 +50,7 @@ def _openvino(path: pathlib.Path, precision: Precision) -> Program:
     # Left to itself it takes fewer bits where the processor has units for them.
     hint = {"float32": "f32", "bfloat16": "bf16"}[precision]
     compiled = openvino.Core().compile_model(path, "CPU", {"INFERENCE_PRECISION_HINT": hint})
-    return lambda images: np.array(compiled([images])[0])
+    return lambda *inputs: np.array(compiled(list(inputs))[0])
 
 
 _ENGINES: Mapping[str, Callable[[pathlib.Path, Precision], Program]] = {
@@ -71,7 +70,7 @@ def load_program(
         precision: type of the matrix products; onnxruntime has float32 alone.
 
     Returns:
-        A function of images to descriptors.
+        A function of the program's inputs.
 
     Raises:
         InputError: the engine is unknown, is not installed, or cannot read the file.

@@ -16,21 +16,36 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from crisalad_jax.checkpoints.engines import (
-    DESCRIPTORS,
-    IMAGES,
     EngineName,
     convert_to_openvino,
     load_program,
+)
+from crisalad_jax.checkpoints.runtime import (
+    ATTEND,
+    DESCRIBE,
+    FORMAT,
+    MANIFEST,
+    SUFFIXES,
+    TOKENS,
 )
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import check_types, choose
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, Images, check_params, describe, self_mask
+from crisalad_jax.nn.model import (
+    Crisalad,
+    Images,
+    attend_across_images,
+    check_params,
+    describe,
+    extract_tokens,
+    self_mask,
+)
+from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
@@ -38,10 +53,7 @@ from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
-FORMAT = "crisalad-jax export 1"
-PROGRAM, WEIGHTS, MANIFEST = "describe.jax_export", "weights.safetensors", "manifest.json"
-ONNX, ONNX_DATA = "describe.onnx", "describe.onnx.data"
-IR, IR_DATA = "describe.xml", "describe.bin"
+PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
 FORMATS = {
     "stablehlo": "a program of JAX's, for several platforms",
     "onnx": "a program of ONNX",
@@ -54,11 +66,16 @@ PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 GROUPINGS = {
     "single": "every image is described alone",
     "batch": "the images of a call look at each other",
+    "any": "images are described together as a mask says",
 }
 _SOURCES = "jax_traceback_in_locations_limit"
 """JAX's setting: how many lines of source a program has beside each operation."""
 _LARGEST = 2**31
 """Largest size of a program in bytes: offsets of a flatbuffer and of a protobuf have 31 bits."""
+_CALLS = {
+    "onnx": "onnxruntime.InferenceSession({!r}).run(None, {{'images': images}})",
+    "openvino": "openvino.Core().compile_model({!r}, 'CPU')(images)",
+}
 _PROBES = 3
 """Images that a program of any number of images is checked with."""
 
@@ -72,8 +89,10 @@ class ExportConfig:
         'single'
     """
 
-    grouping: Literal["single", "batch"] = "single"
-    """Grouping of a call's images in the cross-image encoder: each alone, or the whole batch."""
+    grouping: Literal["single", "batch", "any"] = "single"
+    """Grouping of a call's images in the cross-image encoder: each alone, or the whole batch. "any"
+    is two programs, of ONNX or OpenVINO: tokens of images, and descriptors of such tokens, where a
+    mask says which image looks at which."""
     batch_size: int | None = None
     """Number of images in a call; None takes any number, by a symbolic dimension."""
     weights_inside: bool = False
@@ -90,6 +109,11 @@ class ExportConfig:
         """Check the values."""
         check_types(self)
         choose("format", self.format, FORMATS)
+        if self.grouping == "any" and self.format == "stablehlo":
+            raise InputError(
+                "grouping: found any with format stablehlo, expected single or batch, or format "
+                "onnx or openvino"
+            )
         if self.pixels is not None:
             choose("pixels", self.pixels, dict.fromkeys(("bytes", "floats")))
         if self.format == "openvino" and self.weights_inside:
@@ -164,19 +188,16 @@ def _program(
     params: Crisalad, config: ModelConfig, how: ExportConfig
 ) -> tuple[Callable[..., Any], dict[str, Any], jax.ShapeDtypeStruct]:
     """Return a function of weights and images, the weights by name, and the images' shape."""
-    # A dictionary's leaves come in the order of its keys, not in that of the fields.
-    weights, tree = named_leaves(params), jax.tree.structure(params)
 
-    def run(weights: Mapping[str, Array], images: Images) -> Float[Array, "image descriptor"]:
-        restored = jax.tree.unflatten(tree, [weights[name] for name in named_leaves(params)])
+    def run(params: Crisalad, images: Images) -> Float[Array, "image descriptor"]:
         mask = self_mask(images.shape[0]) if how.grouping == "single" else None
-        return describe(restored, images, config, mask=mask)
+        return describe(params, images, config, mask=mask)
 
     batch = how.batch_size
     if batch is None:
         (batch,) = export.symbolic_shape("batch")
     dtype = jnp.uint8 if _takes_bytes(config, how) else jnp.float32
-    return run, weights, jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
+    return *_of_weights(run, params), jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
 
 
 def _takes_bytes(config: ModelConfig, how: ExportConfig) -> bool:
@@ -281,47 +302,90 @@ def _write_onnx(
     except ModuleNotFoundError as error:
         raise InputError(missing_extra(error, f"format {how.format}")) from error
     run, weights, images = _program(params, config, how)
-    is_onnx = how.format == "onnx"
-    with lowering_for(STRAIGHT):
-        descriptors = jax.eval_shape(run, weights, images)
-        write_onnx(
-            folder / ONNX,
-            run,
-            weights,
-            images,
-            words=f"{IMAGES} to {DESCRIPTORS}; {GROUPINGS[how.grouping]}",
-            beside=not how.weights_inside,
-        )
-    if not is_onnx:
-        convert_to_openvino(folder / ONNX, folder / IR)
-        for name in (ONNX, ONNX_DATA):
-            (folder / name).unlink()
-    engine: EngineName = "onnxruntime" if is_onnx else "openvino"
-    program, beside = (ONNX, ONNX_DATA) if is_onnx else (IR, IR_DATA)
-    called = {
-        "onnx": f"onnxruntime.InferenceSession({ONNX!r}).run(None, {{{IMAGES!r}: images}})",
-        "openvino": f"openvino.Core().compile_model({IR!r}, 'CPU')(images)",
-    }
-    difference = _difference(folder / program, engine, params, config, how)
+    parts = {DESCRIBE: (run, weights, {"images": images}, "descriptors")}
+    if how.grouping == "any":
+        parts = _halves(params, config, images)
+    descriptors = jax.ShapeDtypeStruct((images.shape[0], config.descriptor_dim), jnp.float32)
+    suffixes = SUFFIXES[how.format]
+    files: dict[str, Any] = {}
+    for name, (function, arrays, inputs, output) in parts.items():
+        path = folder / f"{name}.onnx"
+        with lowering_for(STRAIGHT):
+            words = f"{', '.join(inputs)} to {output}; {GROUPINGS[how.grouping]}"
+            beside = not how.weights_inside
+            write_onnx(path, function, arrays, inputs, output, words=words, beside=beside)
+        if how.format == "openvino":
+            convert_to_openvino(path, path.with_suffix(".xml"))
+            for suffix in SUFFIXES["onnx"]:
+                path.with_name(name + suffix).unlink()
+        lying = [_file(folder / f"{name}{suffix}") for suffix in suffixes[: 1 + beside]]
+        files[name] = {"program": lying[0], "weights": lying[1] if beside else None}
+    engine: EngineName = "onnxruntime" if how.format == "onnx" else "openvino"
+    difference = _difference(folder, engine, params, config, how)
     if not difference <= TOLERANCE:
         raise InputError(
             f"{out}: found descriptors of {engine} that differ from those of `describe` by "
             f"{difference:.2g}, expected at most {TOLERANCE:g}: nothing was written"
         )
+    first, *others = files
     return {
         "format": FORMAT,
         "program_format": how.format,
-        "call": called[how.format],
-        "program": _file(folder / program),
-        "weights": None if how.weights_inside else _file(folder / beside),
+        "call": _CALLS[how.format].format(first + suffixes[0]),
+        **files[first],
+        **{name: files[name] for name in others},
         **_inputs_and_outputs(images, descriptors, config, how),
+        "side_multiple": config.side_multiple,
         "opset": OPSET,
         "checked": {"engine": engine, "largest_difference": difference},
     }
 
 
+def _halves(
+    params: Crisalad, config: ModelConfig, images: jax.ShapeDtypeStruct
+) -> dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, Any], str]]:
+    """Return two functions: of images to tokens, and of tokens and a mask to descriptors.
+
+    An image's tokens are one row of numbers: the global token, and then the local ones.
+    """
+    shape, count = config.token_shape, images.shape[0]
+    width = shape.global_dim + shape.tokens * shape.token_dim
+
+    def extract(backbone: Any, images: Images) -> Float[Array, "image number"]:
+        tokens = extract_tokens(backbone, images, config)
+        return jnp.concatenate([tokens.global_token, tokens.local.reshape(count, -1)], axis=1)
+
+    def attend(
+        model: Any, rows: Float[Array, "image number"], mask: Bool[Array, "image image"]
+    ) -> Float[Array, "image descriptor"]:
+        local = rows[:, shape.global_dim :].reshape(count, shape.tokens, shape.token_dim)
+        tokens = Tokens(rows[:, : shape.global_dim], local)
+        return attend_across_images(model, tokens, config, mask=mask)
+
+    rows = jax.ShapeDtypeStruct((count, width), jnp.float32)
+    mask = jax.ShapeDtypeStruct((count, count), jnp.bool_)
+    return {
+        TOKENS: (*_of_weights(extract, params), {"images": images}, "tokens"),
+        ATTEND: (*_of_weights(attend, params), {"tokens": rows, "mask": mask}, "descriptors"),
+    }
+
+
+def _of_weights(
+    function: Callable[..., Any], params: Crisalad
+) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """Make a function of parameters one of the weights by name, and return these."""
+    # A dictionary's leaves come in the order of its keys, not in that of the fields.
+    weights, tree = named_leaves(params), jax.tree.structure(params)
+
+    def run(weights: Mapping[str, Array], *inputs: Array) -> Array:
+        leaves = [weights[name] for name in named_leaves(params)]
+        return function(jax.tree.unflatten(tree, leaves), *inputs)
+
+    return run, weights
+
+
 def _difference(
-    program: pathlib.Path,
+    folder: pathlib.Path,
     engine: EngineName,
     params: Crisalad,
     config: ModelConfig,
@@ -336,11 +400,19 @@ def _difference(
             for each in (config.preprocessing.mean, config.preprocessing.deviation)
         )
         images = (images / np.float32(255) - mean) / deviation
-    found = load_program(engine, program)(images)
-    mask = self_mask(count) if how.grouping == "single" else None
-    expected = np.asarray(describe(params, images, config, mask=mask))
-    longest = np.linalg.norm(expected, axis=1).max()  # 1, unless a projection leaves it
-    return float(np.abs(found - expected).max() / longest)
+    suffix = SUFFIXES[how.format][0]
+    names = (TOKENS, ATTEND) if how.grouping == "any" else (DESCRIBE,)
+    first, *second = (load_program(engine, folder / f"{name}{suffix}") for name in names)
+    alone, together = np.eye(count, dtype=bool), np.ones((count, count), bool)
+    masks = {"single": [alone], "batch": [together], "any": [alone, together]}[how.grouping]
+    found = first(images)
+    worst = 0.0
+    for mask in masks:
+        expected = np.asarray(describe(params, images, config, mask=jnp.asarray(mask)))
+        given = second[0](found, mask) if second else found
+        longest = np.linalg.norm(expected, axis=1).max()  # 1, unless a projection leaves it
+        worst = max(worst, float(np.abs(given - expected).max() / longest))
+    return worst
 
 
 def _inputs_and_outputs(

@@ -15,7 +15,10 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
 from crisalad_jax.utils.output import printable
 
+RuntimeName = Literal["jax", "onnxruntime", "openvino"]
+
 if TYPE_CHECKING:  # commands that load no model of a file start without these
+    from crisalad_jax.checkpoints.runtime import Runtime
     from crisalad_jax.data.benchmarks import Benchmark
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Crisalad
@@ -119,6 +122,63 @@ def open_set(arguments: Any) -> "Benchmark":
         f"images; positive: {benchmark.rule}"
     )
     return benchmark
+
+
+def open_model(
+    weights: pathlib.Path,
+    runtime: RuntimeName,
+    *,
+    image_size: tuple[int, int] | None = None,
+    resize: Sequence[str] = (),
+    compute_dtype: Literal["float32", "bfloat16"] | None = None,
+    any_grouping: bool = False,
+    verify: bool = True,
+    quiet: bool = False,
+) -> "tuple[Crisalad | Runtime, ModelConfig, str]":
+    """Load a model for JAX, or open it in another engine.
+
+    Args:
+        weights: the file, a published model's name, or for other engines an exported folder.
+        runtime: what computes it.
+        image_size: as `load_model`.
+        resize: as `load_model`.
+        compute_dtype: as `load_model`.
+        any_grouping: whether images look at each other.
+        verify: as `load_model`.
+        quiet: as `load_model`.
+
+    Returns:
+        (params, config, name), as `load_model`.
+
+    Raises:
+        InputError: what `load_model` and `open_runtime` raise.
+    """
+    options: dict[str, Any] = {"image_size": image_size, "resize": resize}
+    if runtime == "jax":
+        options |= {"compute_dtype": compute_dtype, "verify": verify, "quiet": quiet}
+        return load_model(weights, **options)
+    from crisalad_jax.checkpoints.runtime import open_runtime
+    from crisalad_jax.config.io import from_plain
+    from crisalad_jax.nn.config import ModelConfig
+
+    if weights.is_dir():
+        model = open_runtime(weights, runtime, precision=compute_dtype or "float32", verify=verify)
+        config = from_plain(ModelConfig, model.model, source=str(weights))
+        config = dataclasses.replace(config, compute_dtype=compute_dtype or "float32")
+        return model, config.resized(image_size, resize), str(weights)
+    _, config, name = load_model(weights, **options, verify=verify, quiet=quiet)
+    config = dataclasses.replace(config, compute_dtype=compute_dtype or config.compute_dtype)
+    if config.compute_dtype == "float64":
+        raise InputError(f"--runtime: found {runtime} with a model of float64, expected jax")
+    model = open_runtime(
+        find_weights(weights, quiet=True),
+        runtime,
+        image_size=config.image_size,
+        preprocessing=config.preprocessing,
+        precision=config.compute_dtype,
+        any_grouping=any_grouping and config.cross_image.layers > 0,
+    )
+    return model, config, f"{name}, {runtime}"
 
 
 def load_model(

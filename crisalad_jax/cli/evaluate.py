@@ -3,14 +3,17 @@
 import contextlib
 import dataclasses
 import pathlib
-from typing import Literal
+from typing import Any, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     check_json,
+    check_one_model,
     console,
     load_model,
+    open_model,
     open_set,
     say,
     talk_beside,
@@ -104,6 +107,9 @@ class Evaluate:
     precision: float | None = None
     """Also print the similarity to ask for so that this share of the accepted first retrievals is
     right, such as 0.99, and the recall that is left."""
+    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
+    for it once; --weights may be an exported folder."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -142,16 +148,25 @@ def run(arguments: Evaluate) -> None:
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
-    params, config, model_name = load_model(
-        arguments.weights,
-        preset=arguments.preset,
-        seed=arguments.seed,
-        image_size=arguments.image_size,
-        resize=arguments.resize,
-        compute_dtype=arguments.compute_dtype,
-        verify=arguments.verify,
-        quiet=arguments.quiet,
-    )
+    options: dict[str, Any] = {
+        "image_size": arguments.image_size,
+        "resize": arguments.resize,
+        "compute_dtype": arguments.compute_dtype,
+        "verify": arguments.verify,
+        "quiet": arguments.quiet,
+    }
+    if arguments.weights is None or arguments.runtime == "jax":
+        params, config, model_name = load_model(
+            arguments.weights, preset=arguments.preset, seed=arguments.seed, **options
+        )
+    else:
+        check_one_model(arguments.weights, arguments.preset)
+        params, config, model_name = open_model(
+            arguments.weights,
+            arguments.runtime,
+            any_grouping=set(arguments.grouping.replace("/", ",").split(",")) != {"single"},
+            **options,
+        )
     rerank = _reranking(arguments, config)
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
     benchmark = open_set(arguments)
@@ -197,7 +212,7 @@ def run(arguments: Evaluate) -> None:
             folder = staged.enter_context(staged_folder(arguments.out))
             write_galleries(folder, readable, results, model_name=model_name)
             write_json(folder / "config.json", settings)
-        if arguments.report is not None:
+        if arguments.report is not None and not isinstance(params, Runtime):
             from crisalad_jax.experiments.report import write_report
 
             write_report(
@@ -224,6 +239,16 @@ def _check_files(arguments: Evaluate) -> None:
         check_target(arguments.out / "config.json")
     if arguments.report is not None:
         check_target(arguments.report / "index.html")
+    if arguments.runtime != "jax":
+        for name, given in (("report", arguments.report), ("preset", arguments.preset)):
+            if given is not None:
+                raise InputError(
+                    f"--{name}: found with --runtime {arguments.runtime}, expected jax"
+                )
+        if arguments.weights is None:
+            raise InputError(
+                f"--runtime: found {arguments.runtime} without --weights, expected both"
+            )
     if arguments.rerank is None and arguments.rerank_weights is not None:
         raise InputError(
             "rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"

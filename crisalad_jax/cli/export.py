@@ -28,8 +28,9 @@ class Export:
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
     """Images in a call, or symbolic: any number."""
-    grouping: Literal["single", "batch"] = "single"
-    """Every image described alone, or the images of a call looking at each other."""
+    grouping: Literal["single", "batch", "any"] = "single"
+    """Every image described alone, or the images of a call looking at each other; any is two
+    programs of onnx or openvino, and a mask says who looks at whom."""
     weights_inside: bool = False
     """The weights as constants of the program, and no file of them beside it."""
     pixels: Literal["bytes", "floats"] | None = None

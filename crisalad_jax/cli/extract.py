@@ -5,7 +5,7 @@ import pathlib
 from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
+from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 
@@ -17,6 +17,7 @@ COMMON = (
     "resize",
     "grouping",
     "batch-size",
+    "runtime",
     "compute-dtype",
     "root",
     "pairs",
@@ -53,6 +54,9 @@ class Extract:
     all): a cross-image model's descriptors depend on it."""
     batch_size: int = 16
     """Images described together."""
+    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
+    for it once; --weights may be an exported folder."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -100,11 +104,13 @@ def run(arguments: Extract) -> None:
         share=arguments.share,
     )
     weights = find_weights(arguments.weights, quiet=arguments.quiet)
-    params, config, _ = load_model(
+    params, config, _ = open_model(
         weights,
+        arguments.runtime,
         image_size=arguments.image_size,
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
+        any_grouping=arguments.grouping != "single",
         verify=arguments.verify,
     )
     result = extract(

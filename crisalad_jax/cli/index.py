@@ -5,10 +5,15 @@ import pathlib
 from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import give_json, prepare_json, say
+from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
+from crisalad_jax.retrieval.maps.head import has_images
+from crisalad_jax.retrieval.maps.manifest import read_description
 
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 
@@ -51,6 +56,9 @@ class Index:
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
+    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
+    for it once; --weights may be an exported folder."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the map's, and in a new map the model's."""
     on_bad_image: Literal["stop", "skip"] = "stop"
@@ -69,7 +77,7 @@ def run(arguments: Index) -> None:
     """Index the images, and print what became of them."""
     prepare_json(arguments.json)
     weights = find_weights(arguments.weights, quiet=arguments.quiet)
-    params, config = load_weights(weights)
+    params, config = _model(arguments, weights)
     result = index(
         params,
         config,
@@ -109,6 +117,32 @@ def run(arguments: Index) -> None:
             "resized": description.config.images_in_words,
         },
     )
+
+
+def _model(arguments: Index, weights: pathlib.Path) -> tuple[Crisalad | Runtime, ModelConfig]:
+    """Load the model; for another engine, in the size and type in which the map has its images."""
+    if arguments.runtime == "jax":
+        return load_weights(weights)
+    there = read_description(arguments.out)
+    if there is not None and has_images(arguments.out):
+        config = there.config
+        runtime = open_runtime(
+            weights,
+            arguments.runtime,
+            image_size=config.image_size,
+            preprocessing=config.preprocessing,
+            precision="bfloat16" if config.compute_dtype == "bfloat16" else "float32",
+        )
+        return runtime, config
+    params, config, _ = open_model(
+        weights,
+        arguments.runtime,
+        image_size=arguments.image_size,
+        resize=arguments.resize,
+        compute_dtype=arguments.compute_dtype,
+        quiet=arguments.quiet,
+    )
+    return params, config
 
 
 def _words(result: Indexed) -> list[str]:

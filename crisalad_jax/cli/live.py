@@ -14,7 +14,9 @@ from crisalad_jax.utils.output import printable
 from crisalad_jax.utils.signals import defer_signals
 
 if TYPE_CHECKING:
+    from crisalad_jax.checkpoints.runtime import Runtime
     from crisalad_jax.cli.query import Query
+    from crisalad_jax.nn.model import Crisalad
 
 
 def run(arguments: "Query") -> None:
@@ -46,7 +48,7 @@ def run(arguments: "Query") -> None:
             source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps))
             words = f"taking frames from {source.name}"
         places = stack.enter_context(Map.open(arguments.map, verify=arguments.verify))
-        params = places.load_params(find_given(arguments.weights, quiet=arguments.quiet))
+        params = model_of(places, arguments)
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())
 
@@ -72,6 +74,14 @@ def run(arguments: "Query") -> None:
         finally:
             dropped = f"; {source.dropped} frames passed over" if source.dropped else ""
             _say(f"{latency_words(latencies)}{dropped}")
+
+
+def model_of(places: Map, arguments: "Query") -> "Crisalad | Runtime":
+    """Load the map's model, or open it in the engine that the flags ask for."""
+    weights = find_given(arguments.weights, quiet=arguments.quiet)
+    if arguments.runtime == "jax":
+        return places.load_params(weights)
+    return places.load_runtime(arguments.runtime, weights, any_grouping=arguments.window > 1)
 
 
 def sequence_of(arguments: "Query") -> BayesFilter | None:

@@ -9,7 +9,7 @@ import tyro
 
 from crisalad_jax.cli import live
 from crisalad_jax.cli.answers import answers_table
-from crisalad_jax.cli.common import STDOUT, console, find_given, say, talk_beside
+from crisalad_jax.cli.common import STDOUT, console, say, talk_beside
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError
@@ -63,6 +63,9 @@ class Query:
     """Frames described together, each with those just before it: a moving camera's."""
     weights: pathlib.Path | None = None
     """The model that made the map, as a file or a published name; by default where it was then."""
+    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
+    for it once; --weights may be an exported folder."""
     k: int = 5
     """Answers to each query."""
     min_similarity: float | None = None
@@ -108,7 +111,7 @@ def run(arguments: Query) -> None:
     with Map.open(arguments.map, verify=arguments.verify) as places:
         answers = query(
             places,
-            places.load_params(find_given(arguments.weights, quiet=arguments.quiet)),
+            live.model_of(places, arguments),
             arguments.images,
             k=arguments.k,
             fps=1.0 if arguments.fps is None else arguments.fps,

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
+from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
 from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
 from crisalad_jax.retrieval.euclidean import to_unit_vectors
 from crisalad_jax.retrieval.grouping import (
@@ -27,13 +27,14 @@ from crisalad_jax.retrieval.grouping import (
     parse_groupings,
     useful_batch_size,
 )
+from crisalad_jax.retrieval.model import Model, check_groupings, check_params
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
 from crisalad_jax.retrieval.search import search
+from crisalad_jax.utils.errors import InputError
 
 KS = (1, 5, 10, 20)
-
 
 Observe = Callable[
     [str, Float[np.ndarray, "image descriptor"], Float[np.ndarray, "image descriptor"]], None
@@ -42,7 +43,7 @@ Observe = Callable[
 
 
 def evaluate(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     benchmark: Benchmark,
     *,
@@ -116,6 +117,12 @@ def evaluate(
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
     check_params(params, config)
+    check_groupings(params, config, groupings)
+    if rerank is not None and rerank.params is None and isinstance(params, Runtime):
+        raise InputError(
+            f"rerank: found with a model in {params.engine}, expected weights of its own beside it "
+            "(--rerank-weights)"
+        )
     unit = config.unit_length if pca is None else pca.config.renormalise
     benchmark.ground_truth()
     images = max(len(benchmark.database), len(benchmark.queries))
@@ -151,7 +158,7 @@ def evaluate(
         if rerank is not None:
             stages[rerank.label] = stack.enter_context(
                 Reranker(
-                    rerank.over(params, config),
+                    rerank if isinstance(params, Runtime) else rerank.over(params, config),
                     benchmark.database,
                     benchmark.queries,
                     batch_size=batch_size,
@@ -161,10 +168,10 @@ def evaluate(
             )
         k = min(max(*KS, rerank.top if rerank else 0), len(benchmark.database))
         results = []
-        for grouping in parsed if params.cross_image else [Grouping("single", "single")]:
+        for grouping in parsed if config.cross_image.layers else [Grouping("single", "single")]:
             is_random = "shuffled" in (grouping.queries, grouping.database)
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
-            name = str(grouping) if params.cross_image else ANY
+            name = str(grouping) if config.cross_image.layers else ANY
             sides = (database, grouping.database), (queries, grouping.queries)
             database_share, query_share = (
                 _mean_share(side, kind, drawn, batch_size) for side, kind in sides

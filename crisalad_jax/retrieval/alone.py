@@ -10,10 +10,10 @@ from jaxtyping import Float32
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, check_params, describe, self_mask
 from crisalad_jax.retrieval.describe import group, tokens_in_batches
 from crisalad_jax.retrieval.described import Described
 from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
+from crisalad_jax.retrieval.model import Model, check_params, describe_each
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
@@ -21,7 +21,7 @@ from crisalad_jax.utils.progress import progress_bar
 
 
 def describe_alone(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     paths: Sequence[pathlib.Path],
     *,
@@ -53,7 +53,7 @@ def describe_alone(
 
 
 def describe_files(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
@@ -103,7 +103,7 @@ def describe_files(
 
 
 def describe_images(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     images: Sequence[Pixels],
     *,
@@ -153,7 +153,7 @@ def describe_images(
 
 
 def describe_prepared(
-    params: Crisalad, config: ModelConfig, prepared: Sequence[Pixels], *, batch_size: int
+    params: Model, config: ModelConfig, prepared: Sequence[Pixels], *, batch_size: int
 ) -> Float32[np.ndarray, "image descriptor"]:
     """Describe pictures of `prepare_image`, each as if it were alone; see `describe_images`."""
     by_shape: dict[tuple[int, ...], list[int]] = {}
@@ -165,6 +165,5 @@ def describe_prepared(
             part = numbers[start : start + batch_size]
             count = min(batch_size, 1 << (len(part) - 1).bit_length())
             batch = np.stack([prepared[part[i % len(part)]] for i in range(count)])
-            described = describe(params, batch, config, mask=self_mask(count))
-            descriptors[part] = np.asarray(described)[: len(part)]
+            descriptors[part] = describe_each(params, batch, config)[: len(part)]
     return descriptors

@@ -10,13 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int64
 
+from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, attend_across_images, cast_params, extract_tokens
+from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.retrieval.grouping import (
     Batches,
     batches_of,
+)
+from crisalad_jax.retrieval.model import (
+    Model,
+    attend_across_images,
+    cast_params,
+    check_groupings,
+    extract_tokens,
 )
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.utils import compiler
@@ -50,7 +58,7 @@ class HeldTokens(Protocol):
 
 
 def read_tokens(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     paths: Sequence[pathlib.Path],
     *,
@@ -78,7 +86,7 @@ def read_tokens(
 
 
 def tokens_in_batches(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     paths: Sequence[pathlib.Path],
     *,
@@ -98,6 +106,12 @@ def tokens_in_batches(
     batches = photograph_batches(
         config, paths, batch_size=batch_size, on_bad_image=on_bad_image, cache=cache
     )
+    if isinstance(params, Runtime):
+        for batch in batches:
+            rows = params.tokens(batch.images)
+            none = np.empty((len(rows), 0, 0), np.float32)
+            yield FolderTokens(rows, none, batch.valid), batch
+        return
     devices = devices_for(batch_size)
     params = devices.replicate(cast_params(params, config))
 
@@ -117,7 +131,7 @@ def tokens_in_batches(
 
 
 def group(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     folder: HeldTokens,
     grouping: str,
@@ -142,7 +156,7 @@ def group(
 
 
 def described(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     folder: HeldTokens,
     grouping: str,
@@ -157,6 +171,7 @@ def described(
     Raises:
         InputError: what `check_grouping` raises.
     """
+    check_groupings(params, config, [grouping])
     count = len(folder.readable)
     batches = batches_of(count, grouping, batch_size, seed)
     # A window gives one descriptor, so `batch_size` windows are computed at a time.
@@ -173,7 +188,7 @@ def described(
 
 
 def _relate_batch(
-    params: Crisalad, config: ModelConfig, folder: HeldTokens, batch: Batches
+    params: Model, config: ModelConfig, folder: HeldTokens, batch: Batches
 ) -> Float[np.ndarray, "image descriptor"]:
     """Describe the images of one batch."""
     (images,), (kept_places,), (mask,) = batch.images, batch.kept, batch.looks(folder.readable)
@@ -182,9 +197,16 @@ def _relate_batch(
 
 
 def _relate_windows(
-    params: Crisalad, config: ModelConfig, folder: HeldTokens, windows: Batches
+    params: Model, config: ModelConfig, folder: HeldTokens, windows: Batches
 ) -> Float[np.ndarray, "window descriptor"]:
     """Describe the last image of each of some windows."""
+    if isinstance(params, Runtime):
+        pairs = zip(windows.images, windows.looks(folder.readable), strict=True)
+        lasts = [
+            attend_across_images(params, folder.of(images), config, mask=mask)[-1]
+            for images, mask in pairs
+        ]
+        return np.stack(lasts)
     width = windows.images.shape[1]
     # Windows overlap, so each image goes to the device once. Shapes are always those of `width`
     # windows, for one compilation.

@@ -12,7 +12,6 @@ from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import frame_time, name_frame
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
-from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.chunks import check_all_rows
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
@@ -23,6 +22,7 @@ from crisalad_jax.retrieval.descriptor_files import (
 )
 from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
+from crisalad_jax.retrieval.model import Model, check_groupings, check_params
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.sets import (
     DescribedSet,
@@ -41,7 +41,7 @@ StrPath = str | os.PathLike[str]
 
 
 def extract(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     images: StrPath | Sequence[StrPath],
     out: StrPath | None = None,
@@ -67,7 +67,7 @@ def extract(
     Tokens and descriptors are then in files, and a few hundred images' in memory.
 
     Args:
-        params: the model's parameters.
+        params: the model's parameters, or a `Runtime` that has them.
         config: the model; images are resized as it says.
         images: a folder, searched with its subfolders in sorted order, another source of images
             (docs/how-to/image-sources.md), or a list of files.
@@ -108,6 +108,7 @@ def extract(
         (4, 576)
     """
     check_params(params, config)
+    check_groupings(params, config, [grouping])
     check_extraction(
         out,
         grouping=grouping,

@@ -14,14 +14,13 @@ import safetensors
 from jaxtyping import Bool, Int64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.video import file_of
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.retrieval.describe import FolderTokens, tokens_in_batches
+from crisalad_jax.retrieval.model import Model, model_hash
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
@@ -70,7 +69,7 @@ def _segments(folder: pathlib.Path) -> list[pathlib.Path]:
 
 def read_tokens_partly(
     folder: pathlib.Path,
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     paths: Sequence[pathlib.Path],
     *,
@@ -163,7 +162,7 @@ def _path(folder: pathlib.Path, first: int) -> pathlib.Path:
     return folder / f"{first:010d}.safetensors"
 
 
-def _plan(params: Crisalad, config: ModelConfig, batch_size: int) -> dict[str, Any]:
+def _plan(params: Model, config: ModelConfig, batch_size: int) -> dict[str, Any]:
     """Return what all tokens depend on: the model, and how many images are computed together."""
     plan = {
         "model": model_hash(params, config),

@@ -10,7 +10,6 @@ import numpy as np
 
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.chunks import check_rows, pieces
 from crisalad_jax.retrieval.describe import HeldTokens, described, group, read_tokens
 from crisalad_jax.retrieval.descriptor_files import (
@@ -22,6 +21,7 @@ from crisalad_jax.retrieval.descriptor_files import (
     targets,
     write_descriptors,
 )
+from crisalad_jax.retrieval.model import Model
 from crisalad_jax.retrieval.partial import partial_folder, read_tokens_partly
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.shares import Share
@@ -98,7 +98,7 @@ def open_work(out: str | os.PathLike[str] | None) -> Iterator[Work]:
 
 
 def describe_set(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     paths: Sequence[pathlib.Path],
     names: Sequence[str],

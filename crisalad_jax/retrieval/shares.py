@@ -6,10 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
-from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.retrieval.model import Model, model_hash
 from crisalad_jax.utils.errors import InputError
 
 
@@ -65,7 +64,7 @@ class Share(NamedTuple):
 
 
 def digest_of(
-    params: Crisalad, config: ModelConfig, names: Sequence[str], settings: Mapping[str, Any]
+    params: Model, config: ModelConfig, names: Sequence[str], settings: Mapping[str, Any]
 ) -> str:
     """Compute a digest of what all shares of one collection have in common."""
     common = {"model": model_hash(params, config), "config": to_plain(config), **settings}

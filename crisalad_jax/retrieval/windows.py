@@ -13,11 +13,16 @@ from jaxtyping import Float32
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, attend_across_images, cast_params, extract_tokens
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.retrieval.alone import describe_alone, describe_images
 from crisalad_jax.retrieval.describe import FolderTokens, group, tokens_in_batches
 from crisalad_jax.retrieval.described import Described
+from crisalad_jax.retrieval.model import (
+    Model,
+    attend_across_images,
+    cast_params,
+    extract_tokens,
+)
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
@@ -39,7 +44,7 @@ def check_window(config: ModelConfig, window: int) -> None:
 
 
 def describe_windows(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     paths: Sequence[pathlib.Path],
     *,
@@ -72,7 +77,7 @@ def describe_windows(
 
 
 def describe_sources(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     sources: Sequence[list[pathlib.Path]],
     *,
@@ -110,7 +115,7 @@ def _join(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 class FrameDescriber:
     """Describe pictures as they come, each with the `window - 1` before it."""
 
-    def __init__(self, params: Crisalad, config: ModelConfig, window: int = 1) -> None:
+    def __init__(self, params: Model, config: ModelConfig, window: int = 1) -> None:
         """Start without a picture.
 
         Raises:

@@ -91,6 +91,22 @@ def user_cache() -> pathlib.Path:
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
 
 
+CACHE = "CRISALAD_CACHE"
+"""Variable of the environment: the folder of models that are kept."""
+
+
+def cache_folder() -> pathlib.Path:
+    """Return the folder of the cache, which need not be there yet.
+
+    It is what `CRISALAD_CACHE` names, else `crisalad_jax` in the user's cache, which
+    `XDG_CACHE_HOME` may name.
+    """
+    own = os.environ.get(CACHE)
+    if own:
+        return pathlib.Path(own).expanduser()
+    return user_cache() / "crisalad_jax"
+
+
 def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
     """Read a regular file of at most `LARGEST` bytes.
 

@@ -262,7 +262,10 @@ def test_nothing_is_chosen_by_the_platform_that_exports(monkeypatch: pytest.Monk
         ({"platforms": ("cpu", "metal")}, "platforms: found 'metal', expected one of cpu, cuda"),
         ({"platforms": ()}, "platforms: found none, expected some of cpu, cuda, rocm, tpu"),
         ({"batch_size": 0}, "batch size: found 0, expected at least 1"),
-        ({"grouping": "shuffled"}, "grouping: found 'shuffled', expected one of batch, single"),
+        (
+            {"grouping": "shuffled"},
+            "grouping: found 'shuffled', expected one of any, batch, single",
+        ),
     ],
 )
 def test_what_cannot_be_asked_for(fields: dict[str, Any], words: str):

@@ -1,4 +1,4 @@
-"""Write a function of images as an ONNX program."""
+"""Write a function of weights and images as an ONNX program."""
 
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from crisalad_jax.checkpoints.engines import DESCRIPTORS, IMAGES
 from crisalad_jax.checkpoints.onnx_format.convert import convert
 from crisalad_jax.checkpoints.onnx_format.graph import OPSET as OPSET
 from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known, place_constants
@@ -18,62 +17,64 @@ from crisalad_jax.utils.files import told_of
 def onnx_graph(
     run: Callable[..., Any],
     weights: Mapping[str, Any],
-    images: jax.ShapeDtypeStruct,
-) -> tuple[Graph, Value, Value]:
-    """Convert a function of weights and images, with the weights as constants.
+    inputs: Mapping[str, jax.ShapeDtypeStruct],
+) -> tuple[Graph, list[Value], Value]:
+    """Convert a function of weights and other arrays, with the weights as constants.
 
     Args:
-        run: the function, of a dictionary of arrays and images.
+        run: the function, of a dictionary of arrays and the inputs in their order.
         weights: the arrays.
-        images: shape and type of the images; the number of them may be symbolic.
+        inputs: shapes and types of the inputs by name. Their first sides are the number of images,
+            which may be symbolic.
 
     Returns:
-        (graph, images, descriptors).
+        (graph, inputs, output).
 
     Raises:
         InputError: the function has an operation that no operator of ONNX is made of; named.
     """
-    traced = jax.make_jaxpr(run)(weights, images)
+    traced = jax.make_jaxpr(run)(weights, *inputs.values())
     graph = Graph()
-    value = Value(images.shape, np.dtype(images.dtype), IMAGES)
-    count = images.shape[0]
+    values = [Value(each.shape, np.dtype(each.dtype), name) for name, each in inputs.items()]
+    count = values[0].shape[0]
     if not is_known(count):
-        (name,) = graph.node("Shape", [IMAGES], start=0, end=1)
-        graph.symbolic[count] = name
+        (graph.symbolic[count],) = graph.node("Shape", [values[0].name], start=0, end=1)
     arguments = [Value.of(leaf) for leaf in jax.tree.leaves(weights)]
-    (descriptors,) = convert(graph, traced, [*arguments, value])
-    if descriptors.missing:
+    (output,) = convert(graph, traced, [*arguments, *values])
+    if output.missing:
         raise InputError(
-            f"format onnx: found the operation {descriptors.missing}, expected a model of "
-            "operations that ONNX has (docs/export.md)"
+            f"format onnx: found the operation {output.missing}, expected a model of operations "
+            "that ONNX has (docs/export.md)"
         )
-    return graph, value, graph.full(descriptors, traced.out_avals[0].shape)
+    return graph, values, graph.full(output, traced.out_avals[0].shape)
 
 
 def write_onnx(
     path: pathlib.Path,
     run: Callable[..., Any],
     weights: Mapping[str, Any],
-    images: jax.ShapeDtypeStruct,
+    inputs: Mapping[str, jax.ShapeDtypeStruct],
+    output: str,
     *,
     words: str,
     beside: bool,
 ) -> None:
-    """Write a function of weights and images as an ONNX program.
+    """Write a function of weights and other arrays as an ONNX program.
 
     Args:
         path: the file.
         run: as `onnx_graph`.
         weights: as `onnx_graph`.
-        images: as `onnx_graph`.
+        inputs: as `onnx_graph`.
+        output: name of the output.
         words: what the file says of itself.
         beside: whether large weights go to a file of its own, `path` with .data appended.
 
     Raises:
         InputError: as `onnx_graph`, or the disk is full.
     """
-    graph, value, descriptors = onnx_graph(run, weights, images)
-    model = graph.model([value], [(DESCRIPTORS, descriptors)], words)
+    graph, values, result = onnx_graph(run, weights, inputs)
+    model = graph.model(values, [(output, result)], words)
     data = path.with_name(f"{path.name}.data")
     places = place_constants(model, graph.constants, data.name if beside else None)
     with told_of(path):

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.exif import exif_positions
@@ -18,7 +17,6 @@ from crisalad_jax.data.positions import Positions, read_positions, utm_positions
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, check_params
 from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.described import Described
 from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
@@ -28,6 +26,7 @@ from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, r
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.shared import SharedMap
 from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.model import Model, check_params, model_hash
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.shares import Share, digest_of
 from crisalad_jax.utils.errors import InputError
@@ -65,7 +64,7 @@ class Indexed(NamedTuple):
 
 def index_images(
     target: Map,
-    params: Crisalad,
+    params: Model,
     root: pathlib.Path,
     paths: Sequence[pathlib.Path],
     *,
@@ -168,7 +167,7 @@ def _new_images(
 
 
 def index(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     images: str | os.PathLike[str],
     out: str | os.PathLike[str],
@@ -310,7 +309,7 @@ def index(
 
 def _index_share(
     shared: SharedMap,
-    params: Crisalad,
+    params: Model,
     images: pathlib.Path,
     paths: Sequence[pathlib.Path],
     *,

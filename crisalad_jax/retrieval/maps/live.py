@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
+from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.live import Frame
 from crisalad_jax.retrieval.maps.follow import Follower
@@ -50,7 +51,7 @@ class LiveAnswer(NamedTuple):
 
 def query_live(
     places: Map,
-    params: "Crisalad",
+    params: "Crisalad | Runtime",
     source: FrameSource,
     *,
     k: int = 5,
@@ -98,7 +99,7 @@ def query_live(
         >>> [answer.image.name for _, ranked in found.answers.rows() for answer in ranked]
         ['2.png']
     """
-    from crisalad_jax.nn.model import check_params
+    from crisalad_jax.retrieval.model import check_params
     from crisalad_jax.retrieval.windows import FrameDescriber, check_window
 
     if k < 1:

@@ -8,10 +8,8 @@ import pathlib
 import uuid
 from collections.abc import Iterator
 
-from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
-from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.head import (
     COMPONENTS,
     DESCRIPTION,
@@ -25,6 +23,7 @@ from crisalad_jax.retrieval.maps.head import (
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.model import Model, model_hash
 from crisalad_jax.retrieval.pca import Pca, pca_hash
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -40,7 +39,7 @@ class MapDescription(MapHead):
 
 
 def describe_map(
-    params: Crisalad,
+    params: Model,
     config: ModelConfig,
     weights: pathlib.Path,
     folder: pathlib.Path,

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float, Float32
 
+from crisalad_jax.checkpoints.engines import EngineName
+from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.positions import Positions
@@ -40,6 +42,7 @@ from crisalad_jax.retrieval.maps.head import (
     is_checked,
     read_components,
     read_head,
+    read_value,
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import Store, open_store
@@ -123,7 +126,7 @@ class Map:
         self._approximate: Approximate | None = None
         self._tells_stale = True
         """Whether the next search that is not asked to be exact tells why it is."""
-        self._checked: Crisalad | None = None
+        self._checked: Crisalad | Runtime | None = None
         """Parameters that are known to be of the model that made the map."""
         self._segments: list[_Segment] = []
         # A writer adds records in order, so those that are listed now have all before them. It may
@@ -347,7 +350,7 @@ class Map:
         image: Pixels | str | os.PathLike[str],
         k: int = 5,
         *,
-        params: "Crisalad | None" = None,
+        params: "Crisalad | Runtime | None" = None,
     ) -> list[Answer]:
         """Find the images of the map that are most similar to one picture.
 
@@ -546,27 +549,69 @@ class Map:
         """
         from crisalad_jax.checkpoints.weights import load_with_hash
 
-        file = pathlib.Path(self.head.weights) if weights is None else weights
-        if weights is None and not pathlib.Path(file).is_file():
-            raise InputError(
-                f"{self.folder}: found no {file}, which made this map, expected it there or as "
-                "--weights"
-            )
+        file = self._weights(weights)
         params, _, digest = load_with_hash(file)
         check_model(self.head, self.folder, digest, file)
         self._checked = params
         return params
 
-    def check_params(self, params: "Crisalad") -> None:
+    def load_runtime(
+        self,
+        engine: EngineName,
+        weights: str | os.PathLike[str] | None = None,
+        *,
+        any_grouping: bool = False,
+    ) -> Runtime:
+        """Open the model that made the map in another engine; JAX is not imported for it.
+
+        Args:
+            engine: "onnxruntime" or "openvino".
+            weights: an exported folder or the file; None is where it was then.
+            any_grouping: whether queries look at each other.
+
+        Returns:
+            The model, in the place of parameters.
+
+        Raises:
+            InputError: what `open_runtime` raises, or it is of another model.
+        """
+        file = self._weights(weights)
+        config = read_value(self.folder)["config"]  # pyright: ignore[reportOptionalSubscript]
+        runtime = open_runtime(
+            file,
+            engine,
+            image_size=tuple(config["image_size"]),
+            preprocessing=config.get("preprocessing"),
+            precision=config.get("compute_dtype", "float32"),
+            any_grouping=any_grouping,
+        )
+        check_model(self.head, self.folder, runtime.digest, file)
+        self._checked = runtime
+        return runtime
+
+    def _weights(self, weights: str | os.PathLike[str] | None) -> str | os.PathLike[str]:
+        """Return a model's file, by default where it was when the map was made."""
+        file = pathlib.Path(self.head.weights) if weights is None else weights
+        if weights is None and not pathlib.Path(file).exists():
+            raise InputError(
+                f"{self.folder}: found no {file}, which made this map, expected it there or as "
+                "--weights"
+            )
+        return file
+
+    def check_params(self, params: "Crisalad | Runtime") -> None:
         """Check that parameters are of the model that made the map; the same ones only once.
 
         Raises:
             InputError: they are not.
         """
-        from crisalad_jax.checkpoints.weights import model_hash
-
         if params is not self._checked:
-            digest = model_hash(params, self.description.config)
+            if isinstance(params, Runtime):
+                digest = params.digest
+            else:
+                from crisalad_jax.checkpoints.weights import model_hash
+
+                digest = model_hash(params, self.description.config)
             check_model(self.head, self.folder, digest, "the given parameters")
             self._checked = params
 

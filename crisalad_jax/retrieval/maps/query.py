@@ -1,5 +1,6 @@
 """Queries to a map: which of its images are most similar to others, and where they were taken."""
 
+import itertools
 import json
 import os
 import pathlib
@@ -9,9 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import frame_time
+from crisalad_jax.retrieval.by_engine import describe_by_engine
 from crisalad_jax.retrieval.described import Described
 from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
@@ -83,7 +86,7 @@ class Answers(NamedTuple):
 
 def query(
     places: Map,
-    params: "Crisalad",
+    params: "Crisalad | Runtime",
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     k: int = 5,
@@ -196,7 +199,7 @@ def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
 
 def _described(
     places: Map,
-    params: "Crisalad",
+    params: "Crisalad | Runtime",
     sources: Sequence[list[pathlib.Path]],
     *,
     window: int,
@@ -204,7 +207,16 @@ def _described(
     on_bad_image: OnBadImage,
 ) -> Iterator[Described]:
     """Check that the model made the map, then describe the images of all sources."""
-    from crisalad_jax.nn.model import check_params
+    if window == 1 and isinstance(params, Runtime):
+        places.check_params(params)
+        return describe_by_engine(
+            params,
+            list(itertools.chain(*sources)),
+            batch_size=batch_size,
+            on_bad_image=on_bad_image,
+            components=places.components,
+        )
+    from crisalad_jax.retrieval.model import check_params
     from crisalad_jax.retrieval.windows import check_window, describe_sources
 
     places.check_params(params)

@@ -1,0 +1,160 @@
+"""`--runtime` of the commands: the answers of JAX, and for every bad input one line."""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.export import ExportConfig, write_export
+from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.nn.model import Crisalad
+from tests.cli.test_cli import fails, succeeds
+from tests.conftest import MODEL, random_params
+
+ENGINES = ("onnxruntime", "openvino")
+# As of exports: the same operations, rounded in another order.
+TOLERANCE = 2e-6
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("grouping", ["single", "sequential", "window"])
+def test_extract_gives_the_descriptors_of_jax(
+    engine: str,
+    grouping: str,
+    shared: pathlib.Path,
+    tmp_path: pathlib.Path,
+    capfd: pytest.CaptureFixture[str],
+):
+    flags = ("--images", shared / "town", "--grouping", grouping, "--batch-size", "4", "--quiet")
+    weights = ("--weights", shared / "weights.safetensors")
+    found = {}
+    for runtime in ("jax", engine):
+        out = tmp_path / f"{runtime}.npy"
+        succeeds(capfd, "extract", *weights, *flags, "--runtime", runtime, "--out", out)
+        found[runtime] = np.load(out)
+    np.testing.assert_allclose(found[engine], found["jax"], rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_evaluate_recalls_as_jax_does(
+    engine: str, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+):
+    command = (
+        *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
+        *("--batch-size", "4", "--seeds", "1", "--quiet"),
+    )
+    tables = {}
+    for runtime in ("jax", engine):
+        file = tmp_path / f"{runtime}.json"
+        succeeds(capfd, *command, "--runtime", runtime, "--json", file)
+        tables[runtime] = json.loads(file.read_text())["groupings"]
+    assert tables[engine] == tables["jax"]
+
+
+def test_a_map_of_one_runtime_answers_another(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+):
+    weights = shared / "weights.safetensors"
+    images, queries = shared / "town" / "database", shared / "town" / "queries"
+    index = ("index", "--weights", weights, "--images", images, "--out", tmp_path / "map")
+    succeeds(capfd, *index, "--runtime", "openvino", "--quiet")
+    assert "7 were there already" in succeeds(capfd, *index, "--runtime", "onnxruntime", "--quiet")
+    answers = []
+    for runtime in ("jax", *ENGINES):
+        said = tmp_path / f"{runtime}.jsonl"
+        succeeds(
+            capfd,
+            *("query", queries, "--map", tmp_path / "map", "--k", "3", "--runtime", runtime),
+            *("--quiet", "--json", said),
+        )
+        lines = map(json.loads, said.read_text().splitlines())
+        answers.append([[each["image"] for each in line["answers"]] for line in lines])
+    assert len(answers[0]) == 5
+    assert answers[0] == answers[1] == answers[2]
+
+
+def test_a_kept_export_describes_without_jax(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+):
+    weights = shared / "weights.safetensors"
+    out = tmp_path / "d.npy"
+    extract = ("extract", "--weights", weights, "--images", shared / "town" / "queries")
+    succeeds(capfd, *extract, "--runtime", "onnxruntime", "--out", out, "--quiet")
+    program = (
+        "import sys, numpy as np\n"
+        "from crisalad_jax.checkpoints.runtime import open_runtime\n"
+        f"model = open_runtime({str(weights)!r}, 'onnxruntime')\n"
+        "assert model.describe(np.zeros((1, 42, 56, 3), np.uint8)).shape == (1, 48)\n"
+        "print('jax' in sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "False\n"
+
+
+@pytest.fixture
+def exported(params: Crisalad, tmp_path: pathlib.Path) -> pathlib.Path:
+    write_export(tmp_path / "onnx", params, MODEL, ExportConfig(format="onnx"))
+    return tmp_path / "onnx"
+
+
+def test_an_exported_folder_is_a_model(
+    exported: pathlib.Path,
+    shared: pathlib.Path,
+    tmp_path: pathlib.Path,
+    capfd: pytest.CaptureFixture[str],
+):
+    flags = ("--images", shared / "town" / "queries", "--quiet")
+    out = tmp_path / "d.npy"
+    extract = ("extract", "--weights", exported, *flags, "--out", out)
+    succeeds(capfd, *extract, "--runtime", "openvino")
+    own = tmp_path / "jax.npy"
+    weights = ("--weights", shared / "weights.safetensors")
+    succeeds(capfd, "extract", *weights, *flags, "--out", own)
+    np.testing.assert_allclose(np.load(out), np.load(own), rtol=0, atol=TOLERANCE)
+
+
+def test_bad_input_is_one_line(
+    exported: pathlib.Path,
+    shared: pathlib.Path,
+    tmp_path: pathlib.Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    flags = ("--images", shared / "town" / "queries", "--out", tmp_path / "d.npy", "--quiet")
+    extract = ("extract", "--weights", exported, *flags, "--runtime", "onnxruntime")
+    fails(capfd, *extract, "--grouping", "sequential", words=("grouping: found sequential",))
+    fails(capfd, *extract, "--image-size", "56", "42", words=("42 x 56", "expected 56 x 42"))
+    fails(capfd, *extract, "--compute-dtype", "bfloat16", words=("bfloat16 with onnxruntime",))
+    fails(capfd, *extract[:-2], words=(exported,))  # JAX takes no folder
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    fails(capfd, *extract, words=("no module onnxruntime", "pip install 'crisalad-jax[onnx]'"))
+    data = (exported / "describe.onnx.data").read_bytes()
+    (exported / "describe.onnx.data").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    fails(
+        capfd,
+        *extract[:-1],
+        "openvino",
+        words=("describe.onnx.data: found other bytes than manifest.json says",),
+    )
+    assert not (tmp_path / "d.npy").exists()
+
+
+def test_a_program_of_other_weights_is_not_a_maps(
+    exported: pathlib.Path,
+    shared: pathlib.Path,
+    tmp_path: pathlib.Path,
+    capfd: pytest.CaptureFixture[str],
+):
+    other = tmp_path / "other.safetensors"
+    params = random_params(MODEL)
+    save_weights(other, params, MODEL)
+    images = shared / "town" / "queries"
+    index = ("index", "--images", images, "--out", tmp_path / "map", "--quiet")
+    succeeds(capfd, *index, "--weights", other)
+    query = ("query", images, "--map", tmp_path / "map", "--weights", exported, "--quiet")
+    fails(capfd, *query, "--runtime", "onnxruntime", words=(exported, "map"))
