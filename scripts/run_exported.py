@@ -2,9 +2,10 @@
 
     python scripts/run_exported.py EXPORT --images FOLDER --out descriptors.npy [--batch-size 16]
 
-Needs jax, flatbuffers, numpy, Pillow, and safetensors where the weights lie beside the program. Row
-i of the array is the image of line i of the file of names beside it (.names.txt). All that it needs
-to know is in EXPORT/manifest.json: take from here what a program of your own needs.
+Of format stablehlo. Needs jax, flatbuffers, numpy, Pillow, and safetensors where the weights lie
+beside the program. Row i of the array is the image of line i of the file of names beside it
+(.names.txt). All that it needs to know is in EXPORT/manifest.json: take from here what a program of
+your own needs.
 """
 
 import argparse
@@ -19,6 +20,10 @@ import numpy as np
 import PIL.Image
 import PIL.ImageOps
 
+FILTERS = {
+    "bilinear": PIL.Image.Resampling.BILINEAR,
+    "bicubic": PIL.Image.Resampling.BICUBIC,
+}
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
 
@@ -39,11 +44,16 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     zeros = data.replace(digest.encode(), b"0" * 64, 1)
     if hashlib.sha256(zeros).hexdigest() != digest:
         raise SystemExit(f"{path}: found other bytes than were written")
+    if manifest["program_format"] != "stablehlo":
+        raise SystemExit(
+            f"{path}: found a program of {manifest['program_format']}, expected stablehlo; call: "
+            f"{manifest['call']}"
+        )
     return manifest
 
 
 def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
-    """The function of images (batch, height, width, 3), uint8, to descriptors."""
+    """The function of images (batch, height, width, 3), of the manifest's type, to descriptors."""
     program = jax.export.deserialize(bytearray(read_whole(folder, manifest["program"])))
     if manifest["weights"] is None:
         return lambda images: np.asarray(program.call(images))
@@ -54,18 +64,39 @@ def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray
     return lambda images: np.asarray(program.call(weights, images))
 
 
-def read_image(path: pathlib.Path, height: int, width: int) -> np.ndarray:
-    """8-bit RGB pixels, upright, resized as the manifest says."""
+def read_image(path: pathlib.Path, manifest: dict[str, Any]) -> np.ndarray:
+    """RGB pixels, upright, resized and, where they are floats, normalised as the manifest says."""
+    how, wanted = manifest["model"]["preprocessing"], manifest["images"]
+    if how["filter"] not in FILTERS or not how["antialias"]:
+        raise SystemExit(f"found images resized {wanted['resize']}, which Pillow cannot do")
     with PIL.Image.open(path) as image:
-        upright = PIL.ImageOps.exif_transpose(image).convert("RGB")
-        return np.asarray(upright.resize((width, height), PIL.Image.Resampling.BILINEAR))
+        pixels = np.asarray(PIL.ImageOps.exif_transpose(image).convert("RGB"))
+    if how["pixels"] == "floats":
+        pixels = pixels.astype(np.float32)
+    pixels = resize(pixels, tuple(manifest["model"]["image_size"]), FILTERS[how["filter"]])
+    # A model that rounds sides to its patches resizes once more.
+    pixels = resize(pixels, tuple(wanted["shape"][1:3]), FILTERS["bilinear"])
+    if wanted["dtype"] == "uint8":
+        return pixels
+    return ((pixels / np.float32(255) - wanted["mean"]) / wanted["deviation"]).astype(np.float32)
+
+
+def resize(pixels: np.ndarray, size: tuple[int, int], resample: Any) -> np.ndarray:
+    """Pixels (height, width, 3) at another size: bytes together, floats channel by channel."""
+    height, width = size
+    if pixels.shape[:2] == size:
+        return pixels
+    if pixels.dtype == np.uint8:
+        return np.asarray(PIL.Image.fromarray(pixels).resize((width, height), resample))
+    channels = (PIL.Image.fromarray(channel) for channel in np.moveaxis(pixels, -1, 0))
+    return np.stack([np.asarray(each.resize((width, height), resample)) for each in channels], -1)
 
 
 def batches(
     paths: list[pathlib.Path], manifest: dict[str, Any], batch_size: int
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Images of so many files at a time, and how many of them count."""
-    fixed, height, width, _ = manifest["images"]["shape"]
+    fixed = manifest["images"]["shape"][0]
     size = fixed if isinstance(fixed, int) else batch_size
     if size == fixed and manifest["grouping"] == "batch" and len(paths) % size:
         raise SystemExit(
@@ -73,7 +104,7 @@ def batches(
             "at a time, and lets them look at each other"
         )
     for start in range(0, len(paths), size):
-        images = np.stack([read_image(p, height, width) for p in paths[start : start + size]])
+        images = np.stack([read_image(p, manifest) for p in paths[start : start + size]])
         count = len(images)
         if size == fixed:
             images = np.resize(images, (size, *images.shape[1:]))

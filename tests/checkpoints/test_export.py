@@ -26,8 +26,10 @@ from crisalad_jax.checkpoints.export import (
     write_export,
 )
 from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.data.resize import resize_image
+from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
@@ -167,14 +169,45 @@ def test_a_script_without_this_package(
     np.testing.assert_allclose(np.load(tmp_path / "found.npy"), expected, rtol=0, atol=TOLERANCE)
 
 
-def test_a_script_resizes_as_we_do(scripts: Any, tmp_path: pathlib.Path):
+def told(how: PreprocessingConfig, shape: tuple[int | str, ...]) -> dict[str, Any]:
+    """What a manifest says of images that are prepared like this."""
+    dtype = "uint8" if how.pixels == "bytes" else "float32"
+    images = {"shape": shape, "dtype": dtype, "resize": how.in_words(MODEL.image_size)}
+    images |= {"mean": how.mean, "deviation": how.deviation}
+    model = {"preprocessing": to_plain(how), "image_size": list(MODEL.image_size)}
+    return {"images": images, "grouping": "single", "model": model}
+
+
+@pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("pixels", ["bytes", "floats"])
+def test_a_script_prepares_images_as_we_do(
+    scripts: Any, tmp_path: pathlib.Path, filter: Any, pixels: Any
+):
     for name, seed in (("a.jpg", 1), ("b.png", 2)):
         write_picture(tmp_path / name, seed, noise=30.0)
+    how = PreprocessingConfig(filter=filter, pixels=pixels)
+    manifest = told(how, ("batch", *MODEL.image_size, 3))
     for path in list_images(tmp_path):
-        found = scripts("run_exported").read_image(path, *MODEL.image_size)
-        expected = resize_image(read_image(path), MODEL.image_size)
+        found = scripts("run_exported").read_image(path, manifest)
+        expected = Preparation(MODEL.image_size, how).prepare(read_image(path))
+        assert found.dtype == expected.dtype
         # A level where Pillow rounds the rows before the columns, one more where decoders differ.
-        assert np.abs(found.astype(int) - expected).max() <= 2
+        levels = 2 if pixels == "bytes" else 2 / 255 / min(how.deviation)
+        assert np.abs(found.astype(float) - expected).max() <= levels
+        other = dataclasses.replace(how, filter={"bilinear": "bicubic"}.get(filter, "bilinear"))
+        far = Preparation(MODEL.image_size, other).prepare(read_image(path))
+        assert np.abs(found.astype(float) - far).max() > 2 * levels
+
+
+def test_a_script_refuses_what_it_cannot_do(scripts: Any, tmp_path: pathlib.Path):
+    script = scripts("run_exported")
+    how = PreprocessingConfig(filter="area")
+    write_picture(tmp_path / "a.png", 1)
+    with pytest.raises(SystemExit, match=r"found images resized .* area.*, which Pillow cannot do"):
+        script.read_image(tmp_path / "a.png", told(how, ("batch", *MODEL.image_size, 3)))
+    write_json(tmp_path / "manifest.json", {"program_format": "onnx", "call": "onnxruntime"})
+    with pytest.raises(SystemExit, match="found a program of onnx, expected stablehlo"):
+        script.read_manifest(tmp_path)
 
 
 def test_a_script_fills_the_last_batch_or_refuses(
@@ -184,10 +217,10 @@ def test_a_script_fills_the_last_batch_or_refuses(
     for name in "abc":
         write_picture(tmp_path / f"{name}.png", ord(name))
     paths = list_images(tmp_path)
-    manifest = {"images": {"shape": [2, 42, 56, 3]}, "grouping": "single"}
+    manifest = told(PreprocessingConfig(), (2, 42, 56, 3))
     (first, two), (last, one) = script.batches(paths, manifest, 16)
     assert (first.shape, two, last.shape, one) == ((2, 42, 56, 3), 2, (2, 42, 56, 3), 1)
-    np.testing.assert_array_equal(last[0], script.read_image(paths[2], 42, 56))
+    np.testing.assert_array_equal(last[0], script.read_image(paths[2], manifest))
     with pytest.raises(SystemExit, match="found 3 images, expected a multiple of 2"):
         list(script.batches(paths, manifest | {"grouping": "batch"}, 16))
 
