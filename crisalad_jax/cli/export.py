@@ -75,7 +75,7 @@ def run(arguments: Export) -> None:
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
     )
-    calibration = None if arguments.int8 is None else _calibration(arguments.int8, config)
+    calibration = None if arguments.int8 is None else read_calibration(arguments.int8, config)
     manifest = write_export(arguments.out, params, config, how, calibration=calibration)
     shapes = (
         f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"
@@ -101,7 +101,7 @@ _MOST = 256
 """Largest number of photographs that products are quantised with: more change nothing."""
 
 
-def _calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray":
+def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray":
     """Read some photographs, evenly spread over all, as the model takes them."""
     import numpy as np
 
