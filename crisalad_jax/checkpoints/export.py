@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import os
 import pathlib
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
@@ -220,6 +221,8 @@ def write_export(
     params: Crisalad,
     config: ModelConfig,
     how: ExportConfig = ExportConfig(),
+    *,
+    calibration: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """Write a model as a program into the new folder `out`, whole or not at all.
 
@@ -230,7 +233,10 @@ def write_export(
         out: the folder.
         params: the model's parameters.
         config: the model.
-        how: platforms, batch size and grouping.
+        how: format, platforms, batch size and grouping.
+        calibration: prepared images that products are quantised to int8 with, in ONNX and OpenVINO,
+            by onnxruntime; None keeps float32. Descriptors then differ, and by how much the
+            manifest says.
 
     Returns:
         The manifest, as manifest.json has it.
@@ -251,11 +257,13 @@ def write_export(
     """
     check_new_folder(out)
     check_exportable(params, config, how)
+    if calibration is not None:
+        _check_calibration(calibration, config, how)
     with atomic_folder(out) as folder:
         if how.format == "stablehlo":
             manifest = _write_stablehlo(folder, params, config, how)
         else:
-            manifest = _write_onnx(folder, params, config, how, os.fspath(out))
+            manifest = _write_onnx(folder, params, config, how, os.fspath(out), calibration)
         manifest |= {
             "grouping": how.grouping,
             "grouping_means": GROUPINGS[how.grouping],
@@ -265,6 +273,19 @@ def write_export(
         }
         write_json(folder / MANIFEST, manifest)
     return manifest
+
+
+def _check_calibration(images: np.ndarray, config: ModelConfig, how: ExportConfig) -> None:
+    if how.format == "stablehlo" or how.grouping == "any" or how.weights_inside or how.batch_size:
+        raise InputError(
+            "int8: found with format stablehlo, grouping any, weights inside or a batch size, "
+            "expected a program of onnx or openvino for any number of images"
+        )
+    shape = (*config.input_size, 3)
+    if images.shape[1:] != shape or not len(images):
+        raise InputError(
+            f"calibration: found shape {images.shape}, expected images of {shape}, at least one"
+        )
 
 
 def _write_stablehlo(
@@ -294,7 +315,12 @@ def _write_stablehlo(
 
 
 def _write_onnx(
-    folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig, out: str
+    folder: pathlib.Path,
+    params: Crisalad,
+    config: ModelConfig,
+    how: ExportConfig,
+    out: str,
+    calibration: np.ndarray | None,
 ) -> dict[str, Any]:
     """Write the files of ONNX or OpenVINO, check them, and return what the manifest says."""
     try:
@@ -314,6 +340,8 @@ def _write_onnx(
             words = f"{', '.join(inputs)} to {output}; {GROUPINGS[how.grouping]}"
             beside = not how.weights_inside
             write_onnx(path, function, arrays, inputs, output, words=words, beside=beside)
+        if calibration is not None:
+            _quantise(path, calibration)
         if how.format == "openvino":
             convert_to_openvino(path, path.with_suffix(".xml"))
             for suffix in SUFFIXES["onnx"]:
@@ -322,7 +350,7 @@ def _write_onnx(
         files[name] = {"program": lying[0], "weights": lying[1] if beside else None}
     engine: EngineName = "onnxruntime" if how.format == "onnx" else "openvino"
     difference = _difference(folder, engine, params, config, how)
-    if not difference <= TOLERANCE:
+    if calibration is None and not difference <= TOLERANCE:
         raise InputError(
             f"{out}: found descriptors of {engine} that differ from those of `describe` by "
             f"{difference:.2g}, expected at most {TOLERANCE:g}: nothing was written"
@@ -337,8 +365,25 @@ def _write_onnx(
         **_inputs_and_outputs(images, descriptors, config, how),
         "side_multiple": config.side_multiple,
         "opset": OPSET,
+        "products": "float32" if calibration is None else "int8",
         "checked": {"engine": engine, "largest_difference": difference},
     }
+
+
+def _quantise(program: pathlib.Path, calibration: np.ndarray) -> None:
+    """Quantise a program in its place."""
+    try:
+        from crisalad_jax.checkpoints.onnx_format.quantise import quantise
+    except ModuleNotFoundError as error:
+        raise InputError(missing_extra(error, "int8")) from error
+    data = program.with_name(f"{program.name}.data")
+    # It finds its weights by their name, so they keep it.
+    whole = program.parent / "float32"
+    whole.mkdir()
+    for each in (program, data):
+        each.rename(whole / each.name)
+    quantise(whole / program.name, program, calibration)
+    shutil.rmtree(whole)
 
 
 def _halves(

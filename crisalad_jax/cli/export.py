@@ -2,10 +2,15 @@
 
 import dataclasses
 import pathlib
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
 from crisalad_jax.utils.files import check_new_folder
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from crisalad_jax.nn.config import ModelConfig
 
 EXAMPLE = "crisalad export --weights salad --out exported"
 
@@ -36,6 +41,9 @@ class Export:
     pixels: Literal["bytes", "floats"] | None = None
     """Bytes, which the program normalises, or floats that already are; by default what the model
     resizes."""
+    int8: pathlib.Path | None = None
+    """Photographs to quantise products with, of onnx or openvino: a folder or another source of
+    some dozens like those to be described. Costs recall (docs/export.md)."""
     platforms: str = "cpu,cuda"
     """Of stablehlo, comma-separated: cpu, cuda, rocm, tpu."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
@@ -67,7 +75,8 @@ def run(arguments: Export) -> None:
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
     )
-    manifest = write_export(arguments.out, params, config, how)
+    calibration = None if arguments.int8 is None else read_calibration(arguments.int8, config)
+    manifest = write_export(arguments.out, params, config, how, calibration=calibration)
     shapes = (
         f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"
         for name in ("images", "descriptors")
@@ -77,7 +86,7 @@ def run(arguments: Export) -> None:
     else:
         checked = manifest["checked"]
         last = (
-            f"{how.format}; {checked['engine']} differs by at most "
+            f"{how.format}, {manifest['products']}; {checked['engine']} differs by at most "
             f"{checked['largest_difference']:.1g} from this package"
         )
     say(
@@ -86,3 +95,26 @@ def run(arguments: Export) -> None:
         f"{last}"
     )
     give_json(arguments.json, {"out": str(arguments.out), "manifest": manifest})
+
+
+_MOST = 256
+"""Largest number of photographs that products are quantised with: more change nothing."""
+
+
+def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray":
+    """Read some photographs, evenly spread over all, as the model takes them."""
+    import numpy as np
+
+    from crisalad_jax.data.images import read_image
+    from crisalad_jax.data.sources import open_source
+    from crisalad_jax.retrieval.photographs import prepare_image
+    from crisalad_jax.utils.errors import InputError
+
+    if config.preprocessing.size_rule != "fixed":
+        raise InputError(
+            f"int8: found images of size rule {config.preprocessing.size_rule}, expected fixed "
+            "(--resize fixed)"
+        )
+    paths = open_source(images).paths
+    chosen = paths[:: -(-len(paths) // _MOST)]
+    return np.stack([prepare_image(read_image(path), config) for path in chosen])

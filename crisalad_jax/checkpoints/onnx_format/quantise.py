@@ -1,0 +1,58 @@
+"""Quantise a program's products with weights to int8, by onnxruntime's own calibration."""
+
+import contextlib
+import logging
+import pathlib
+from collections.abc import Iterator
+
+import numpy as np
+from onnxruntime import quantization
+
+_OPERATORS = ["MatMul", "Conv"]
+"""What is quantised where a factor is a weight: the transport and the attention stay in float32."""
+
+
+class _Images(quantization.CalibrationDataReader):
+    """Images one by one, for the ranges of what layers give."""
+
+    def __init__(self, images: np.ndarray) -> None:
+        self._images: Iterator[dict[str, np.ndarray]] = (
+            {"images": images[number : number + 1]} for number in range(len(images))
+        )
+
+    def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
+        return next(self._images, None)
+
+
+def quantise(program: pathlib.Path, out: pathlib.Path, images: np.ndarray) -> None:
+    """Quantise a program of images.
+
+    Args:
+        program: the file in float32, for any number of images.
+        out: the file in int8; its weights lie beside it, with .data appended.
+        images: prepared images of the kind that will be described.
+    """
+    with _quiet():
+        quantization.quantize_static(
+            program,
+            out,
+            _Images(images),
+            quant_format=quantization.QuantFormat.QDQ,
+            op_types_to_quantize=_OPERATORS,
+            per_channel=True,
+            weight_type=quantization.QuantType.QInt8,
+            activation_type=quantization.QuantType.QInt8,
+            use_external_data_format=True,
+            extra_options={"MatMulConstBOnly": True, "ActivationSymmetric": True},
+        )
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Leave out the advice to optimise the program first, which was done as it was made."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)

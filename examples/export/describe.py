@@ -1,0 +1,21 @@
+"""Describe photographs by `crisalad export --format onnx`, with neither JAX nor this package.
+
+python examples/export/describe.py EXPORT IMAGE... (needs numpy, onnxruntime and Pillow)
+"""
+
+import json
+import pathlib
+import sys
+
+import numpy as np
+import onnxruntime
+from PIL import Image, ImageOps
+
+folder, *paths = map(pathlib.Path, sys.argv[1:])
+_, height, width, _ = json.loads((folder / "manifest.json").read_text())["images"]["shape"]
+session = onnxruntime.InferenceSession(folder / "describe.onnx")
+for path in paths:
+    image = ImageOps.exif_transpose(Image.open(path)).convert("RGB")
+    pixels = np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
+    (descriptors,) = session.run(["descriptors"], {"images": pixels[None]})
+    np.save(path.with_suffix(".npy").name, descriptors[0])

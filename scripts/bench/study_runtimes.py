@@ -1,0 +1,92 @@
+"""Recall of one model by each runtime, in float32 and in fewer bits, on photographs.
+
+    python scripts/bench/study_runtimes.py --weights FILE --data SET... --int8 PHOTOGRAPHS
+        [--page docs/export.md]
+
+Every image is described alone. "Same" counts the queries with the same first answer as JAX's. With
+--page the table takes its place in the page.
+"""
+
+import argparse
+import dataclasses
+import pathlib
+import tempfile
+from collections.abc import Iterator
+
+import numpy as np
+
+from crisalad_jax.checkpoints.export import ExportConfig, write_export
+from crisalad_jax.checkpoints.runtime import open_runtime
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.cli.export import read_calibration
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.extract import extract
+from crisalad_jax.retrieval.model import Model
+from crisalad_jax.utils.files import around
+
+KS = (1, 5, 10)
+
+
+def models(
+    weights: pathlib.Path, photographs: pathlib.Path, folder: pathlib.Path
+) -> Iterator[tuple[str, Model, ModelConfig]]:
+    """The model by each runtime, with its name in the table; JAX's in float32 is the first."""
+    params, config = load_weights(weights)
+    yield "JAX, float32", params, config
+    yield "JAX, bfloat16", params, dataclasses.replace(config, compute_dtype="bfloat16")
+    for format in ("onnx", "openvino"):
+        write_export(folder / format, params, config, ExportConfig(format=format))
+        whole = read_calibration(photographs, config)
+        how = ExportConfig(format=format)
+        write_export(folder / f"{format}-int8", params, config, how, calibration=whole)
+    for engine, format in (("onnxruntime", "onnx"), ("openvino", "openvino")):
+        yield f"{engine}, float32", open_runtime(folder / format, engine), config
+        yield f"{engine}, int8", open_runtime(folder / f"{format}-int8", engine), config
+    fewer = open_runtime(folder / "openvino", "openvino", precision="bfloat16")
+    yield "openvino, bfloat16", fewer, config
+
+
+def first_answers(model: Model, config: ModelConfig, data: Benchmark) -> np.ndarray:
+    """The numbers of the images most similar to each query, best first."""
+    there, asked = (
+        np.asarray(extract(model, config, paths, quiet=True).descriptors)
+        for paths in (data.database, data.queries)
+    )
+    return np.argsort(-(asked @ there.T), axis=1, kind="stable")[:, : max(KS)]
+
+
+def recalls(answers: np.ndarray, data: Benchmark) -> list[float]:
+    """Share of queries, of those with a positive, that have one among their first answers."""
+    right = [(a, set(p)) for a, p in zip(answers, data.ground_truth(), strict=True) if len(p)]
+    return [100 * float(np.mean([not p.isdisjoint(a[:k]) for a, p in right])) for k in KS]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--weights", type=pathlib.Path, required=True)
+    parser.add_argument("--data", type=pathlib.Path, nargs="+", required=True)
+    parser.add_argument("--int8", type=pathlib.Path, required=True)
+    parser.add_argument("--page", type=pathlib.Path)
+    given = parser.parse_args()
+    sets = [open_benchmark(path) for path in given.data]
+    heads = [f"{data.name}: R@1 / 5 / 10 | same" for data in sets]
+    lines = [f"| runtime | {' | '.join(heads)} |", f"|{' --- |' * (1 + 2 * len(sets))}"]
+    exact: list[np.ndarray] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, model, config in models(given.weights, given.int8, pathlib.Path(folder)):
+            answers = [first_answers(model, config, data) for data in sets]
+            exact = exact or answers
+            cells = [name]
+            for found, first, data in zip(answers, exact, sets, strict=True):
+                cells.append(" / ".join(f"{each:.1f}" for each in recalls(found, data)))
+                cells.append(f"{int((found[:, 0] == first[:, 0]).sum())} of {len(found)}")
+            lines.append(f"| {' | '.join(cells)} |")
+            print(lines[-1], flush=True)
+    if given.page is not None:
+        before, after = around(given.page, "runtimes")
+        given.page.write_text(before + "\n".join(lines) + "\n" + after, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
