@@ -51,6 +51,7 @@ from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
@@ -259,6 +260,12 @@ def write_export(
     check_exportable(params, config, how)
     if calibration is not None:
         _check_calibration(calibration, config, how)
+    if config.preprocessing.size_rule != "fixed":
+        size = " x ".join(map(str, config.input_size))
+        tell(
+            f"{out}: found images of size rule {config.preprocessing.size_rule}; the program takes "
+            f"{size} alone"
+        )
     with atomic_folder(out) as folder:
         if how.format == "stablehlo":
             manifest = _write_stablehlo(folder, params, config, how)

@@ -5,6 +5,8 @@ import pathlib
 from typing import TYPE_CHECKING, Literal
 
 from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
+from crisalad_jax.config.preprocessing import WORDS
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_new_folder
 
 if TYPE_CHECKING:
@@ -29,8 +31,8 @@ class Export:
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
-    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
+    """Words in place of the model's way: bilinear, bicubic or area; antialias or no-antialias;
+    bytes or floats; fixed; round (docs/resizing.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
     """Images in a call, or symbolic: any number."""
     grouping: Literal["single", "batch", "any"] = "single"
@@ -44,8 +46,8 @@ class Export:
     int8: pathlib.Path | None = None
     """Photographs to quantise products with, of onnx or openvino: a folder or another source of
     some dozens like those to be described. Costs recall (docs/export.md)."""
-    platforms: str = "cpu,cuda"
-    """Of stablehlo, comma-separated: cpu, cuda, rocm, tpu."""
+    platforms: str | None = None
+    """Of stablehlo, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
     gains and loses."""
@@ -61,11 +63,19 @@ def run(arguments: Export) -> None:
 
     prepare_json(arguments.json)
     check_new_folder(arguments.out)
+    if arguments.platforms is not None and arguments.format != "stablehlo":
+        raise InputError(
+            f"--platforms: found with --format {arguments.format}, expected without it, or with "
+            "stablehlo"
+        )
+    for word in arguments.resize:
+        if WORDS.get(word, {}).get("size_rule", "fixed") != "fixed":
+            raise InputError(f"--resize: found {word}, expected fixed: a program takes one size")
     how = ExportConfig(
         grouping=arguments.grouping,
         batch_size=None if arguments.batch_size == "symbolic" else arguments.batch_size,
         weights_inside=arguments.weights_inside,
-        platforms=tuple(dict.fromkeys(arguments.platforms.split(","))),
+        platforms=tuple(dict.fromkeys((arguments.platforms or "cpu,cuda").split(","))),
         format=arguments.format,
         pixels=arguments.pixels,
     )

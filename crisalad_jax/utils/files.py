@@ -365,6 +365,8 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
         InputError: there is a file, or a folder that holds something; or as `check_target`.
     """
     path = pathlib.Path(path)
+    if os.path.isfile(path):
+        raise InputError(f"{path}: found a file, expected a new or empty folder")
     check_target(path / "any")
     if path.is_dir() and path.samefile(os.curdir):
         raise InputError(f"{path}: found the folder that this runs in, expected another")

@@ -169,6 +169,6 @@ def test_only_an_empty_folder_is_replaced(tmp_path: pathlib.Path):
         (temporary / "a").write_text("1")
     assert os.listdir(tmp_path / "empty") == ["a"]
     (tmp_path / "file").write_text("")
-    for name, found in (("empty", "a folder with files in it"), ("file", "cannot be made: found")):
+    for name, found in (("empty", "a folder with files in it"), ("file", "found a file")):
         with pytest.raises(InputError, match=f"^{tmp_path / name}.*{found}"):
             check_new_folder(tmp_path / name)

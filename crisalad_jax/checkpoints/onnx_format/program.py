@@ -43,8 +43,8 @@ def onnx_graph(
     (output,) = convert(graph, traced, [*arguments, *values])
     if output.missing:
         raise InputError(
-            f"format onnx: found the operation {output.missing}, expected a model of operations "
-            "that ONNX has (docs/export.md)"
+            f"format onnx or openvino: found the operation {output.missing}, which is not "
+            "converted, expected format stablehlo or a model without it (docs/export.md)"
         )
     return graph, values, graph.full(output, traced.out_avals[0].shape)
 
