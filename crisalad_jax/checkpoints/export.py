@@ -346,9 +346,12 @@ def _write_onnx(
         with lowering_for(STRAIGHT):
             words = f"{', '.join(inputs)} to {output}; {GROUPINGS[how.grouping]}"
             beside = not how.weights_inside
-            write_onnx(path, function, arrays, inputs, output, words=words, beside=beside)
+            products = write_onnx(
+                path, function, arrays, inputs, output, words=words, beside=beside
+            )
         if calibration is not None:
-            _quantise(path, calibration)
+            # OpenVINO fails to move scales of columns past a reshape.
+            _quantise(path, calibration, products, per_channel=how.format == "onnx")
         if how.format == "openvino":
             convert_to_openvino(path, path.with_suffix(".xml"))
             for suffix in SUFFIXES["onnx"]:
@@ -377,7 +380,9 @@ def _write_onnx(
     }
 
 
-def _quantise(program: pathlib.Path, calibration: np.ndarray) -> None:
+def _quantise(
+    program: pathlib.Path, calibration: np.ndarray, products: list[str], *, per_channel: bool
+) -> None:
     """Quantise a program in its place."""
     try:
         from crisalad_jax.checkpoints.onnx_format.quantise import quantise
@@ -389,7 +394,7 @@ def _quantise(program: pathlib.Path, calibration: np.ndarray) -> None:
     whole.mkdir()
     for each in (program, data):
         each.rename(whole / each.name)
-    quantise(whole / program.name, program, calibration)
+    quantise(whole / program.name, program, calibration, products, per_channel=per_channel)
     shutil.rmtree(whole)
 
 

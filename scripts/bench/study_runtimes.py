@@ -15,6 +15,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.runtime import open_runtime
 from crisalad_jax.checkpoints.weights import load_weights
@@ -26,6 +27,10 @@ from crisalad_jax.retrieval.model import Model
 from crisalad_jax.utils.files import around
 
 KS = (1, 5, 10)
+ENGINES: tuple[tuple[EngineName, ExportConfig], ...] = (
+    ("onnxruntime", ExportConfig(format="onnx")),
+    ("openvino", ExportConfig(format="openvino")),
+)
 
 
 def models(
@@ -35,12 +40,11 @@ def models(
     params, config = load_weights(weights)
     yield "JAX, float32", params, config
     yield "JAX, bfloat16", params, dataclasses.replace(config, compute_dtype="bfloat16")
-    for format in ("onnx", "openvino"):
-        write_export(folder / format, params, config, ExportConfig(format=format))
-        whole = read_calibration(photographs, config)
-        how = ExportConfig(format=format)
-        write_export(folder / f"{format}-int8", params, config, how, calibration=whole)
-    for engine, format in (("onnxruntime", "onnx"), ("openvino", "openvino")):
+    some = read_calibration(photographs, config)
+    for engine, how in ENGINES:
+        format = how.format
+        write_export(folder / format, params, config, how)
+        write_export(folder / f"{format}-int8", params, config, how, calibration=some)
         yield f"{engine}, float32", open_runtime(folder / format, engine), config
         yield f"{engine}, int8", open_runtime(folder / f"{format}-int8", engine), config
     fewer = open_runtime(folder / "openvino", "openvino", precision="bfloat16")

@@ -336,3 +336,28 @@ def test_a_product_of_bytes_is_read_by_all(beside: pathlib.Path):
     np.testing.assert_allclose(
         program("openvino")(images), program("onnxruntime")(images), rtol=0, atol=TOLERANCE
     )
+
+
+@pytest.mark.parametrize("format", ["onnx", "openvino"])
+def test_products_of_eight_bits(format: Any, params: Crisalad, tmp_path: pathlib.Path):
+    """Quantisation is worth its name only if descriptors move, and stay near all the same."""
+    images = pictures(8)
+    how = ExportConfig(format=format)
+    manifest = write_export(tmp_path / "out", params, MODEL, how, calibration=images)
+    assert manifest["products"] == "int8"
+    names = {path.suffix for path in (tmp_path / "out").iterdir()}
+    assert names == {".json", *({".xml", ".bin"} if format == "openvino" else {".onnx", ".data"})}
+    engine = "onnxruntime" if format == "onnx" else "openvino"
+    program = load_program(engine, tmp_path / "out" / manifest["program"]["file"])
+    cosines = np.sum(program(images) * alone(params, images), axis=1)
+    # Steps of 1/127 of the largest number, in two blocks and three networks: a few percent.
+    assert cosines.min() > 0.95
+    assert cosines.max() < 1 - 1e-5
+
+
+def test_eight_bits_of_a_program_that_takes_one_number_of_images(
+    params: Crisalad, tmp_path: pathlib.Path
+):
+    how = ExportConfig(format="onnx", batch_size=2)
+    with pytest.raises(InputError, match=r"^int8: found with format stablehlo, grouping any"):
+        write_export(tmp_path / "out", params, MODEL, how, calibration=pictures(2))

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import onnx
 
 from crisalad_jax.checkpoints.onnx_format.convert import convert
 from crisalad_jax.checkpoints.onnx_format.graph import OPSET as OPSET
@@ -58,7 +59,7 @@ def write_onnx(
     *,
     words: str,
     beside: bool,
-) -> None:
+) -> list[str]:
     """Write a function of weights and other arrays as an ONNX program.
 
     Args:
@@ -69,6 +70,9 @@ def write_onnx(
         output: name of the output.
         words: what the file says of itself.
         beside: whether large weights go to a file of its own, `path` with .data appended.
+
+    Returns:
+        Names of the nodes that multiply by weights.
 
     Raises:
         InputError: as `onnx_graph`, or the disk is full.
@@ -81,6 +85,20 @@ def write_onnx(
         if beside:
             write_constants(data, places)
         path.write_bytes(model.SerializeToString(deterministic=True))
+    return _products(model, graph.constants, [np.asarray(each) for each in weights.values()])
+
+
+def _products(
+    model: onnx.ModelProto, constants: Mapping[str, np.ndarray], weights: Sequence[np.ndarray]
+) -> list[str]:
+    """Name the products whose second factor is a part of a weight, and not computed or made."""
+    return [
+        node.name
+        for node in model.graph.node
+        if node.op_type in ("MatMul", "Conv")
+        and node.input[1] in constants
+        and any(np.may_share_memory(constants[node.input[1]], weight) for weight in weights)
+    ]
 
 
 def write_constants(path: pathlib.Path, places: Sequence[tuple[int, np.ndarray]]) -> None:

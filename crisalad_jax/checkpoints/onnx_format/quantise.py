@@ -3,13 +3,12 @@
 import contextlib
 import logging
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from onnxruntime import quantization
 
 _OPERATORS = ["MatMul", "Conv"]
-"""What is quantised where a factor is a weight: the transport and the attention stay in float32."""
 
 
 class _Images(quantization.CalibrationDataReader):
@@ -24,13 +23,22 @@ class _Images(quantization.CalibrationDataReader):
         return next(self._images, None)
 
 
-def quantise(program: pathlib.Path, out: pathlib.Path, images: np.ndarray) -> None:
+def quantise(
+    program: pathlib.Path,
+    out: pathlib.Path,
+    images: np.ndarray,
+    nodes: Sequence[str],
+    *,
+    per_channel: bool,
+) -> None:
     """Quantise a program of images.
 
     Args:
         program: the file in float32, for any number of images.
         out: the file in int8; its weights lie beside it, with .data appended.
         images: prepared images of the kind that will be described.
+        nodes: names of the products to quantise.
+        per_channel: whether each column of weights has a scale of its own, which is more exact.
     """
     with _quiet():
         quantization.quantize_static(
@@ -39,11 +47,16 @@ def quantise(program: pathlib.Path, out: pathlib.Path, images: np.ndarray) -> No
             _Images(images),
             quant_format=quantization.QuantFormat.QDQ,
             op_types_to_quantize=_OPERATORS,
-            per_channel=True,
+            nodes_to_quantize=list(nodes),
+            per_channel=per_channel,
             weight_type=quantization.QuantType.QInt8,
             activation_type=quantization.QuantType.QInt8,
             use_external_data_format=True,
-            extra_options={"MatMulConstBOnly": True, "ActivationSymmetric": True},
+            extra_options={
+                "MatMulConstBOnly": True,
+                # Sums of products are wider than int8, and OpenVINO fails to reshape them in it.
+                "OpTypesToExcludeOutputQuantization": _OPERATORS,
+            },
         )
 
 
