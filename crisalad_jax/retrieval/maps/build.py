@@ -26,6 +26,7 @@ from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, r
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.shared import SharedMap
 from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.maps.unrecorded import check_no_record_lost
 from crisalad_jax.retrieval.model import Model, check_params, model_hash
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.shares import Share, digest_of
@@ -243,6 +244,7 @@ def index(
     out = pathlib.Path(out)
     description = read_description(out)
     if not has_images(out):
+        check_no_record_lost(out)  # before any work
         description = None  # a map that a kill left without images binds nobody
     source = open_source(images, fps=fps)
     table = source.positions if positions is None else positions
