@@ -299,9 +299,9 @@ def index(
         if by_exif:
             mine = part.of(len(source.paths), batch_size)
             with contextlib.ExitStack() as stack:
-                there = (
-                    stack.enter_context(Map.open(out, verify=False)) if has_images(out) else None
-                )
+                there = None
+                if has_images(out):
+                    there = stack.enter_context(Map.open(out, verify=False, calibrated=False))
                 known = _by_exif(there, source.names[mine], source.paths[mine])
         result = _index_share(
             shared, params, source.root, source.paths, positions=known, search=search, **options
@@ -332,7 +332,7 @@ def _index_share(
     names = {path.relative_to(images).as_posix() for path in paths}
     unmatched = [name for name in positions.of if name not in names]
     if has_images(shared.out):
-        with Map.open(shared.out, verify=False) as whole:
+        with Map.open(shared.out, verify=False, calibrated=False) as whole:
             whole.axes_of(names, positions)
             new = _new_images(whole, images, mine)[2]
             there = len(paths) - len(_new_images(whole, images, paths)[2])

@@ -143,13 +143,17 @@ class Map:
         store.check([(first, count) for first, count, _ in self._segments])
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str], *, verify: bool = True) -> Self:
+    def open(
+        cls, folder: str | os.PathLike[str], *, verify: bool = True, calibrated: bool = True
+    ) -> Self:
         """Open a map to search it as it is now; images appended meanwhile are not seen.
 
         Args:
             folder: what `index` made.
             verify: whether to read all descriptors that are in files, as `verify` does; records
                 are always checked.
+            calibrated: whether to read what `calibrate` measured; a map without it answers every
+                query, also where that file is damaged.
 
         Returns:
             The map. It lets go of its store when it is closed, at the end of a `with`, or when
@@ -176,7 +180,8 @@ class Map:
             raise InputError(f"{folder}: found a map without images, expected at least one")
         opened = cls._opened(folder, head)
         try:
-            opened.calibration = read_calibration(folder, head.model)
+            if calibrated:
+                opened.calibration = read_calibration(folder, head.model)
             if verify and head.store == "files":
                 opened.verify()
             opened._approximate = open_approximate(folder, opened._segments, verify=verify)
