@@ -70,7 +70,7 @@ def run(arguments: Calibrate) -> None:
     """Calibrate the map, and print what it remembers."""
     prepare_json(arguments.json)
     check_precision(arguments.precision)
-    with Map.open(arguments.map, verify=arguments.verify) as places:
+    with Map.open(arguments.map, verify=arguments.verify, calibrated=False) as places:
         params = places.load_params(find_given(arguments.weights, quiet=arguments.quiet))
         benchmark = open_set(arguments)
         calibration = calibrate(

@@ -47,7 +47,10 @@ def run(arguments: "Query") -> None:
             assert arguments.camera is not None
             source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps))
             words = f"taking frames from {source.name}"
-        places = stack.enter_context(Map.open(arguments.map, verify=arguments.verify))
+        opened = Map.open(
+            arguments.map, verify=arguments.verify, calibrated=arguments.min_similarity is None
+        )
+        places = stack.enter_context(opened)
         params = model_of(places, arguments)
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())

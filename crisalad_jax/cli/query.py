@@ -10,10 +10,12 @@ import tyro
 from crisalad_jax.cli import live
 from crisalad_jax.cli.answers import answers_table
 from crisalad_jax.cli.common import STDOUT, console, say, talk_beside
+from crisalad_jax.retrieval.maps.calibration import Calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_target, real_path
+from crisalad_jax.utils.output import counted
 
 _ROWS = 24
 """Largest number of queries in a gallery."""
@@ -108,7 +110,10 @@ def run(arguments: Query) -> None:
     talk_beside(arguments.json)
     _check_files(file, arguments)
     sequence = live.sequence_of(arguments)
-    with Map.open(arguments.map, verify=arguments.verify) as places:
+    opened = Map.open(
+        arguments.map, verify=arguments.verify, calibrated=arguments.min_similarity is None
+    )
+    with opened as places:
         answers = query(
             places,
             live.model_of(places, arguments),
@@ -123,11 +128,12 @@ def run(arguments: Query) -> None:
             sequence=sequence,
             quiet=arguments.quiet,
         )
+    unknown = _unknown(answers, places.calibration)
     if answers.unreadable:
         say(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
-    of = f"in a map of {len(answers.images)} images{_unknown(answers)}"
+    of = f"in a map of {len(answers.images)} images{unknown}"
     if arguments.json is None and arguments.gallery is None:
-        title = f"{arguments.map}, {len(answers.images)} images{_unknown(answers)}"
+        title = f"{arguments.map}, {len(answers.images)} images{unknown}"
         console.print(answers_table(answers, title))
     elif file is None and arguments.json is not None:
         for line in json_lines(answers):
@@ -153,12 +159,16 @@ def run(arguments: Query) -> None:
         say(f"{file}: {len(answers.queries)} queries {of}")
 
 
-def _unknown(answers: Answers) -> str:
-    """Say how many queries are of unknown places; nothing where any similarity counts."""
+def _unknown(answers: Answers, measured: Calibration | None) -> str:
+    """Say how many queries are of unknown places; nothing where any similarity counts.
+
+    Also what the similarity rests on, where it was measured.
+    """
     if answers.min_similarity is None:
         return ""
     count, least = int((~answers.known).sum()), f"{answers.min_similarity:.9g}"
-    return f"; {count} of {len(answers.queries)} unknown, below similarity {least}"
+    rests = "" if measured is None else f" (rests on {counted(measured.answered, 'answer')})"
+    return f"; {count} of {len(answers.queries)} unknown, below similarity {least}{rests}"
 
 
 def _check_files(file: pathlib.Path | None, arguments: Query) -> None:

@@ -5,7 +5,12 @@ import datetime
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.evaluation.operating_point import OperatingPoint, caveats, check_precision
+from crisalad_jax.evaluation.operating_point import (
+    OperatingPoint,
+    caveats,
+    check_precision,
+    check_supported,
+)
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map
@@ -46,8 +51,9 @@ def calibrate(
         What the map remembers from now on.
 
     Raises:
-        InputError: no similarity reaches the precision, and the map stays as it was; parameters of
-            another model; or what `evaluate` raises.
+        InputError: no similarity reaches the precision, or it rests on fewer answers than the
+            precision takes, and the map stays as it was; parameters of another model; or what
+            `evaluate` raises.
 
     Example:
         >>> import jax, shutil
@@ -63,7 +69,7 @@ def calibrate(
         >>> save_weights(weights, params, config)
         >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
         >>> with Map.open(folder / "map") as places:
-        ...     found = calibrate(places, params, benchmark, precision=0.9, quiet=True)
+        ...     found = calibrate(places, params, benchmark, precision=0.4, quiet=True)
         >>> found.right, found.answered
         (4, 4)
     """
@@ -85,6 +91,7 @@ def calibrate(
     assert point is not None  # asked for above
     if not point.reached:
         raise InputError(f"precision: {caveats(point)[0]}, on {benchmark.name}")
+    check_supported(point, benchmark.name)
     calibration = Calibration(
         min_similarity=point.min_similarity,
         precision=precision,

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from crisalad_jax.evaluation.metrics import accepted, right_retrievals
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import counted
 
 CONFIDENCE = 0.95
 """Confidence of the lower bound of a precision."""
@@ -150,6 +151,31 @@ def needed(precision: float) -> int | None:
     None at a precision of 1, which no number of queries shows.
     """
     return None if precision == 1 else math.ceil(math.log(1 - CONFIDENCE) / math.log(precision))
+
+
+def check_supported(point: OperatingPoint, source: str) -> None:
+    """Check that there are as many answers as the asked precision takes if all are right.
+
+    Args:
+        point: what was measured.
+        source: the set, for the message.
+
+    Raises:
+        InputError: there are fewer.
+    """
+    enough, asked = needed(point.asked), f"{100 * point.asked:g} %"
+    if enough is not None and point.answered >= enough:
+        return
+    takes = (
+        f"{asked} takes {enough} (95 % confidence)"
+        if enough
+        else f"no number of them shows {asked}"
+    )
+    raise InputError(
+        f"precision: found {counted(point.answered, 'answer')} of similarity "
+        f"{point.min_similarity:.9g} or more on {source}, {point.right} right, but {takes}; "
+        "expected more queries or a lower precision; or the set may be of another place"
+    )
 
 
 def caveats(point: OperatingPoint) -> list[str]:

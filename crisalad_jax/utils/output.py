@@ -25,6 +25,16 @@ def one_line(error: object) -> str:
     return printable(" ".join(str(error).split()))
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, which has an s for any other number than one.
+
+    Example:
+        >>> counted(1, "image"), counted(2, "image")
+        ('1 image', '2 images')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def keep_on_without_reader() -> None:
     """Let the program go on where the reader of its output is gone, as after `| head`.
 

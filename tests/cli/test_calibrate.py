@@ -27,16 +27,16 @@ def calibrate(folder: pathlib.Path, data: pathlib.Path, *more: object) -> tuple:
 
 def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd):
     queries = shared / "town" / "images" / "test" / "queries"
-    said = succeeds(capfd, *calibrate(folder, shared / "town", "--precision", 0.6))
+    said = succeeds(capfd, *calibrate(folder, shared / "town", "--precision", 0.4))
     value = json.loads((folder / "calibration.json").read_text())
     least = value["min_similarity"]
     assert f"calibration.json: answers below similarity {least:.9g} are unknown from now on" in said
     assert "rests on few queries" in said
     assert f"{value['right']} of {value['answered']}" in said
-    assert (value["precision"], value["database"], value["unknown"]) == (0.6, 7, 1)
-    assert value["right"] / value["answered"] >= 0.6
+    assert (value["precision"], value["database"], value["unknown"]) == (0.4, 7, 1)
+    assert value["right"] / value["answered"] >= 0.4
 
-    assert f"calibration min_similarity {least}, precision 0.6," in succeeds(
+    assert f"calibration min_similarity {least}, precision 0.4," in succeeds(
         capfd, "info", "--map", folder
     )
     answers = tmp_path / "answers.jsonl"
@@ -47,7 +47,7 @@ def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd):
     assert [line["known"] for line in lines].count(False) == unknown
     assert said == (
         f"{answers}: 5 queries in a map of 7 images; {unknown} of 5 unknown, below similarity "
-        f"{least:.9g}"
+        f"{least:.9g} (rests on {value['answered']} answers)"
     )
     table = succeeds(capfd, *query(folder, queries))
     assert table.count("unknown") == unknown + 1  # their rows and the title
@@ -65,7 +65,25 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(folder, shared, tmp_path,
     # A radius of a centimetre: nothing is right.
     words = ("precision: no similarity reaches a precision of 99 %", "town")
     fails(capfd, *calibrate(folder, town, "--radius", 0.01), words=words)
+    # All right, and too few.
+    words = ("precision: found 5 answers", "5 right, but 90 % takes 29")
+    fails(capfd, *calibrate(folder, town, "--radius", 1e5, "--precision", 0.9), words=words)
     assert files_in(folder) == before
+
+
+def test_a_damaged_calibration_is_left_out_where_a_similarity_is_given(folder, shared, capfd):
+    queries = shared / "town" / "images" / "test" / "queries"
+    (folder / "calibration.json").write_text("{")
+    fails(capfd, *query(folder, queries), words=("calibration.json", "the file may be removed"))
+    for least in (-1, 0.5):
+        said = succeeds(capfd, *query(folder, queries, "--min-similarity", least))
+        assert ("unknown, below similarity 0.5" in said) == (least == 0.5)
+        assert "rests on" not in said
+    watched = ("query", "--map", folder, "--watch", folder / "none", "--min-similarity", -1)
+    fails(capfd, *watched, words=("none",))
+    # It is replaced, not read.
+    succeeds(capfd, *calibrate(folder, shared / "town", "--precision", 0.4))
+    assert "rests on" in succeeds(capfd, *query(folder, queries))
 
 
 def test_frames_of_a_camera_are_followed(folder, shared, tmp_path, capfd):

@@ -94,6 +94,19 @@ def open_approximate(
     return Approximate(index.kind, index, float(record["recall"]))
 
 
+def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
+    """List each approximate search in a map's folder, and how many images it is of.
+
+    Raises:
+        InputError: what says so is damaged.
+    """
+    found = []
+    for path in _indices(folder):
+        record = read_json(path.with_suffix(".json"), "a record of an approximate search")
+        found.append((path, int(record["images"])))
+    return found
+
+
 def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
     """Return the kind of a map's approximate search of fewer or other images; None without any."""
     found = _indices(folder)

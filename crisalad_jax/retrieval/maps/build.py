@@ -26,6 +26,7 @@ from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, r
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.shared import SharedMap
 from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.maps.unrecorded import check_no_record_lost
 from crisalad_jax.retrieval.model import Model, check_params, model_hash
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.shares import Share, digest_of
@@ -243,6 +244,7 @@ def index(
     out = pathlib.Path(out)
     description = read_description(out)
     if not has_images(out):
+        check_no_record_lost(out)  # before any work
         description = None  # a map that a kill left without images binds nobody
     source = open_source(images, fps=fps)
     table = source.positions if positions is None else positions
@@ -297,9 +299,9 @@ def index(
         if by_exif:
             mine = part.of(len(source.paths), batch_size)
             with contextlib.ExitStack() as stack:
-                there = (
-                    stack.enter_context(Map.open(out, verify=False)) if has_images(out) else None
-                )
+                there = None
+                if has_images(out):
+                    there = stack.enter_context(Map.open(out, verify=False, calibrated=False))
                 known = _by_exif(there, source.names[mine], source.paths[mine])
         result = _index_share(
             shared, params, source.root, source.paths, positions=known, search=search, **options
@@ -330,7 +332,7 @@ def _index_share(
     names = {path.relative_to(images).as_posix() for path in paths}
     unmatched = [name for name in positions.of if name not in names]
     if has_images(shared.out):
-        with Map.open(shared.out, verify=False) as whole:
+        with Map.open(shared.out, verify=False, calibrated=False) as whole:
             whole.axes_of(names, positions)
             new = _new_images(whole, images, mine)[2]
             there = len(paths) - len(_new_images(whole, images, paths)[2])

@@ -51,6 +51,16 @@ def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
     path = folder / CALIBRATION
     if not path.exists():
         return None
+    try:
+        return _read(path, model)
+    except InputError as error:
+        raise InputError(
+            f"{error}; the file may be removed: the map then answers every query, as with "
+            "--min-similarity -1"
+        ) from error
+
+
+def _read(path: pathlib.Path, model: str) -> Calibration:
     value = read_json(path, "a map's calibration", quiet=True)
     version = value.get("format") if isinstance(value, dict) else None
     if type(version) is int and version > FORMAT:
@@ -63,7 +73,7 @@ def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
     if calibration.model != model:
         raise InputError(
             f"{path}: found a calibration of model {calibration.model[:12]}, expected "
-            f"{model[:12]}, which made the map: remove the file, or calibrate again"
+            f"{model[:12]}, which made the map; `crisalad calibrate` replaces it"
         )
     return calibration
 

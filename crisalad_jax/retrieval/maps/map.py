@@ -46,6 +46,7 @@ from crisalad_jax.retrieval.maps.head import (
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import Store, open_store
+from crisalad_jax.retrieval.maps.unrecorded import check_no_record_lost, remove_unrecorded
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.utils.checksums import tell_unchecked
@@ -142,13 +143,17 @@ class Map:
         store.check([(first, count) for first, count, _ in self._segments])
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str], *, verify: bool = True) -> Self:
+    def open(
+        cls, folder: str | os.PathLike[str], *, verify: bool = True, calibrated: bool = True
+    ) -> Self:
         """Open a map to search it as it is now; images appended meanwhile are not seen.
 
         Args:
             folder: what `index` made.
             verify: whether to read all descriptors that are in files, as `verify` does; records
                 are always checked.
+            calibrated: whether to read what `calibrate` measured; a map without it answers every
+                query, also where that file is damaged.
 
         Returns:
             The map. It lets go of its store when it is closed, at the end of a `with`, or when
@@ -175,7 +180,8 @@ class Map:
             raise InputError(f"{folder}: found a map without images, expected at least one")
         opened = cls._opened(folder, head)
         try:
-            opened.calibration = read_calibration(folder, head.model)
+            if calibrated:
+                opened.calibration = read_calibration(folder, head.model)
             if verify and head.store == "files":
                 opened.verify()
             opened._approximate = open_approximate(folder, opened._segments, verify=verify)
@@ -629,11 +635,12 @@ def open_for_appending(
     """Open the map with this description to append to it, or make it, with its components.
 
     One process at a time may append; others may search meanwhile. A map that a kill left without
-    images is made anew; one that an exception leaves without images is removed.
+    images is made anew; one that an exception leaves without images is removed. A note tells of
+    descriptors without a record, which are removed.
 
     Raises:
-        InputError: another process appends, the map there is another one or what `Map.open` raises,
-            or the folder cannot be written to.
+        InputError: another process appends, the map there is another one or has lost a record of
+            images, what `Map.open` raises, or the folder cannot be written to.
     """
     from crisalad_jax.retrieval.maps.manifest import (
         read_description,
@@ -649,6 +656,7 @@ def open_for_appending(
         existing = read_description(folder)
         for each in (folder, folder / SEGMENTS):
             remove_temporaries(each)
+        check_no_record_lost(folder)  # first: what follows removes a map without images
         stack.enter_context(undone_without_images(folder))
         if existing != description:
             if has_images(folder):
@@ -656,7 +664,9 @@ def open_for_appending(
             if components is not None:
                 save_pca(folder / COMPONENTS, components)
             write_description(folder, description)
-        yield stack.enter_context(Map._opened(folder, description))
+        opened = stack.enter_context(Map._opened(folder, description))
+        remove_unrecorded(folder, len(opened))
+        yield opened
 
 
 def _inside(name: object) -> str:

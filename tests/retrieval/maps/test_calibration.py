@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pathlib
+import re
 import shutil
 
 import jax
@@ -94,7 +95,7 @@ def ask(folder, params, images, **options) -> Answers:
 
 def test_a_map_remembers_the_point_of_an_evaluation(folder, params, benchmark):
     (result,) = evaluate(
-        params, MODEL, benchmark, groupings=["single"], batch_size=BATCH, precision=0.6, quiet=True
+        params, MODEL, benchmark, groupings=["single"], batch_size=BATCH, precision=0.4, quiet=True
     )
     point = result.operating_point
     assert point is not None
@@ -102,7 +103,7 @@ def test_a_map_remembers_the_point_of_an_evaluation(folder, params, benchmark):
     with Map.open(folder) as places:
         assert places.calibration is None
         assert places.summary()["calibration"] is None
-        found = calibrate(places, params, benchmark, 0.6, batch_size=BATCH, quiet=True)
+        found = calibrate(places, params, benchmark, 0.4, batch_size=BATCH, quiet=True)
         assert places.calibration is found
         assert found.model == places.description.model
     assert operating_point_of(found) == point
@@ -130,6 +131,29 @@ def test_a_precision_out_of_reach_leaves_what_was_there(folder, params, benchmar
         assert places.calibration == before
     with Map.open(folder) as places:
         assert places.calibration == before
+
+
+@pytest.mark.parametrize(
+    ("precision", "takes"), [(0.99, "99 % takes 299"), (1.0, "no number of them shows 100 %")]
+)
+def test_a_similarity_that_rests_on_too_few_answers_is_not_remembered(
+    folder, params, benchmark, precision, takes
+):
+    """ceil(log 0.05 / log 0.99) is 299; one query that is right is no reason for either."""
+    one = dataclasses.replace(
+        benchmark,
+        queries=benchmark.queries[:1],
+        query_positions=None,
+        database_positions=None,
+        positives=(np.arange(7),),
+    )
+    where = re.escape(benchmark.name)
+    words = f"precision: found 1 answer of similarity .* on {where}, 1 right, but {takes}.*; or the"
+    with Map.open(folder) as places:
+        with pytest.raises(InputError, match=words):
+            calibrate(places, params, one, precision, batch_size=BATCH, quiet=True)
+        assert places.calibration is None
+    assert not (folder / CALIBRATION).exists()
 
 
 def test_another_model_calibrates_nothing(folder, benchmark):
@@ -163,6 +187,19 @@ def test_a_calibration_that_is_not_this_maps_is_refused(folder):
     path.write_text(json.dumps(value | {"min_similarity": 1.5}))
     with pytest.raises(InputError, match=r"found similarity 1.5, expected one from -1 to 1"):
         Map.open(folder)
+
+
+def test_a_damaged_calibration_is_named_and_may_be_left_out(folder, params, benchmark, queries):
+    plain = ask(folder, params, queries)
+    (folder / CALIBRATION).write_text('{"min_sim')
+    with pytest.raises(InputError, match=r"calibration\.json: .*; the file may be removed"):
+        Map.open(folder)
+    with Map.open(folder, calibrated=False) as places:
+        answers = query(places, params, queries, batch_size=BATCH, quiet=True)
+        assert list(json_lines(answers)) == list(json_lines(plain))
+        calibrate(places, params, benchmark, 0.4, batch_size=BATCH, quiet=True)
+    with Map.open(folder) as places:
+        assert places.calibration is not None
 
 
 def test_a_map_with_a_calibration_grows(folder, params, shared, queries):

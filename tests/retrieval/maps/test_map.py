@@ -98,6 +98,64 @@ def test_a_full_disk_is_one_line_and_leaves_the_map_as_it_was(tmp_path):
         assert line.endswith(f"{name}: cannot be written: File too large")
 
 
+# A lost record
+
+
+def files_in(folder: pathlib.Path) -> dict[pathlib.Path, bytes]:
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_descriptors_without_a_record_are_removed_with_a_note(folder):
+    (folder / "segments" / "0000000003.json").unlink()
+    with pytest.warns(Note, match=r"0000000003\.npy: descriptors 3 to 6 without a record are rem"):
+        append_until(folder, 3)
+    assert not (folder / "segments" / "0000000003.npy").exists()
+    assert killed_appends.check(folder) == 3
+
+
+@pytest.mark.parametrize(
+    ("told", "value"),
+    [
+        ("calibration.json", {}),
+        ("approximate/hnsw-0123456789abcdef.index", {"images": 3}),
+    ],
+)
+def test_a_map_that_lost_its_only_record_is_refused(tmp_path, told, value):
+    folder = tmp_path / "map"
+    with open_for_appending(folder, description("files")) as target:
+        target.append(names(0, 3), [7] * 3, rows(0, 3), root="/images")
+    (folder / told).parent.mkdir(exist_ok=True)
+    (folder / told).write_bytes(b"")
+    write_json((folder / told).with_suffix(".json"), value)
+    (folder / "segments" / "0000000000.json").unlink()
+    before = files_in(folder)
+    words = f"{told}: found it in a map without a record of images"
+    with pytest.raises(InputError, match=words):
+        append_until(folder, 7)
+    assert {path: before[path] for path in before if path.name != ".crisalad-lock"} == {
+        path: data for path, data in files_in(folder).items() if path.name != ".crisalad-lock"
+    }
+
+
+def test_a_map_that_lost_a_later_record_is_refused_where_a_search_tells_of_it(folder):
+    path = folder / "approximate" / "hnsw-0123456789abcdef.index"
+    path.parent.mkdir()
+    path.write_bytes(b"")
+    write_json(path.with_suffix(".json"), {"images": 7})
+    (folder / "segments" / "0000000003.json").unlink()
+    with pytest.raises(InputError, match="a search of 7 images in a map of 3, expected at most"):
+        append_until(folder, 7)
+    assert (folder / "segments" / "0000000003.npy").exists()
+
+
+def test_more_descriptors_without_a_record_than_a_kill_leaves_are_refused(folder):
+    for path in (folder / "segments").glob("*.json"):
+        path.unlink()
+    with pytest.raises(InputError, match="found 3 such files of descriptors without a record"):
+        append_until(folder, 7)
+    assert len(list((folder / "segments").glob("*.npy"))) == 3
+
+
 # What a map knows
 
 
