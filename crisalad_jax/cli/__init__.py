@@ -127,7 +127,8 @@ def _run(name: str, given: list[str], keep_programs: bool) -> None:
     module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
     chosen = _parse(name, module, arguments)
     _check_numbers(chosen)
-    _set_up_jax(keep_programs)
+    if not hasattr(module, "needs_jax") or module.needs_jax(chosen):
+        _set_up_jax(keep_programs)
     module.run(chosen)
 
 

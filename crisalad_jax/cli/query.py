@@ -101,6 +101,11 @@ class Query:
     """No progress bars."""
 
 
+def needs_jax(arguments: Query) -> bool:
+    """Return whether JAX describes the images: another runtime starts without importing it."""
+    return arguments.runtime == "jax"
+
+
 def run(arguments: Query) -> None:
     """Query the map, and print or write its answers."""
     if arguments.watch is not None or arguments.camera is not None:

@@ -8,6 +8,7 @@ import numpy as np
 import pymilvus
 import pytest
 
+from crisalad_jax.retrieval.maps import file_store
 from crisalad_jax.retrieval.maps import milvus_store as milvus
 from crisalad_jax.retrieval.maps.store import Store, open_store, store_name
 from crisalad_jax.retrieval.maps.ties import lower_first
@@ -19,6 +20,12 @@ LENGTH = 24
 # Sums of 24 products of float32 below one, in whatever order.
 ROUNDING = 2e-6
 STORES = ("files", "milvus:rows.db")
+
+
+@pytest.fixture(params=[0, file_store._FEW], ids=["FAISS", "numpy"], autouse=True)
+def _largest(request, monkeypatch):
+    """Rank products by FAISS, as of many queries, and by numpy."""
+    monkeypatch.setattr(file_store, "_FEW", request.param)
 
 
 def unit_rows(count: int, seed: int = 0, length: int = LENGTH) -> np.ndarray:
