@@ -14,6 +14,7 @@ python scripts/bench/bench_published.py "${page[@]}"
 python scripts/bench/bench_train.py "${page[@]}" "$@"
 python scripts/bench/bench_extract.py "${page[@]}"
 python scripts/bench/bench_start.py "${page[@]}"
+python scripts/bench/bench_query.py "${page[@]}"
 python scripts/bench/bench_modes.py "${page[@]}"
 python scripts/bench/bench_profile.py "${page[@]}"
 page=(--page docs/training.md)
