@@ -11,12 +11,14 @@ import numpy as np
 from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
+from crisalad_jax.utils.notes import tell
 
 EngineName = Literal["onnxruntime", "openvino"]
 Precision = Literal["float32", "bfloat16"]
 Program = Callable[..., np.ndarray]
 """A loaded program: its inputs, in their order, to its output."""
 _TOOLS = "openvino.tools.ovc"
+_CAPABILITIES = "OPTIMIZATION_CAPABILITIES"
 
 
 def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
@@ -49,7 +51,10 @@ def _openvino(path: pathlib.Path, precision: Precision) -> Program:
     openvino = import_openvino()
     # Left to itself it takes fewer bits where the processor has units for them.
     hint = {"float32": "f32", "bfloat16": "bf16"}[precision]
-    compiled = openvino.Core().compile_model(path, "CPU", {"INFERENCE_PRECISION_HINT": hint})
+    core = openvino.Core()
+    if precision == "bfloat16" and "BF16" not in core.get_property("CPU", _CAPABILITIES):
+        tell("openvino: found a processor without bfloat16 instructions; it computes in float32")
+    compiled = core.compile_model(path, "CPU", {"INFERENCE_PRECISION_HINT": hint})
     return lambda *inputs: np.array(compiled(list(inputs))[0])
 
 

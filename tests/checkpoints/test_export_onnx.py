@@ -96,6 +96,17 @@ def test_openvino_gives_our_descriptors_for_any_number_of_images(
     assert not any("'f16'" in each for each in floats)
 
 
+def test_a_processor_without_bfloat16_is_told_of(
+    beside: pathlib.Path, params: Crisalad, recwarn: pytest.WarningsRecorder
+):
+    """OpenVINO takes float32 there without a word."""
+    program = load_program("openvino", beside / "describe.onnx", "bfloat16")
+    difference = np.abs(program(pictures(2)) - alone(params, pictures(2))).max()
+    is_told = any("without bfloat16" in str(each.message) for each in recwarn)
+    # 8 bits of a product are off by 4e-3 of it, 24 bits by 6e-8.
+    assert (difference < TOLERANCE) == is_told
+
+
 def test_a_batch_of_one_size_with_the_weights_inside(params: Crisalad, tmp_path: pathlib.Path):
     how = ExportConfig("batch", batch_size=BATCH, weights_inside=True, format="onnx")
     write_export(tmp_path / "out", params, MODEL, how)
