@@ -60,7 +60,7 @@ class ComparisonConfig:
     test: tuple[str, ...]
     """Evaluation sets, of any layout that `open_benchmark` knows."""
     train: str | None = None
-    """Folder in the layout of GSV-Cities."""
+    """Training set, in any layout that `read_places` reads."""
     weights: tuple[str, ...] = ()
     """Weights of methods that are not trained here, as NAME=FILE, or the NAME of a published model.
     A name that is no method's is a line of its own, whatever model the file holds."""
