@@ -2,6 +2,7 @@
 
 import sys
 
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import keep_on_without_reader
 from crisalad_jax.utils.signals import end_at_signals
 
@@ -14,7 +15,12 @@ def main() -> None:
     from crisalad_jax.cli import main as run_command
 
     code = run_command(keep_programs=True)
-    sys.stdout.flush()
+    try:
+        sys.stdout.flush()
+    except InputError as error:  # a full disk, which the last lines met
+        if not code:
+            print(f"crisalad: {error}", file=sys.stderr)
+            code = 2
     sys.exit(code)
 
 

@@ -25,7 +25,7 @@ from crisalad_jax.utils.version import VERSION
 
 _COMMANDS = {
     "demo": "Render a small city, train a tiny model on it, and show Recall@K before and after.",
-    "train": "Train on places in the GSV-Cities layout; go on with the run that is there.",
+    "train": "Train on places, each with several images; go on with the run that is there.",
     "convert": "Convert a public torch checkpoint to a file of this package, or back.",
     "models": "List the models that others published, which --weights takes by name.",
     "evaluate": "Print what a model recalls of an evaluation set under each grouping.",

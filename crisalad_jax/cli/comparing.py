@@ -22,7 +22,8 @@ class ComparisonFlags:
     """Folder of the comparison; the same command goes on with what is in it. Beside the runs it
     holds table.md, table.csv, results.json, and the page index.html."""
     train: pathlib.Path | None = None
-    """Training set, in the layout of GSV-Cities."""
+    """Training set: a folder with one folder a place, a table name,place[,lat,lon[,heading]]
+    (places.csv in the folder, or the file), or Dataframes/ and Images/ of GSV-Cities."""
     backbone: pathlib.Path | None = None
     """Train from this backbone, as the recipes say: a file of this package, a public checkpoint, or
     a published model's name. None trains all from nothing, by the recipe scratch."""

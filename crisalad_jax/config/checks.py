@@ -54,6 +54,18 @@ def check_seed(what: str, seed: int) -> None:
     require(0 <= seed < SEEDS, f"{what}: found {seed}, expected at least 0, and less than 2**32")
 
 
+def check_count(what: str, count: Any) -> None:
+    """Check that an argument is a whole number from 1.
+
+    Raises:
+        InputError: it is below, or no whole number.
+    """
+    words, types = _PLAIN[int]
+    if not isinstance(count, types) or isinstance(count, bool):
+        raise InputError(f"{what}: found {count!r}, expected {words} of at least 1")
+    require(int(count) >= 1, f"{what}: found {count}, expected at least 1")
+
+
 def check_types(config: Any) -> None:
     """Check that every field of a configuration holds a value of its annotated type.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
-from crisalad_jax.data.resize import Pixels, resize_image
+from crisalad_jax.data.resize import Pixels, check_pixels, resize_image
 from crisalad_jax.utils.errors import InputError
 
 
@@ -45,7 +45,11 @@ class Preparation:
 
         Returns:
             8-bit pixels, or normalised float32.
+
+        Raises:
+            InputError: the image is no array of pixels, or what `check` raises.
         """
+        check_pixels(image)
         how = self.preprocessing
         height, width = image.shape[:2]
         first = how.target_size((height, width), self.image_size)

@@ -3,7 +3,7 @@
 import functools
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -59,11 +59,7 @@ def resize_image(
     choose("pixels", pixels, {"bytes": None, "floats": None})
     choose("filter", filter, {**_KERNELS, "area": None})
     kinds = (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32)
-    if image.dtype not in kinds or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise InputError(
-            f"image: found {image.dtype} of shape {image.shape}, expected uint8 of shape "
-            "(height, width, 3) with sides of at least 1"
-        )
+    check_pixels(image, kinds)
     if not _is_size(image_size):
         raise InputError(f"image_size: found {image_size!r}, expected two whole numbers of pixels")
     if min(image_size) < 1:
@@ -84,6 +80,21 @@ def resize_image(
     target = resized.reshape(image_size[0], -1)
     resample(flat.astype(np.float32), *lines, *columns, target, pixels == "bytes")
     return resized.astype(np.uint8) if pixels == "bytes" else resized
+
+
+def check_pixels(image: Any, kinds: Sequence[type] = (np.uint8,)) -> None:
+    """Check that an image is RGB, of one of the types.
+
+    Raises:
+        InputError: it is not.
+    """
+    expected = "uint8 of shape (height, width, 3) with sides of at least 1"
+    if not isinstance(image, np.ndarray):
+        raise InputError(
+            f"image: found {type(image).__name__}, expected {expected}, as of `read_image`"
+        )
+    if image.dtype not in kinds or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"image: found {image.dtype} of shape {image.shape}, expected {expected}")
 
 
 def _is_size(size: Any) -> bool:

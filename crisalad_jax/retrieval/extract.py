@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import check_lines
 from crisalad_jax.data.loader import OnBadImage
@@ -226,8 +227,8 @@ def check_extraction(
     if database is not None and pairs is None:
         raise InputError("--database: found without --pairs, expected both")
     check_grouping([grouping], batch_size, seed)
-    if pairs is not None and k < 1:
-        raise InputError(f"k: found {k}, expected at least 1")
+    if pairs is not None:
+        check_count("k", k)
     if share is not None:
         Share.parse(share)
         if grouping != "single" or out is None:

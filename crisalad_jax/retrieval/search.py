@@ -16,6 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Float32, Int, Int32
 
+from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.retrieval.chunks import (
     KEPT,
@@ -31,7 +32,6 @@ from crisalad_jax.retrieval.chunks import (
 from crisalad_jax.retrieval.neighbours import Neighbours, exact_similarities, rounding
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.target import target
@@ -93,8 +93,7 @@ def search(
         [[1], [2]]
     """
     for name, value in (("k", k), ("chunk", chunk)):
-        if value < 1:
-            raise InputError(f"{name}: found {value}, expected at least 1")
+        check_count(name, value)
     database, queries = as_sides(database, queries)
     on_host = target().platform == "cpu"
     return _search(database, queries, k, chunk, on_host=on_host, label=label, quiet=quiet)

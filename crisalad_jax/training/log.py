@@ -6,13 +6,6 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import (  # made by protobuf when it is imported
-    Event,  # pyright: ignore[reportAttributeAccessIssue]
-    SessionLog,  # pyright: ignore[reportAttributeAccessIssue]
-)
-from tensorboardX.summary import scalar
-
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, read_text
 
@@ -28,6 +21,10 @@ class MetricsLog:
         Raises:
             InputError: a log that is there cannot be read.
         """
+        # Imported here: it imports torch where that is installed, which takes seconds, and a log is
+        # read without it.
+        from tensorboardX.event_file_writer import EventsWriter
+
         self._path = folder / "metrics.jsonl"
         records = read_metrics(self._path) if self._path.exists() else []
         with atomic_path(self._path) as temporary:
@@ -43,7 +40,10 @@ class MetricsLog:
         self._events = EventsWriter(str(folder / "tensorboard" / "events"))
         if records:
             # Tells TensorBoard to drop the later steps that it has read already.
-            begin = SessionLog(status=SessionLog.START)
+            from tensorboardX.proto import event_pb2  # made by protobuf when it is imported
+
+            session: Any = event_pb2.SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+            begin = session(status=session.START)
             self._add(keep_up_to + 1, session_log=begin)
 
     def write(self, values: Mapping[str, int | float], *, of: str = "") -> None:
@@ -51,6 +51,8 @@ class MetricsLog:
 
         The tags are those of other VPR tools: `loss`, `{set}/R5`.
         """
+        from tensorboardX.summary import scalar
+
         with self._path.open("a", encoding="utf-8") as file:
             file.write(_line(values))
         for name, value in values.items():
@@ -64,7 +66,10 @@ class MetricsLog:
         self._events.close()
 
     def _add(self, step: int, **what: Any) -> None:
-        self._events.write_event(Event(step=step, wall_time=time.time(), **what))
+        from tensorboardX.proto import event_pb2
+
+        event: Any = event_pb2.Event  # pyright: ignore[reportAttributeAccessIssue]
+        self._events.write_event(event(step=step, wall_time=time.time(), **what))
 
 
 def _line(values: Mapping[str, int | float]) -> str:

@@ -134,13 +134,14 @@ def tell_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) 
     steps = count_steps(config, steps, steps_per_epoch)
     longest = steps // WARMUP_SHARE
     if warmup > longest:
-        field, found = "warmup_steps", str(warmup)
+        flag, found = "steps", str(warmup)
         if config.warmup_epochs:
-            field, found = "warmup_epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
+            flag, found = "epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
         left = max(steps - warmup, 0)
+        quarter = f"; at most {longest} steps would be a quarter" if longest else ""
         tell(
-            f"OptimiserConfig.{field}: found {found} for a run of {steps} steps, which leaves "
-            f"{left} at the learning rate and its decay; at most {longest} steps would be a quarter"
+            f"--optimiser.warmup-{flag}: found {found} for a run of {steps} steps, which leaves "
+            f"{left} at the learning rate and its decay{quarter}"
         )
 
 

@@ -5,6 +5,8 @@ import os
 import sys
 from typing import Any, TextIO
 
+from crisalad_jax.utils.errors import InputError
+
 
 def printable(text: str) -> str:
     """Return a text with its control characters escaped: names of files may hold any.
@@ -38,10 +40,13 @@ def counted(count: int, noun: str) -> str:
 def keep_on_without_reader() -> None:
     """Let the program go on where the reader of its output is gone, as after `| head`.
 
-    Letters that the encoding lacks are escaped. Standard error stays as it is: who reads that knows
-    that the program goes on.
+    A full disk raises an `InputError` once, at the write or flush that meets it. Letters that the
+    encoding lacks are escaped. Standard error stays as it is: who reads that knows that the program
+    goes on.
     """
-    if sys.stdout is not None:
+    if sys.stdout is None:  # it was closed, as by `>&-`
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    else:
         sys.stdout = _going_on(sys.stdout)
 
 
@@ -56,16 +61,25 @@ def _going_on(stream: TextIO) -> TextIO:
 
 
 class _UntilClosed(io.RawIOBase):
-    """A file that drops what is written after its reader is gone."""
+    """A file that drops what is written after its reader is gone, or after an error was raised.
+
+    Python flushes once more at its end, and would end with a traceback of its own.
+    """
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
+        self._failed = False
 
     def write(self, data: Any) -> int:
-        try:
-            return os.write(self._descriptor, data)
-        except BrokenPipeError:
-            return memoryview(data).nbytes
+        if not self._failed:
+            try:
+                return os.write(self._descriptor, data)
+            except BrokenPipeError:
+                pass
+            except OSError as error:
+                self._failed = True
+                raise InputError(f"standard output: {error.strerror}") from error
+        return memoryview(data).nbytes
 
     def fileno(self) -> int:
         return self._descriptor

@@ -266,6 +266,26 @@ def test_a_reader_that_goes_away_is_no_error(more):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux alone")
+@pytest.mark.parametrize("more", [("--help",), ("--help-all",), ("--json", "-")])
+def test_a_full_disk_at_standard_output_is_one_line(more):
+    """Of output met by the last flush, by a print on the way, and by JSON."""
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "crisalad_jax", "models", *more]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "crisalad: standard output: No space left on device"
+    assert "Traceback" not in done.stderr
+    assert "Errno" not in done.stderr
+
+
+def test_a_closed_standard_output_is_no_error():
+    command = [sys.executable, "-m", "crisalad_jax", "info", "--help"]
+    shell = ["sh", "-c", 'exec "$@" >&-', "sh", *command]
+    done = subprocess.run(shell, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 # train
 
 

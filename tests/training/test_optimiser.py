@@ -38,6 +38,7 @@ def told(params, optimiser: OptimiserConfig, steps: int, steps_per_epoch: int) -
         (30, 32, "found 30 for a run of 32 steps, which leaves 2 at .*; at most 8 steps would"),
         (30, 10, "found 30 for a run of 10 steps, which leaves 0 at .*; at most 2 steps would"),
         (9, 35, "found 9 for a run of 35 steps, which leaves 26 at .*; at most 8 steps would"),
+        (30, 3, "found 30 for a run of 3 steps, which leaves 0 at [^;]* and its decay$"),
         (9, 36, None),
         (30, 180, None),  # of the demo
         (0, 1, None),
@@ -48,7 +49,7 @@ def test_a_warm_up_of_more_than_a_quarter_is_told_in_a_line(params, warmup, step
     assert len(notes) == (words is not None)
     for note in notes:
         assert "\n" not in note
-        assert re.match(f"OptimiserConfig.warmup_steps: {words}", note)
+        assert re.match(f"--optimiser.warmup-steps: {words}", note)
 
 
 def test_a_warm_up_in_epochs_is_told_and_shortened_too(params) -> None:
@@ -56,7 +57,7 @@ def test_a_warm_up_in_epochs_is_told_and_shortened_too(params) -> None:
     boq = recipe("b14", "boq").optimiser
     (note,) = told(params, boq, 5 * 7, 7)
     assert note.startswith(
-        "OptimiserConfig.warmup_epochs: found 10, which are 70 steps, for a run of 35 steps, which "
+        "--optimiser.warmup-epochs: found 10, which are 70 steps, for a run of 35 steps, which "
         "leaves 0 at"
     )
     short = with_short_warmup(boq, 5 * 7, 7)

@@ -9,7 +9,7 @@ from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.experiments.comparison.ablation import adapter_costs_once
 from crisalad_jax.experiments.comparison.page import write_page
 from crisalad_jax.experiments.comparison.plan import ComparisonConfig, prepare, without_unreadable
-from crisalad_jax.experiments.comparison.runner import carry_out
+from crisalad_jax.experiments.comparison.runner import carry_out, runs_left
 from crisalad_jax.experiments.comparison.summary import Summary, summarise
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
 from crisalad_jax.experiments.comparison.workers import run_jobs
@@ -44,7 +44,8 @@ def compare(
             <!-- end of NAME -->, where NAME is the name of the folder.
         on_bad_image: "stop" at an unreadable image, or "skip" it: training masks it out, and the
             sets are compared on without it. Each call reads all images of the sets to find them.
-        jobs: number of runs at once, each in a process with its share of this host's devices.
+        jobs: number of runs at once, each in a process with its share of this host's devices; no
+            more than runs are left, and a single one is done by this process.
         say: is given a line at the start and before each run.
         quiet: whether to show no progress bars.
 
@@ -63,7 +64,7 @@ def compare(
         around(pathlib.Path(page), place)
     if jobs < 1:
         raise InputError(f"--jobs: found {jobs}, expected at least 1")
-    jobs = min(jobs, len(config.names) * config.seeds)
+    jobs = min(jobs, runs_left(config, out))
     with warnings.catch_warnings():
         if jobs > 1:
             run_jobs(config, out, jobs, on_bad_image=on_bad_image, say=say)

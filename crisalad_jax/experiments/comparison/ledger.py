@@ -60,6 +60,12 @@ def numbers_of(out: pathlib.Path, config: ComparisonConfig) -> list[int]:
     return [there["test"].index(test) for test in config.test]
 
 
+def seeds_of(config: ComparisonConfig) -> dict[str, int]:
+    """Map the names of a comparison to their numbers of runs: one for a model from a file."""
+    files = _weights_of_runs(config)
+    return {name: 1 if files[_run(config, name)] else config.seeds for name in config.names}
+
+
 def grown(
     existing: ComparisonConfig, config: ComparisonConfig, out: pathlib.Path
 ) -> ComparisonConfig:

@@ -60,7 +60,7 @@ class ComparisonConfig:
     test: tuple[str, ...]
     """Evaluation sets, of any layout that `open_benchmark` knows."""
     train: str | None = None
-    """Folder in the layout of GSV-Cities."""
+    """Training set, in any layout that `read_places` reads."""
     weights: tuple[str, ...] = ()
     """Weights of methods that are not trained here, as NAME=FILE, or the NAME of a published model.
     A name that is no method's is a line of its own, whatever model the file holds."""
@@ -105,6 +105,16 @@ class ComparisonConfig:
             elif name not in ABLATIONS and self.row(name) is None:
                 find_row(name, self.preset)
         folders = [file_name(name) for name in self.names]
+        own_rows = {row.name for row in rows}
+        for i, folder in enumerate(folders):
+            first = folders.index(folder)
+            if first < i and self.names[first] != self.names[i]:
+                flag = "--row" if own_rows & {self.names[first], self.names[i]} else what
+                raise InputError(
+                    f"{flag}: found {self.names[first]} and {self.names[i]}, whose results would "
+                    f"both be in the folder {folder}, expected names that differ in letters or "
+                    "digits"
+                )
         for flag, values, files in ((what, self.names, folders), ("--test", self.test, self.test)):
             if not values or len(set(files)) < len(values):
                 raise InputError(

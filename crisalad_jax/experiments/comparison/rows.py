@@ -1,6 +1,7 @@
 """Rows of an ablation of one's own: a recipe with settings changed by the flags of `train`."""
 
 import dataclasses
+import functools
 import re
 import shlex
 from collections.abc import Mapping
@@ -102,15 +103,20 @@ class AblationRow:
 
     def changed(self, config: TrainConfig, preset: str) -> TrainConfig:
         """Put the row's changes into a configuration; raises as `training`."""
-        arguments = []
-        for flag, value in self.flags.items():
-            try:
-                arguments += [f"--{flag}", *shlex.split(value)]
-            except ValueError as error:
-                raise InputError(
-                    f"--row {self.name}: {flag}: found {value}, expected closed quotes"
-                ) from error
-        return parse_changes(config, arguments, preset, f"--row {self.name}")
+        return _changed(self, config, preset)
+
+
+@functools.lru_cache(64)  # a comparison asks several times, and a parser takes half a second
+def _changed(row: AblationRow, config: TrainConfig, preset: str) -> TrainConfig:
+    arguments = []
+    for flag, value in row.flags.items():
+        try:
+            arguments += [f"--{flag}", *shlex.split(value)]
+        except ValueError as error:
+            raise InputError(
+                f"--row {row.name}: {flag}: found {value}, expected closed quotes"
+            ) from error
+    return parse_changes(config, arguments, preset, f"--row {row.name}")
 
 
 def parse_row(text: str) -> AblationRow:
@@ -140,6 +146,8 @@ def parse_row(text: str) -> AblationRow:
     if not colon or not name or set(name) & set("=,"):
         raise InputError(f"--row: found {text!r}, expected {_SHAPE}")
     items = [item.strip() for item in _ITEM.findall(rest) if item.strip()]
+    if not items:
+        raise InputError(f"--row {name}: found no change, expected {_SHAPE}")
     recipes = [item for item in items if _flag(item.partition("=")[0]) == "recipe"]
     changes = tuple(item for item in items if item not in recipes)
     if len(recipes) > 1:

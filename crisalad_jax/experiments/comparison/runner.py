@@ -27,7 +27,7 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import right_retrievals
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.experiments.comparison.ledger import claim, numbers_of
+from crisalad_jax.experiments.comparison.ledger import claim, numbers_of, seeds_of
 from crisalad_jax.experiments.comparison.plan import (
     ComparisonConfig,
     Prepared,
@@ -132,6 +132,24 @@ def take_runs(
                 say("waiting for the runs of other processes")
             waits = True
             time.sleep(POLL)
+
+
+def runs_left(config: ComparisonConfig, out: pathlib.Path) -> int:
+    """Count the runs that lack a result, by the folder's files alone: nothing is read or checked.
+
+    Args:
+        config: the comparison, whose folder may not be claimed yet.
+        out: the folder.
+    """
+    runs = [(name, seed) for name, seeds in seeds_of(config).items() for seed in range(seeds)]
+    try:
+        numbers = numbers_of(out, config)
+    except (InputError, KeyError, TypeError, ValueError):  # a new folder or set, or a damaged file
+        return len(runs)
+    return sum(
+        not all((folder_of(out, name, seed) / f"test-{n}.json").exists() for n in numbers)
+        for name, seed in runs
+    )
 
 
 def _run_words(

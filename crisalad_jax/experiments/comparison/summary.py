@@ -5,6 +5,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from crisalad_jax.config.io import to_plain
@@ -18,7 +19,7 @@ from crisalad_jax.experiments.comparison.plan import Prepared, Variant, labels_o
 from crisalad_jax.experiments.comparison.records import advised, read_result
 from crisalad_jax.experiments.comparison.runner import folder_of, read_race, result_path
 from crisalad_jax.experiments.comparison.timing import Race
-from crisalad_jax.nn.costs import part_costs
+from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.errors import InputError
 
@@ -57,14 +58,16 @@ class Row(NamedTuple):
     training: float | None
     """Training time over the reference's; None where one of the two was not trained."""
     training_seconds: float | None
-    """Mean over the seeds of the steps times a step's median seconds."""
+    """Mean over the runs that were trained alone of the steps times a step's median seconds."""
     sittings: int
     """Largest number of calls that a run took; more than one if it was resumed."""
     differences: Mapping[str, Mapping[int, Difference]] | None = None
     """Differences to the reference by set, then by K; None of the reference itself."""
     beside: bool = False
-    """Whether a run, or the reference's, shared its device with another one: its training time
-    tells nothing, and is None."""
+    """Whether all runs, or all of the reference's, shared their device with others: the training
+    time tells nothing, and is None."""
+    alone: tuple[int, int] = (0, 0)
+    """Number of runs that were trained here with the device to themselves, and of all trained."""
 
 
 class Summary(NamedTuple):
@@ -95,13 +98,17 @@ def summarise(
     reference = _reference(prepared)
     ranks = {v.name: _ranks(prepared, out, v, sets) for v in prepared.variants}
     records = {v.name: _training_records(prepared, out, v) for v in prepared.variants}
-    seconds = {name: _seconds(trainings) for name, trainings in records.items()}
+    alone = {
+        name: [each for each in trainings if not each.get("beside")]
+        for name, trainings in records.items()
+    }
+    seconds = {name: _seconds(trainings) for name, trainings in alone.items()}
     rows = []
     for variant in prepared.variants:
         parameters, trained = _parameters(variant)
         batch = statistics.median(raced.rounds[variant.run])
         took, theirs = seconds[variant.name], seconds[reference.name]
-        beside = any(r.get("beside") for n in (variant, reference) for r in records[n.name])
+        beside = any(records[n.name] and not alone[n.name] for n in (variant, reference))
         if beside:
             took = theirs = None
         for grouping, of_sets in ranks[variant.name].items():
@@ -128,6 +135,7 @@ def summarise(
                         same_runs=variant.run == reference.run,
                     ),
                     beside,
+                    (len(alone[variant.name]), len(records[variant.name])),
                 )
             )
     return Summary(
@@ -173,7 +181,7 @@ def _seconds(records: list[dict[str, Any]]) -> float | None:
 
 def _parameters(variant: Variant) -> tuple[int, int | None]:
     """Count all parameters, and those that were trained."""
-    total = sum(cost.parameters for cost in part_costs(variant.model))
+    total = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(variant.model)))
     if variant.weights is not None:
         return total, None
     if not variant.learns:
@@ -302,6 +310,12 @@ def _notes(
         notes.append(
             f"Trained beside others on one device, so that no training time is told: "
             f"{', '.join(beside)}."
+        )
+    fewer = {row.labels[0]: row.alone for row in rows if 0 < row.alone[0] < row.alone[1]}
+    if fewer:
+        runs = (f"{name} {of} of {all_runs}" for name, (of, all_runs) in sorted(fewer.items()))
+        notes.append(
+            f"Training time of the runs that had their device to themselves: {', '.join(runs)}."
         )
     resumed = sorted({row.labels[0] for row in rows if row.sittings > 1})
     if resumed:

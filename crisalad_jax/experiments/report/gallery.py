@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
 
+from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
@@ -78,8 +79,7 @@ def retrieval_figure(
     """
     _check_gallery(queries, database, indices, similarities, positives)
     for name, value in (("rows", rows), ("columns", columns)):
-        if value < 1:
-            raise InputError(f"{name}: found {value}, expected at least 1")
+        check_count(name, value)
     shown = indices[:, :columns]
     right = None
     if positives is not None:

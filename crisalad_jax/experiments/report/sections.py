@@ -78,7 +78,6 @@ class Photograph(NamedTuple):
 class Retrieval(NamedTuple):
     """A query and what was retrieved for it."""
 
-    title: str
     file: str
     photographs: list[Photograph]
 
@@ -153,7 +152,7 @@ def galleries(subject: Subject, shown: Shown) -> Iterator[Gallery]:
 def _retrieval(subject: Subject, query: int) -> Retrieval:
     benchmark, positives = subject.benchmark, subject.benchmark.ground_truth()[query]
     path = benchmark.queries[query]
-    photographs = [_photograph(subject, path, "query", ("query",), f"query {query}")]
+    photographs = [_photograph(subject, path, "query", ("query",), "query")]
     indices = subject.neighbours.indices[query]
     similarities = subject.neighbours.similarities[query]
     for rank, (index, similarity) in enumerate(
@@ -165,7 +164,7 @@ def _retrieval(subject: Subject, query: int) -> Retrieval:
         photographs.append(_photograph(subject, benchmark.database[index], kind, lines, words))
     if subject.verdicts.wrong[query]:
         photographs.append(_expected(subject, query))
-    return Retrieval(f"Query {query}", subject.name(path), photographs)
+    return Retrieval(subject.name(path), photographs)
 
 
 def _expected(subject: Subject, query: int) -> Photograph:
@@ -180,7 +179,7 @@ def _expected(subject: Subject, query: int) -> Photograph:
         index, rank = int(positives[np.argmin(away)]), f"not in the first {len(indices)}"
     lines = "would be right", rank, *_metres(subject.metres(query, index))
     path = subject.benchmark.database[index]
-    return _photograph(subject, path, "expected", lines, f"right for query {query}, {rank}")
+    return _photograph(subject, path, "expected", lines, f"right for the query, {rank}")
 
 
 def _metres(distance: float | None) -> tuple[str, ...]:

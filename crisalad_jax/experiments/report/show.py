@@ -64,6 +64,11 @@ def show_transport(
         >>> [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:3]]
         ['80 x 60 pixels', 'dustbin: 67 % of the mass', 'top clusters']
     """
+    if isinstance(image, Crisalad):
+        raise InputError(
+            "image: found parameters, expected a file or 8-bit RGB: the order is "
+            "show_transport(image, params, config)"
+        )
     check_params(params, config)
     pixels = read_image(image) if isinstance(image, str | os.PathLike) else image
     picture = transport_of_image(pixels, params, config)
@@ -138,8 +143,8 @@ def show_retrievals(
         A figure that a notebook shows; `figure.savefig(path)` writes it.
 
     Raises:
-        InputError: a result without its benchmark, or answers with one; a query that there is not;
-            rows or columns below 1; or an image that cannot be read.
+        InputError: neither of these; a result without its benchmark, or answers with one; a query
+            that there is not; rows or columns below 1; or an image that cannot be read.
 
     Example:
         >>> import numpy as np, pathlib
@@ -151,6 +156,15 @@ def show_retrievals(
         >>> [axes.get_xlabel() for axes in figure.axes]
         ['query 0', '1   1.000', '2   0.500']
     """
+    if not isinstance(found, Answers | GroupingResult):
+        raise InputError(
+            f"found: found {type(found).__name__}, expected answers of `query`, or one of the "
+            "results of `evaluate`"
+        )
+    if not isinstance(benchmark, Benchmark | None):
+        raise InputError(
+            f"benchmark: found {type(benchmark).__name__}, expected one of `open_benchmark`"
+        )
     is_result = isinstance(found, GroupingResult)
     if is_result != (benchmark is not None):
         which = "a result of evaluate" if is_result else "answers of a map"

@@ -72,7 +72,7 @@ def transport_section(
     for query in chosen:
         word = "right" if subject.verdicts.right[query] else "wrong"
         photographs += [
-            (f"Query {query}", subject.benchmark.queries[query]),
+            ("Query", subject.benchmark.queries[query]),
             (f"Retrieved for it, {word}", subject.benchmark.database[first[query]]),
         ]
     pictures = transport_of([path for _, path in photographs], params, config)

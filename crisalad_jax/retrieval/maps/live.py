@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.live import Frame
 from crisalad_jax.retrieval.maps.follow import Follower
@@ -15,7 +16,6 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, asked_similarity, json_rows, json_text
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
-from crisalad_jax.utils.errors import InputError
 
 if TYPE_CHECKING:  # answers are searched without JAX
     from crisalad_jax.nn.model import Crisalad
@@ -102,8 +102,7 @@ def query_live(
     from crisalad_jax.retrieval.model import check_params
     from crisalad_jax.retrieval.windows import FrameDescriber, check_window
 
-    if k < 1:
-        raise InputError(f"k: found {k}, expected at least 1")
+    check_count("k", k)
     config = places.description.config
     check_window(config, window)
     places.check_params(params)

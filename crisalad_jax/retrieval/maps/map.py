@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
+from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.positions import Positions
@@ -299,8 +300,7 @@ class Map:
             InputError: no queries, none in the map, descriptors that are no unit vectors of the
                 map's length, k below 1; or the store is damaged or gone.
         """
-        if k < 1:
-            raise InputError(f"k: found {k}, expected at least 1")
+        check_count("k", k)
         if not len(self):
             raise InputError(f"{self.folder}: found a map without images, expected at least one")
         self._check_descriptors("queries", queries)
@@ -389,8 +389,7 @@ class Map:
         """
         from crisalad_jax.retrieval.alone import describe_images
 
-        if k < 1:
-            raise InputError(f"k: found {k}, expected at least 1")
+        check_count("k", k)
         picture = read_image(image) if isinstance(image, str | os.PathLike) else image
         if params is None:
             params = self._checked or self.load_params()

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import frame_time
@@ -140,8 +141,7 @@ def query(
         ['2.png']
     """
     check_grouping((), batch_size, seed=0)
-    if k < 1:
-        raise InputError(f"k: found {k}, expected at least 1")
+    check_count("k", k)
     min_similarity = asked_similarity(places, min_similarity)
     sources = _listed(images, fps)
     paths = [path for source in sources for path in source]

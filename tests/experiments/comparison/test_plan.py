@@ -1,10 +1,13 @@
 """What a comparison is made of, and what is refused before any work."""
 
 import dataclasses
+import shutil
 import warnings
 
 import pytest
 
+from crisalad_jax.cli import main
+from crisalad_jax.data.places import read_places
 from crisalad_jax.experiments.comparison import METHODS, ComparedMethod, ComparisonConfig, prepare
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -24,6 +27,28 @@ def test_batches_fit_the_training_set(config):
     assert training.optimiser.warmup_steps == 0
     assert (training.trainable, training.augmentation.part_name) == ("all", "light")
     assert training.optimiser.learning_rate == recipe("tiny").optimiser.learning_rate
+
+
+def test_places_of_ones_own_train_a_comparison(settings, shared, tmp_path, capsys):
+    """In one folder a place, and in a table: the short help of --train names them."""
+    city = read_places(shared / "city", min_images=3)
+    lines = ["name,place"]
+    for image in range(len(city.files)):
+        place = int(city.image_place[image])
+        lines.append(f"{place}/{image}.jpg,{place}")
+        target = tmp_path / "own" / str(place) / f"{image}.jpg"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(city.path(image), target)
+    table = tmp_path / "own" / "table.csv"
+    table.write_text("\n".join(lines))
+    for train in (table.parent, table):
+        names = ("crisalad", "no-encoder")
+        given = settings | {"kind": "ablate", "names": names, "train": str(train)}
+        for variant in prepare(ComparisonConfig(**given)).variants:
+            assert len(variant.places.place_id) == len(city.place_id)
+            assert sorted(variant.places.image_counts) == sorted(city.image_counts)
+    assert main(["ablate", "--help"]) == 0
+    assert "one folder a place" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_same_images_a_batch_for_all(settings):

@@ -60,6 +60,8 @@ def test_flags_change_what_they_name_and_nothing_else():
 REFUSED = [
     ("epochs=2", "--row: found 'epochs=2', expected NAME: flag=value, flag=value"),
     ("a b", "--row: found 'a b', expected NAME"),
+    ("x:", "--row x: found no change, expected NAME: flag=value"),
+    ("x: ,", "--row x: found no change, expected NAME: flag=value"),
     ("x: epochs", "--row x: found 'epochs', expected flag=value"),
     ("x: epochs=", "--row x: found 'epochs=', expected flag=value"),
     ("x: recipe=", "--row x: found 'recipe=', expected flag=value"),
@@ -86,10 +88,29 @@ def test_refused_in_one_line(ablation, text, words):
     assert "\n" not in str(caught.value)
 
 
+def test_rows_of_one_folder_are_refused_with_their_flag(ablation):
+    rows = ("a/b: epochs=1", "a-b: epochs=2")
+    words = "--row: found a/b and a-b, whose results would both be in the folder a-b, expected"
+    with pytest.raises(InputError, match=words):
+        ComparisonConfig(**ablation | {"rows": rows})
+
+
+def test_a_row_is_parsed_once(ablation, monkeypatch):
+    """Its parser takes half a second, and a comparison asks for its configuration several times."""
+    from crisalad_jax.experiments.comparison import rows as module
+
+    module._changed.cache_clear()
+    asked, parse = [], module.parse_changes
+    monkeypatch.setattr(module, "parse_changes", lambda *a: asked.append(a) or parse(*a))
+    config = ComparisonConfig(**ablation | {"rows": ("once: epochs=2",)})
+    dataclasses.replace(config, seeds=2)
+    assert len(asked) == 1
+
+
 def test_what_a_row_sets_stays_as_it_is(ablation):
     """Else a comparison fits epochs, batches and warm-up to the training set."""
     rows = (
-        "base:",
+        ("base", {}),
         "longer: epochs=40",
         "fewer: places-per-batch=2, min-images=2, images-per-place=2",
         "warm: optimiser.warmup-steps=2",

@@ -396,8 +396,18 @@ def test_a_run_beside_others_tells_no_training_time(finished, flags, capfd):
         assert runner._has_neighbours(finished)
         lock.write_text("process 1 on elsewhere\n")
         assert not runner._has_neighbours(finished)
-    path = finished / "crisalad" / "seed-1" / "training.json"
-    write_json(path, read_json(path, "a record") | {"beside": True})
+    paths = [finished / "crisalad" / f"seed-{seed}" / "training.json" for seed in (0, 1)]
+    first, second = (read_json(path, "a record") for path in paths)
+    write_json(paths[1], second | {"beside": True, "step_seconds": 1e6})
+    # The other run was alone: its time stays, and nothing of the disturbed one is in it.
+    told = succeeds(capfd, *flags, "--out", finished)
+    words = "Training time of the runs that had their device to themselves: CriSALAD 1 of 2."
+    assert words in told
+    assert "beside others" not in told
+    (row,) = json.loads((finished / "results.json").read_text())["rows"]
+    assert (row["training"], row["beside"], row["alone"]) == (1, False, [1, 2])
+    assert row["training_seconds"] == pytest.approx(first["steps"] * first["step_seconds"])
+    write_json(paths[0], first | {"beside": True})
     told = succeeds(capfd, *flags, "--out", finished)
     assert (
         "Trained beside others on one device, so that no training time is told: CriSALAD." in told

@@ -249,7 +249,12 @@ def test_names_of_files_are_no_markup(
     assert json.loads(data["text"])["rows"][0][0] == name
     assert not any("onerror" in key for element in page.elements for key in element)
     assert [e["text"] for e in page.all("span", title=name)] == [name]
-    assert any(e["alt"] == f"query 0: {name}" for e in page.all("img"))
+    assert any(e["alt"] == f"query: {name}" for e in page.all("img"))
+    # As in the table of every query: a number would be of neither a file nor a row.
+    shown = [" ".join(e["text"].split()) for e in page.all("h3")]
+    asked = {row[0] for row in json.loads(data["text"])["rows"]}
+    assert shown
+    assert set(shown) <= asked
     # Of what this model and set lack there is no section, nor a word.
     names = [e["id"] for e in page.all("section")]
     assert names == ["recall", "queries", "right", "wrong", "unmatched", "settings"]

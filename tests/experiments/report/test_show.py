@@ -5,6 +5,7 @@ import dataclasses
 import cv2
 import jax
 import numpy as np
+import PIL.Image
 import pytest
 
 import crisalad_jax as cj
@@ -76,3 +77,18 @@ def test_retrievals_refuse_queries_that_are_not_there(benchmark, queries):
 def test_a_result_needs_its_benchmark(benchmark):
     with pytest.raises(cj.InputError, match="benchmark: found none for a result"):
         cj.show_retrievals(_result(benchmark))
+
+
+def test_what_is_shown_is_of_the_right_class(params, benchmark):
+    """Each is one line that names the argument; the order of a model's calls is refused too."""
+    picture = PIL.Image.open(benchmark.queries[0])
+    for arguments, words in (
+        ((picture, params, MODEL), "image: found JpegImageFile, expected uint8 of shape"),
+        ((params, picture, MODEL), "image: found parameters, .* show_transport\\(image, params, c"),
+    ):
+        with pytest.raises(cj.InputError, match=words):
+            cj.show_transport(*arguments)
+    with pytest.raises(cj.InputError, match="found: found str, expected answers of `query`, or"):
+        cj.show_retrievals("own")
+    with pytest.raises(cj.InputError, match="benchmark: found str, expected one of"):
+        cj.show_retrievals(_result(benchmark), "town")

@@ -13,8 +13,10 @@ import crisalad_jax.retrieval.maps.query
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.answers import answers_table
 from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.live import FolderWatch
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.maps.live import query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import (
     Answers,
@@ -179,6 +181,20 @@ def test_what_locate_refuses(folder, params, answers):
         places.locate(np.zeros((8, 8, 3)))
     with pytest.raises(InputError, match="found a map made by model"):
         places.locate(answers.queries[0], params=jax.tree.map(lambda x: x + 1, params))
+
+
+@pytest.mark.parametrize("k", [1.5, 2.0, "3", None, True, np.float32(1)])
+def test_a_number_of_answers_is_a_whole_number(folder, params, answers, k):
+    with Map.open(folder) as places:
+        rows = np.eye(1, places.head.descriptor_length, dtype=np.float32)
+        for ask_for in (
+            lambda: places.locate(answers.queries[0], k=k),
+            lambda: places.search(rows, k),
+            lambda: query(places, params, answers.queries, k=k),
+            lambda: query_live(places, params, FolderWatch(folder), k=k),
+        ):
+            with pytest.raises(InputError, match=r"k: found .*, expected a whole number"):
+                ask_for()
 
 
 def test_a_map_that_is_forgotten_closes_its_store(folder, monkeypatch):
