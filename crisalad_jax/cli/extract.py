@@ -8,6 +8,7 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
+from crisalad_jax.utils.output import counted
 
 COMMON = (
     "weights",
@@ -42,7 +43,7 @@ class Extract:
     (docs/how-to/image-sources.md)."""
     out: pathlib.Path
     """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
-    fps: float = 1.0
+    fps: float | None = None
     """Frames a second taken of a video."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's."""
@@ -133,17 +134,20 @@ def run(arguments: Extract) -> None:
         verify=arguments.verify,
         quiet=arguments.quiet,
     )
-    if result.shares_left:
-        say(
-            f"{arguments.out}: share {arguments.share}: {len(result.names)} descriptors; "
+    described = counted(len(result.names), "descriptor")
+    if result.shares_left or result.joined_elsewhere:
+        rest = (
             f"shares still to be done: {result.shares_left}; the last one joins all"
+            if result.shares_left
+            else "another process joins all"
         )
+        say(f"{arguments.out}: share {arguments.share}: {described}; {rest}")
         return
     if result.pairs is not None:
         say(f"{arguments.pairs}: {len(result.pairs)} pairs")
     skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""
     say(
-        f"{arguments.out}: {len(result.names)} descriptors of {result.descriptors.shape[1]} "
+        f"{arguments.out}: {described} of {result.descriptors.shape[1]} "
         f"numbers, grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]}), images at "
         f"{config.images_in_words}{skipped}"
     )

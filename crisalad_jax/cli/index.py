@@ -14,6 +14,7 @@ from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.head import has_images
 from crisalad_jax.retrieval.maps.manifest import read_description
+from crisalad_jax.utils.output import counted
 
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 
@@ -30,7 +31,7 @@ class Index:
     images by their paths in the folder, subfolders included."""
     out: pathlib.Path
     """The map's folder. After a kill the same command goes on."""
-    fps: float = 1.0
+    fps: float | None = None
     """Frames a second taken of a video."""
     positions: pathlib.Path | None = None
     """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for images that are new; by
@@ -98,11 +99,14 @@ def run(arguments: Index) -> None:
         on_bad_image=arguments.on_bad_image,
         quiet=arguments.quiet,
     )
+    described = f"{counted(result.added, 'image')} described"
     if result.shares_left:
         say(
-            f"{arguments.out}: share {arguments.share}: {result.added} images described; "
+            f"{arguments.out}: share {arguments.share}: {described}; "
             f"shares still to be done: {result.shares_left}; the last one joins all"
         )
+    elif result.joined_elsewhere:
+        say(f"{arguments.out}: share {arguments.share}: {described}; another process joins all")
     else:
         say(f"{arguments.out}: {'; '.join(_words(result))}")
     description = result.description
@@ -148,7 +152,7 @@ def _model(arguments: Index, weights: pathlib.Path) -> tuple[Crisalad | Runtime,
 def _words(result: Indexed) -> list[str]:
     """Describe the images' fates in clauses; empty groups are left out."""
     description, unmatched = result.description, result.unmatched
-    words = [f"{result.added} images added, {result.positions} with positions"]
+    words = [f"{counted(result.added, 'image')} added, {result.positions} with positions"]
     if result.there:
         words.append(f"{result.there} were there already")
     if result.stay:
@@ -160,7 +164,7 @@ def _words(result: Indexed) -> list[str]:
     if result.unreadable:
         words.append(f"{len(result.unreadable)} unreadable left out")
     length, store = description.descriptor_length, description.store
-    words.append(f"{result.images} descriptors of {length} numbers ({store})")
+    words.append(f"{counted(result.images, 'descriptor')} of {length} numbers ({store})")
     if result.recall is not None:
         words.append(
             f"approximate search finds {100 * result.recall:.1f} % of the exact {NEIGHBOURS} "

@@ -10,7 +10,7 @@ from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import printable
+from crisalad_jax.utils.output import counted, printable
 from crisalad_jax.utils.signals import defer_signals
 
 if TYPE_CHECKING:
@@ -42,7 +42,9 @@ def run(arguments: "Query") -> None:
         # First, for its errors: loading a model takes seconds.
         if arguments.watch is not None:
             source = FolderWatch(arguments.watch)
-            words = f"watching {arguments.watch} ({source.there} images are there, and left out)"
+            verb = "is" if source.there == 1 else "are"
+            there = f"{counted(source.there, 'image')} {verb} there"
+            words = f"watching {arguments.watch} ({there}, and left out)"
         else:
             assert arguments.camera is not None
             source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps))

@@ -124,7 +124,7 @@ def run(arguments: Query) -> None:
             live.model_of(places, arguments),
             arguments.images,
             k=arguments.k,
-            fps=1.0 if arguments.fps is None else arguments.fps,
+            fps=arguments.fps,
             window=arguments.window,
             exact=arguments.exact,
             batch_size=arguments.batch_size,
@@ -136,9 +136,9 @@ def run(arguments: Query) -> None:
     unknown = _unknown(answers, places.calibration)
     if answers.unreadable:
         say(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
-    of = f"in a map of {len(answers.images)} images{unknown}"
+    of = f"in a map of {counted(len(answers.images), 'image')}{unknown}"
     if arguments.json is None and arguments.gallery is None:
-        title = f"{arguments.map}, {len(answers.images)} images{unknown}"
+        title = f"{arguments.map}, {counted(len(answers.images), 'image')}{unknown}"
         console.print(answers_table(answers, title))
     elif file is None and arguments.json is not None:
         for line in json_lines(answers):
@@ -161,7 +161,8 @@ def run(arguments: Query) -> None:
         shown = f"{_ROWS} of " if len(answers.queries) > _ROWS else ""
         say(f"{arguments.gallery}: {shown}{len(answers.queries)} queries {of}")
     if file is not None:
-        say(f"{file}: {len(answers.queries)} queries {of}")
+        asked = f"{len(answers.queries)} {'query' if len(answers.queries) == 1 else 'queries'}"
+        say(f"{file}: {asked} {of}")
 
 
 def _unknown(answers: Answers, measured: Calibration | None) -> str:

@@ -7,7 +7,7 @@ from typing import Literal
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import find_given, give_json, prepare_json, say
-from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.vocabulary import (
@@ -52,7 +52,7 @@ class Vocabulary:
     (docs/how-to/image-sources.md). Not of images that are evaluated on."""
     out: pathlib.Path
     """A .safetensors file."""
-    fps: float = 1.0
+    fps: float | None = None
     """Frames a second taken of a video."""
     weights: pathlib.Path | None = None
     """A model of AnyLoc, NetVLAD or a part of yours with a vocabulary, for another one; a file, or
@@ -101,7 +101,8 @@ def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    open_source(arguments.images, fps=arguments.fps)  # first: drawing parameters takes seconds
+    source = open_source(arguments.images, fps=arguments.fps)  # drawing parameters takes seconds
+    check_rate_used(arguments.fps, source.paths)
     params, config = _model(arguments)
     built = build_vocabulary(
         params,

@@ -6,7 +6,7 @@ import os
 import pathlib
 import warnings
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, BinaryIO
 
 from crisalad_jax.data.positions import AXES, Positions
 
@@ -16,7 +16,7 @@ _VOID = "V"
 """Status of a receiver without a fix."""
 
 
-def exif_position(path: str | os.PathLike[str]) -> tuple[float, float] | None:
+def exif_position(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, float] | None:
     """Read latitude and longitude in degrees; None where a file says none that can be right."""
     from PIL import Image
 

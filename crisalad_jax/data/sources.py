@@ -4,7 +4,7 @@ import glob
 import os
 import pathlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, names_in
@@ -41,14 +41,14 @@ class ImageSource(NamedTuple):
     """What the columns of a table say; None without such columns."""
 
 
-def open_source(images: str | os.PathLike[str], *, fps: float = 1.0) -> ImageSource:
+def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> ImageSource:
     """List the images of a source.
 
     Args:
         images: a folder, searched with its subfolders; an image; a video; a pattern, where ** is
             any folders; a list, .txt, of a path a line; or a table, .csv, with a column `name`
             (see `read_image_table`). Paths in lists and tables are relative to their folder.
-        fps: frames a second taken of videos.
+        fps: frames a second taken of videos; None is one.
 
     Returns:
         The images. Names are relative to the folder; to that of the file; to the part of a pattern
@@ -59,6 +59,7 @@ def open_source(images: str | os.PathLike[str], *, fps: float = 1.0) -> ImageSou
         InputError: no such source, no image in it, a path twice, or a file that is missing or that
             no line of text can name.
     """
+    fps = 1.0 if fps is None else fps
     check_rate(fps)
     if not os.fspath(images):
         raise InputError(f"images: found an empty name, expected {_FORMS}")
@@ -80,6 +81,20 @@ def open_source(images: str | os.PathLike[str], *, fps: float = 1.0) -> ImageSou
         return _listed(path, table.rows, table.positions, fps)
     check_source(file_of(path), _AN_IMAGE)
     return _source(path.parent, _with_frames([path], fps), path)
+
+
+def check_rate_used(fps: float | None, paths: Iterable[pathlib.Path]) -> None:
+    """Check that a rate is given only where some image is a frame of a video.
+
+    Args:
+        fps: the rate; None where none is given.
+        paths: the images of all sources.
+
+    Raises:
+        InputError: it is of no use.
+    """
+    if fps is not None and not any(frame_time(path) is not None for path in paths):
+        raise InputError(f"--fps: found {fps:g} without a video among the images, expected both")
 
 
 def _is_below(root: pathlib.Path, path: pathlib.Path) -> bool:

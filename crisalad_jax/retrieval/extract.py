@@ -10,7 +10,7 @@ from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import check_lines
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time, name_frame
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.retrieval.chunks import check_all_rows
@@ -47,7 +47,7 @@ def extract(
     images: StrPath | Sequence[StrPath],
     out: StrPath | None = None,
     *,
-    fps: float = 1.0,
+    fps: float | None = None,
     weights: StrPath | None = None,
     grouping: str = "single",
     batch_size: int = 16,
@@ -74,7 +74,7 @@ def extract(
             (docs/how-to/image-sources.md), or a list of files.
         out: a file .npy, with the names beside it, or .h5, as hloc reads it. How it was made is
             written beside it too, as JSON. None writes nothing.
-        fps: frames a second taken of a video.
+        fps: frames a second taken of a video, which is then expected; None is one.
         weights: the file that the parameters are from, for that JSON and for messages.
         grouping: one of `GROUPINGS`: which images look at each other.
         batch_size: number of images described together.
@@ -122,6 +122,7 @@ def extract(
     )
     components = _components(pca, config, weights, unit=pairs is not None, verify=verify)
     paths, names = _listed(images, root, fps)
+    check_rate_used(fps, paths)
     length = config.descriptor_dim if components is None else len(components.components)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -135,7 +136,7 @@ def extract(
         "model": to_plain(config),
     }
     if any(frame_time(path) is not None for path in paths):
-        record["fps"] = fps
+        record["fps"] = 1.0 if fps is None else fps
 
     def describe(paths: Sequence[pathlib.Path], names: Sequence[str], work: Work) -> DescribedSet:
         return describe_set(
@@ -272,7 +273,7 @@ def _source(images: StrPath | Sequence[StrPath]) -> str:
 
 
 def _listed(
-    images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float
+    images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float | None
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
     if isinstance(images, str | os.PathLike):

@@ -51,6 +51,8 @@ class Extracted(NamedTuple):
     """Each image with those most similar to it, best first; None where no pairs were asked for."""
     shares_left: int = 0
     """Number of shares that are not there yet; until then this holds the images of one share."""
+    joined_elsewhere: bool = False
+    """Whether another process joins the shares, so that this holds the images of one share."""
 
 
 class Work(NamedTuple):
@@ -270,7 +272,7 @@ def extract_share(
                 return result
     names, descriptors = read_descriptors(own)
     skipped = read_json(record_of(own), "a record of descriptors")["skipped"]
-    return Extracted(names, descriptors, skipped, None, left)
+    return Extracted(names, descriptors, skipped, None, left, joined_elsewhere=not left)
 
 
 def _joined(shared: SharedSet, work: Work) -> DescribedSet:

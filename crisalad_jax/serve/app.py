@@ -36,6 +36,8 @@ _UPLOADS = 2
 """Number of pictures that may be arriving at once, in `most_waiting`."""
 _PATIENCE = 60.0
 """Seconds in which a picture has to arrive."""
+_FIELDS = 10
+"""Number of files, and of fields, that are read of a form."""
 _RETRY = {"Retry-After": "1"}
 
 
@@ -131,10 +133,14 @@ _BODY = {
         },
     }
 }
-_PROBLEMS: dict[int | str, dict[str, Any]] = {
-    400: {"model": Problem, "description": "No picture, or an argument out of range"},
+_OF_ALL: dict[int | str, dict[str, Any]] = {
     401: {"model": Problem, "description": "No token, or another one"},
+    421: {"model": Problem, "description": "A Host of another machine, where there is no token"},
+}
+_PROBLEMS = _OF_ALL | {
+    400: {"model": Problem, "description": "No picture, or an argument out of range"},
     403: {"model": Problem, "description": "A page of another site, or a map that is only read"},
+    408: {"model": Problem, "description": "A picture that takes too long to arrive"},
     413: {"model": Problem, "description": "More bytes than the service takes"},
     500: {"model": Problem, "description": "The map or the model failed"},
     503: {"model": Problem, "description": "Too many requests wait; try again"},
@@ -186,12 +192,12 @@ def make_app(
     async def show_page() -> Response:
         return HTMLResponse(page)
 
-    @app.get("/health")
+    @app.get("/health", responses={421: _OF_ALL[421]})
     async def health() -> Health:
         """Tell that the service runs, of which model, how it searches, and since when."""
         return Health(**service.health())
 
-    @app.get("/map", responses={401: _PROBLEMS[401]})
+    @app.get("/map", responses=_OF_ALL)
     def describe_map() -> Places:
         """Tell how large the map is, and where its images were taken."""
         return Places(**service.map_fields(), k=k, max_bytes=max_bytes)
@@ -199,9 +205,10 @@ def make_app(
     @app.get(
         "/images/{number}",
         response_class=Response,
-        responses={
+        responses=_OF_ALL
+        | {
             200: {"content": {"image/jpeg": {}}, "description": "A small JPEG"},
-            401: _PROBLEMS[401],
+            400: {"model": Problem, "description": "No number"},
             404: {"model": Problem, "description": "No such image, or its file is gone"},
         },
     )
@@ -253,7 +260,18 @@ def make_app(
             fields = await service.append(data, name, axes, position)
         return Appended(**fields, latency_ms=_milliseconds(start))
 
+    _leave_out_unused(app)
     return _Gate(app, access, page)
+
+
+def _leave_out_unused(app: fastapi.FastAPI) -> None:
+    """Take out of the description of the interface what FastAPI adds and is never answered."""
+    described = app.openapi()  # is kept, and served from now on
+    for path in described["paths"].values():
+        for operation in path.values():
+            operation["responses"].pop("422", None)  # such is answered with 400
+    for name in ("HTTPValidationError", "ValidationError"):
+        described["components"]["schemas"].pop(name, None)
 
 
 class _Room:
@@ -284,10 +302,26 @@ async def _picture(request: fastapi.Request, limit: int) -> tuple[bytes, str]:
         return {"type": "http.request", "body": data, "more_body": False}
 
     copy = starlette.requests.Request(request.scope, receive)
-    async with copy.form(max_files=1, max_fields=10) as form:
+    try:
+        form = await copy.form(max_files=_FIELDS, max_fields=_FIELDS)
+    except starlette.exceptions.HTTPException as error:
+        raise RefusedError(
+            400,
+            f"image: found a form that cannot be read, or of more than {_FIELDS} files or fields, "
+            "expected one with a file of this name",
+        ) from error
+    async with contextlib.AsyncExitStack() as stack:
+        stack.push_async_callback(form.close)
+        files = [
+            each
+            for _, each in form.multi_items()
+            if isinstance(each, starlette.datastructures.UploadFile)
+        ]
         image = form.get("image")
         if not isinstance(image, starlette.datastructures.UploadFile):
             raise RefusedError(400, "image: found no such file in the form, expected one")
+        if len(files) > 1:
+            raise RefusedError(400, f"image: found {len(files)} files in the form, expected one")
         return await image.read(), image.filename or "image"
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import concurrent.futures
 import functools
+import io
 import pathlib
 import time
 from typing import Any
@@ -10,7 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from crisalad_jax.data.exif import exif_position
 from crisalad_jax.data.images import decode_image, read_image
+from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_similarity, position_fields
@@ -124,7 +127,7 @@ class MapService:
         Args:
             data: the picture's file.
             name: its name in the map.
-            axes: axes of its position; None where that is unknown.
+            axes: axes of its position; None where that is unknown, and EXIF data may say it.
             position: where it was taken.
 
         Returns:
@@ -136,7 +139,13 @@ class MapService:
         """
         check_new_name(name)
         picture = await self._prepared(data, name)
-        work = Addition(picture, data, name, axes, position)
+        by_exif = axes is None
+        if by_exif:
+            loop = asyncio.get_running_loop()
+            file = io.BytesIO(data)
+            position = await loop.run_in_executor(self._threads, exif_position, file)
+            axes = None if position is None else AXES[1]
+        work = Addition(picture, data, name, axes, position, by_exif)
         number = await asyncio.wrap_future(self._worker.submit(work))
         places = self._worker.places
         return {

@@ -55,6 +55,8 @@ class Addition(NamedTuple):
     axes: tuple[str, str] | None
     """Axes of its position; None where that is unknown."""
     position: tuple[float, float] | None
+    by_exif: bool = False
+    """Whether the position is what EXIF data says, which a map in other axes leaves out."""
 
 
 class Found(NamedTuple):
@@ -162,9 +164,12 @@ class MapWorker:
     def _append(self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]) -> None:
         """Append the additions of a batch together, without those that the map does not take."""
         axes, names, rows = self.places.axes, set[str](), list[int]()
+        works: list[Addition] = []
         for row, (work, result) in enumerate(batch):
             if not isinstance(work, Addition):
                 continue
+            if work.by_exif and axes and work.axes != axes:
+                work = work._replace(axes=None, position=None)
             if work.name in names or self.places.image(work.name) is not None:
                 found = f"name: found {work.name!r}, which the map has already, expected a new one"
                 result.set_exception(NameTakenError(found))
@@ -178,9 +183,9 @@ class MapWorker:
                 axes = axes or work.axes
                 names.add(work.name)
                 rows.append(row)
+                works.append(work)
         if not rows:
             return
-        works = [work for row in rows if isinstance(work := batch[row].work, Addition)]
         root = self.places.folder / ADDED
         first = len(self.places)
         with _kept(root, works):

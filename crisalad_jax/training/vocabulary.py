@@ -20,7 +20,7 @@ from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
@@ -178,7 +178,7 @@ def build_vocabulary(
     images: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
-    fps: float = 1.0,
+    fps: float | None = None,
     max_images: int = IMAGES,
     seed: int = 0,
     batch_size: int = 16,
@@ -193,7 +193,7 @@ def build_vocabulary(
         images: the folder, searched with its subfolders, or another source of images
             (docs/how-to/image-sources.md); not of images that are evaluated on.
         out: the .safetensors file to write.
-        fps: frames a second taken of a video.
+        fps: frames a second taken of a video, which is then expected; None is one.
         max_images: number of images that are read at most, drawn at random.
         seed: as `with_vocabulary` takes it, and so are the others.
         batch_size: number of images described at a time.
@@ -219,6 +219,7 @@ def build_vocabulary(
     """
     check_target(out, ".safetensors")
     paths = open_source(images, fps=fps).paths
+    check_rate_used(fps, paths)
     params = with_vocabulary(
         params,
         config,

@@ -87,8 +87,12 @@ def _no_file(path: str | os.PathLike[str]) -> str | None:
 
 
 def user_cache() -> pathlib.Path:
-    """Return the folder of the user's caches, which `XDG_CACHE_HOME` may name."""
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache")
+    """Return the folder of the user's caches, which `XDG_CACHE_HOME` may name.
+
+    A relative name there is ignored, as the XDG Base Directory Specification has it.
+    """
+    named = pathlib.Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return named if named.is_absolute() else pathlib.Path.home() / ".cache"
 
 
 CACHE = "CRISALAD_CACHE"

@@ -136,7 +136,8 @@ def table(loads: list[Load], folder: pathlib.Path) -> Table:
         size = f"images at {config.images_in_words}"
     caption = (
         f"Clients at once, each a request after the other for {loads[0].seconds:.0f} s; {what}; "
-        f"{size}. Clients and service share the machine: {machine()}."
+        f"{size}. Clients and service share the machine: {machine()}. Not as query's: other names, "
+        f"or a similarity off by more than {ROUNDING:g}."
     )
     header = ("clients", "answers", "lost", "not as query's", "answers / s")
     rows = []

@@ -38,6 +38,7 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.download import Patience
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.notes import Note
 from tests.conftest import assert_equal
 from tests.file_server import FileServer, file_server
@@ -487,3 +488,13 @@ def test_a_killed_download_is_gone_on_with_by_the_next_process(
     assert cached_weights(again, quiet=True).is_file()
     assert [wanted for _, wanted in server.asked] == [None, "bytes=10-"]
     assert (folder / FILE).read_bytes() == DATA
+
+
+def test_a_relative_cache_of_the_user_is_ignored(monkeypatch, tmp_path):
+    """As the XDG Base Directory Specification has it: all paths must be absolute."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for named in ("", "cache", "./cache"):
+        monkeypatch.setenv("XDG_CACHE_HOME", named)
+        assert user_cache() == tmp_path / ".cache"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert user_cache() == tmp_path / "cache"

@@ -69,6 +69,37 @@ def test_positions_are_of_the_flag_the_table_names_or_exif(shared, images, tmp_p
     assert positions(tmp_path / "table")["new.jpg"] is None
 
 
+def test_a_rate_without_a_video_is_refused(shared, images, folder, tmp_path, capfd):
+    words = ("--fps: found 2 without a video among the images, expected both",)
+    out = ("--out", tmp_path / "out.npy")
+    common = ("--weights", shared / "weights.safetensors", "--images", images, "--quiet")
+    before = sorted(tmp_path.iterdir())
+    fails(capfd, "extract", *common, *out, "--fps", 2, words=words)
+    fails(capfd, *index(shared, images, tmp_path / "map", "--fps", 2), words=words)
+    fails(capfd, *query(folder, images, "--fps", 2), words=words)
+    target = ("--out", tmp_path / "v.safetensors")
+    fails(capfd, "vocabulary", "--images", images, *target, "--fps", 2, words=words)
+    assert sorted(tmp_path.iterdir()) == before
+    # One video among several sources is enough.
+    video = write_video(tmp_path / "walk.avi", 21)
+    assert "walk.avi#t=0.500" in succeeds(
+        capfd, *query(folder, images, video, "--fps", 2, "--json", "-")
+    )
+
+
+def test_one_image_is_one(shared, images, tmp_path, capfd):
+    said = succeeds(capfd, *index(shared, images / "a.jpg", tmp_path / "map"))
+    assert "map: 1 image added, 1 with positions; 1 descriptor of" in said
+    answers = tmp_path / "answers.jsonl"
+    said = succeeds(capfd, *query(tmp_path / "map", images / "a.jpg", "--json", answers))
+    assert said == f"{answers}: 1 query in a map of 1 image"
+
+
+def test_a_folder_that_is_no_map_is_not_asked(images, capfd):
+    words = f"{images}: found a.jpg and no map.json, expected a map\n"
+    assert fails(capfd, *query(images, images), words=()).endswith(words)
+
+
 def test_a_video_is_extracted_and_described_as_its_frames(shared, tmp_path, capfd):
     video = write_video(tmp_path / "walk.avi", 21)
     common = ("--weights", shared / "weights.safetensors", "--batch-size", BATCH, "--quiet")
@@ -178,8 +209,8 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, cap
     assert line["query"] == (tmp_path / "in" / "new.jpg").as_posix()
     assert line["neighbours"][0]["name"] == image.name
     said = "".join([*errors, rest.err])
-    assert f"ready, watching {tmp_path / 'in'} (1 images are there, and left out)" in said
-    assert "crisalad: 1 answers, latency median " in said
+    assert f"ready, watching {tmp_path / 'in'} (1 image is there, and left out)" in said
+    assert "crisalad: 1 answer, latency median " in said
     assert said.endswith(f"crisalad: stopped by {number.name}\n")
 
 

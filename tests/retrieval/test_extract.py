@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+import crisalad_jax.retrieval.sets
 from crisalad_jax.data.images import list_images
 from crisalad_jax.retrieval import partial
 from crisalad_jax.retrieval.chunks import is_mapped
@@ -15,7 +16,9 @@ from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
+from crisalad_jax.retrieval.sets import open_work
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.locks import BusyFolderError
 from crisalad_jax.utils.notes import Note
 from tests.conftest import BATCH, MODEL
 
@@ -157,6 +160,25 @@ def test_shares_make_the_set_of_one_process(params, town, expected, tmp_path, su
     assert left == {out.name, f"{out.name}.json", "pairs.txt", "whole.txt", *names}
     again = run(params, town, out, share="1/3")
     assert (again.shares_left, set(again.names)) == (0, set(whole.names))
+
+
+def test_a_share_that_another_process_joins_says_so(params, town, tmp_path, monkeypatch):
+    """The lock of the whole set is another's."""
+    out = tmp_path / "d.npy"
+    first = run(params, town, out, share="0/2")
+
+    def busy(path):
+        if path == out:
+            raise BusyFolderError(f"{path}: busy")
+        return open_work(path)
+
+    monkeypatch.setattr(crisalad_jax.retrieval.sets, "open_work", busy)
+    with pytest.warns(Note, match="another process joins the shares"):
+        found = run(params, town, out, share="1/2")
+    assert (found.shares_left, found.joined_elsewhere) == (0, True)
+    assert not first.joined_elsewhere
+    whole = run(params, town).names
+    assert [*first.names, *found.names] == whole
 
 
 def test_a_share_of_other_images_is_not_joined(params, town, tmp_path):

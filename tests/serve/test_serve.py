@@ -7,6 +7,7 @@ import importlib.resources
 import itertools
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.positions import Positions
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
@@ -27,6 +29,7 @@ from crisalad_jax.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
 from tests.conftest import BATCH, MODEL, write_video
+from tests.data.test_sources import write_jpeg
 from tests.serve.conftest import LIMIT, serving
 
 # Batches of other sizes round otherwise; similarities are printed with six digits.
@@ -131,6 +134,93 @@ def test_a_form_without_a_picture(service, pictures):
     reply = service.ask("POST", "/locate", data, **headers)
     assert reply.status == 400
     assert reply.json["error"].startswith("a b.jpg: found 5 bytes")
+
+
+def test_a_form_with_two_files_or_too_many_fields(service, pictures):
+    """In words of ours, not of what reads the form."""
+    data, headers = form(pictures[0].read_bytes())
+    first = data.removesuffix(b"--b--\r\n")
+    reply = service.ask("POST", "/locate", first + data, **headers)
+    assert (reply.status, reply.json["error"]) == (
+        400,
+        "image: found 2 files in the form, expected one",
+    )
+    for body in (first * 11 + b"--b--\r\n", b"--b\r\nno form"):
+        reply = service.ask("POST", "/locate", body, **headers)
+        assert reply.status == 400
+        assert reply.json["error"].startswith("image: found ")
+    words = "found a form that cannot be read, or of more than 10 files or fields"
+    assert (
+        words in service.ask("POST", "/locate", first * 11 + b"--b--\r\n", **headers).json["error"]
+    )
+
+
+def test_the_interface_lists_what_is_answered(service):
+    interface = service.ask("GET", "/openapi.json").json
+    answered = {
+        (method, path): {int(status) for status in operation["responses"]}
+        for path, operations in interface["paths"].items()
+        for method, operation in operations.items()
+    }
+    posted = {400, 401, 403, 408, 413, 421, 500, 503}
+    assert answered == {
+        ("get", "/health"): {200, 421},
+        ("get", "/map"): {200, 401, 421},
+        ("get", "/images/{number}"): {200, 400, 401, 404, 421},
+        ("post", "/locate"): {200} | posted,
+        ("post", "/images"): {201, 409} | posted,
+    }
+    assert service.ask("GET", "/images/x").status == 400
+    assert service.ask("POST", "/images").status == 400  # no name
+    assert service.ask("GET", "/health", Host="robot.example").status == 421
+    assert not re.search("ValidationError", json.dumps(interface))
+
+
+@pytest.mark.parametrize(("axes", "there"), [(("lat", "lon"), None), (("east", "north"), (1, 2))])
+def test_a_picture_is_added_where_its_exif_data_says(shared, params, tmp_path, axes, there):
+    """In a map without positions, or in degrees; one in metres leaves it out, as `index` does."""
+    (tmp_path / "images").mkdir()
+    picture = write_jpeg(tmp_path / "images" / "a.jpg")
+    bare = tmp_path / "images" / "b.png"
+    cv2.imwrite(str(bare), np.full((50, 70, 3), 90, np.uint8))
+    of = Positions(axes, {} if there is None else {"b.png": there})
+    out, weights = tmp_path / "map", shared / "weights.safetensors"
+    more = {"weights": weights, "batch_size": BATCH, "quiet": True}
+    index(params, MODEL, bare, out, positions=None if there is None else of, **more)
+    data = picture.read_bytes()
+    with serving(out, params, appends=True) as own:
+        added = own.ask("POST", "/images?name=new.jpg", data).json
+        # 1e-6: EXIF has ratios of integers of 32 bits.
+        exif = {"lat": pytest.approx(52.2296, abs=1e-6), "lon": pytest.approx(21.0125, abs=1e-6)}
+        assert added["position"] == (exif if there is None else None)
+        # What the request says stands before it.
+        said = dict(zip(axes, (3.0, 4.0), strict=True))
+        path = "/images?name=said.jpg" + "".join(f"&{key}={value}" for key, value in said.items())
+        assert own.ask("POST", path, data).json["position"] == said
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
+@pytest.mark.parametrize(("width", "height"), [(600, 350), (60, 350), (600, 60), (64, 76)])
+def test_the_map_is_drawn_in_any_window(width, height):
+    page = importlib.resources.files("crisalad_jax.serve").joinpath("page.html").read_text()
+    functions = re.findall(r"^function (?:plane|drawMap)\(.*?^}$", page, re.DOTALL | re.MULTILINE)
+    assert len(functions) == 2
+    program = f"""
+        const state = {{ map: {{ positions: [[0, 1, 2], [1, 90, 40]], axes: ["east", "north"],
+                                 positions_known: 2 }}, answers: [], near: false }};
+        const shown = [];
+        const svg = {{ clientWidth: {width}, clientHeight: {height}, replaceChildren() {{}},
+                       setAttribute(_, value) {{ shown.push(value); }}, append() {{}} }};
+        const at = (id) => id === "svg" ? svg : {{}};
+        const draw = (_, attributes, text) => shown.push(...Object.values(attributes), text);
+        {"".join(functions)}
+        drawMap();
+        console.log(shown.join("|"));
+    """
+    done = subprocess.run(["node", "-e", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "M14 " in done.stdout
+    assert not re.search("NaN|Infinity|undefined m", done.stdout)
 
 
 def test_other_sites_are_refused(service, pictures):

@@ -14,7 +14,7 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import Positions, read_positions, utm_positions
-from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.alone import describe_alone
@@ -61,6 +61,8 @@ class Indexed(NamedTuple):
     """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
     shares_left: int = 0
     """Number of shares that are not there yet; until then these are counts of one share."""
+    joined_elsewhere: bool = False
+    """Whether another process joins the shares, so that these are counts of one share."""
 
 
 def index_images(
@@ -174,7 +176,7 @@ def index(
     out: str | os.PathLike[str],
     *,
     weights: str | os.PathLike[str],
-    fps: float = 1.0,
+    fps: float | None = None,
     image_size: tuple[int, int] | None = None,
     resize: Sequence[str] = (),
     compute_dtype: Literal["float32", "bfloat16"] | None = None,
@@ -199,7 +201,7 @@ def index(
             Or another source of images (docs/how-to/image-sources.md).
         out: the map's folder.
         weights: the file that the parameters are from, which queries load by default.
-        fps: frames a second taken of a video.
+        fps: frames a second taken of a video, which is then expected; None is one.
         image_size: height and width in pixels. None is the map's, and of a new map the model's.
         resize: words that change how images are resized; see `ModelConfig.resized`. None are the
             map's way, and of a new map the model's.
@@ -247,6 +249,7 @@ def index(
         check_no_record_lost(out)  # before any work
         description = None  # a map that a kill left without images binds nobody
     source = open_source(images, fps=fps)
+    check_rate_used(fps, source.paths)
     table = source.positions if positions is None else positions
     known = _positions(table, images, source.names)
     by_exif = table is None and not known.of
@@ -374,7 +377,7 @@ def _index_share(
 
     counts = shared.join(finish, quiet=quiet)
     if counts is None:
-        return found
+        return found._replace(joined_elsewhere=True)
     return found._replace(
         added=sum(each["added"] for each in counts),
         positions=sum(each["positions"] for each in counts),

@@ -57,8 +57,12 @@ class MapHead:
 _Head = TypeVar("_Head", bound=MapHead)
 
 
-def read_value(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
+def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[str, Any] | None:
     """Read map.json as JSON values; None where a new map can be made.
+
+    Args:
+        folder: the map's.
+        or_new: whether an empty folder would do, for the message.
 
     Raises:
         InputError: the folder is a file or holds other things than a map, or the map is damaged or
@@ -74,9 +78,9 @@ def read_value(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
         if other_files(folder / SEGMENTS):
             others.append(SEGMENTS)
         if others:
+            expected = "a map or an empty folder" if or_new else "a map"
             raise InputError(
-                f"{folder}: found {others[0]} and no {DESCRIPTION}, expected a map or an empty "
-                "folder"
+                f"{folder}: found {others[0]} and no {DESCRIPTION}, expected {expected}"
             )
         return None
     # Who edits the description removes its checksum. A changed key would be an unknown field.
@@ -98,7 +102,7 @@ def read_head(folder: str | os.PathLike[str]) -> MapHead | None:
             of a newer version of this package.
     """
     folder = pathlib.Path(folder)
-    value = read_value(folder)
+    value = read_value(folder, or_new=False)
     if value is None:
         return None
     if isinstance(value, dict):

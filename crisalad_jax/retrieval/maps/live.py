@@ -16,6 +16,7 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, asked_similarity, json_rows, json_text
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
+from crisalad_jax.utils.output import counted
 
 if TYPE_CHECKING:  # answers are searched without JAX
     from crisalad_jax.nn.model import Crisalad
@@ -144,6 +145,6 @@ def latency_words(milliseconds: Sequence[float]) -> str:
         return "no answers"
     median, high = np.percentile(milliseconds, (50, 95))
     return (
-        f"{len(milliseconds)} answers, latency median {median:.1f} ms, 95th percentile "
+        f"{counted(len(milliseconds), 'answer')}, latency median {median:.1f} ms, 95th percentile "
         f"{high:.1f} ms"
     )

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Float64
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.retrieval.by_engine import describe_by_engine
 from crisalad_jax.retrieval.described import Described
@@ -91,7 +91,7 @@ def query(
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     k: int = 5,
-    fps: float = 1.0,
+    fps: float | None = None,
     window: int = 1,
     exact: bool = False,
     batch_size: int = 16,
@@ -108,7 +108,7 @@ def query(
         images: an image file, a folder, another source of images
             (docs/how-to/image-sources.md), or a list of these.
         k: number of answers to each query.
-        fps: frames a second taken of a video.
+        fps: frames a second taken of a video, which is then expected; None is one.
         window: frames that are described together: each with those just before it in its source,
             as a moving camera has them. 1 describes each alone, as a map's images are.
         exact: whether to search exactly although the map has an approximate search.
@@ -145,6 +145,7 @@ def query(
     min_similarity = asked_similarity(places, min_similarity)
     sources = _listed(images, fps)
     paths = [path for source in sources for path in source]
+    check_rate_used(fps, paths)
     batch_size = useful_batch_size(batch_size, len(paths))
     descriptions = _described(
         places, params, sources, window=window, batch_size=batch_size, on_bad_image=on_bad_image
@@ -237,7 +238,7 @@ def _described(
     )
 
 
-def _listed(images: Any, fps: float) -> list[list[pathlib.Path]]:
+def _listed(images: Any, fps: float | None) -> list[list[pathlib.Path]]:
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
