@@ -145,6 +145,10 @@ def to_json(point: OperatingPoint) -> dict[str, Any]:
     return point._asdict() | {name: getattr(point, name) for name in names}
 
 
+_MOST = 0.5
+"""Lower bound of a precision that a map remembers: answers are not more often wrong than right."""
+
+
 def needed(precision: float) -> int | None:
     """Return how many accepted queries, all right, a lower bound of `precision` takes.
 
@@ -154,7 +158,7 @@ def needed(precision: float) -> int | None:
 
 
 def check_supported(point: OperatingPoint, source: str) -> None:
-    """Check that there are as many answers as the asked precision takes if all are right.
+    """Check that there are answers enough to show that most are right, or as many as was asked for.
 
     Args:
         point: what was measured.
@@ -163,19 +167,14 @@ def check_supported(point: OperatingPoint, source: str) -> None:
     Raises:
         InputError: there are fewer.
     """
-    enough, asked = needed(point.asked), f"{100 * point.asked:g} %"
-    if enough is not None and point.answered >= enough:
-        return
-    takes = (
-        f"{asked} takes {enough} (95 % confidence)"
-        if enough
-        else f"no number of them shows {asked}"
-    )
-    raise InputError(
-        f"precision: found {counted(point.answered, 'answer')} of similarity "
-        f"{point.min_similarity:.9g} or more on {source}, {point.right} right, but {takes}; "
-        "expected more queries or a lower precision; or the set may be of another place"
-    )
+    least = min(_MOST, point.asked)
+    if point.lower_bound < least:
+        raise InputError(
+            f"precision: found {counted(point.answered, 'answer')} of similarity "
+            f"{point.min_similarity:.9g} or more on {source}, {point.right} right, which shows a "
+            f"precision of at least {100 * point.lower_bound:.1f} % (95 % confidence), expected "
+            f"{100 * least:g} %: more queries are needed, or the set is of another place"
+        )
 
 
 def caveats(point: OperatingPoint) -> list[str]:

@@ -12,6 +12,7 @@ from crisalad_jax.evaluation.metrics import precision_recall
 from crisalad_jax.evaluation.operating_point import (
     OperatingPoint,
     caveats,
+    check_supported,
     needed,
     operating_point,
     to_json,
@@ -89,6 +90,17 @@ def test_how_many_answers_a_precision_takes():
     assert words.endswith(
         "at least 89.9 % (95 % confidence); 90 % takes 29 answers, all of them right"
     )
+
+
+def test_what_most_may_be_wrong_of_is_not_supported():
+    """Four of four show 0.05 ** (1 / 4), five of five 0.05 ** (1 / 5): 47 and 55 %."""
+    four = OperatingPoint(0.99, 0.5, 4, 4, 40, 0, 0)
+    with pytest.raises(
+        InputError, match=r"found 4 answers .* on town, 4 right, .* at least 47\.3 %"
+    ):
+        check_supported(four, "town")
+    check_supported(four._replace(answered=5, right=5), "town")
+    check_supported(four._replace(asked=0.4), "town")
 
 
 @pytest.mark.parametrize("seed", range(5))
