@@ -145,8 +145,8 @@ def to_json(point: OperatingPoint) -> dict[str, Any]:
     return point._asdict() | {name: getattr(point, name) for name in names}
 
 
-_MOST = 0.5
-"""Lower bound of a precision that a map remembers: answers are not more often wrong than right."""
+_FEWEST = 3
+"""Answers that a map's similarity rests on at least."""
 
 
 def needed(precision: float) -> int | None:
@@ -158,22 +158,21 @@ def needed(precision: float) -> int | None:
 
 
 def check_supported(point: OperatingPoint, source: str) -> None:
-    """Check that there are answers enough to show that most are right, or as many as was asked for.
+    """Check that a similarity rests on more than a coincidence; `caveats` tell what it shows.
 
     Args:
         point: what was measured.
         source: the set, for the message.
 
     Raises:
-        InputError: there are fewer.
+        InputError: there are fewer than three answers.
     """
-    least = min(_MOST, point.asked)
-    if point.lower_bound < least:
+    if point.answered < _FEWEST:
         raise InputError(
             f"precision: found {counted(point.answered, 'answer')} of similarity "
             f"{point.min_similarity:.9g} or more on {source}, {point.right} right, which shows a "
             f"precision of at least {100 * point.lower_bound:.1f} % (95 % confidence), expected "
-            f"{100 * least:g} %: more queries are needed, or the set is of another place"
+            f"{_FEWEST} answers at least: more queries are needed, or the set is of another place"
         )
 
 
