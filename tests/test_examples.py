@@ -138,6 +138,7 @@ def test_the_losss_gradient_is_finite_without_pairs() -> None:
     np.testing.assert_array_equal(gradient, 0)
 
 
+@pytest.mark.slow
 def test_the_loop_learns_to_tell_places_apart(capsys) -> None:
     module = example("training_loop")
     losses, trained, _ = module.main()

@@ -681,6 +681,7 @@ def test_a_field_or_a_preset_of_another_name_is_refused() -> None:
         cj.register_loss("odd", tiny={"scal": 2})(made)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_the_source_that_it_began_with_alone(
     tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, monkeypatch
 ) -> None:

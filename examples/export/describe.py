@@ -12,7 +12,10 @@ import onnxruntime
 from PIL import Image, ImageOps
 
 folder, *paths = map(pathlib.Path, sys.argv[1:])
-_, height, width, _ = json.loads((folder / "manifest.json").read_text())["images"]["shape"]
+wanted = json.loads((folder / "manifest.json").read_text())["images"]
+if not wanted["resize"].startswith("Pillow's BILINEAR"):
+    sys.exit(f"{folder}: found images resized {wanted['resize']}, which is not done here")
+_, height, width, _ = wanted["shape"]
 session = onnxruntime.InferenceSession(folder / "describe.onnx")
 for path in paths:
     image = ImageOps.exif_transpose(Image.open(path)).convert("RGB")

@@ -43,6 +43,8 @@ def models() -> dict[str, ModelConfig]:
 
 
 MODELS = models()
+BACKBONES = {*PRESETS, "b14, registers", "DINOv3", "b14, float32"}
+"""What differs before the head; the recipes' heads are tried among the slow tests."""
 
 
 def sizes(model: ModelConfig) -> list[tuple[int, int]]:
@@ -69,7 +71,10 @@ def test_every_recipe_is_here() -> None:
 
 
 @ACCELERATORS
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name",
+    [name if name in BACKBONES else pytest.param(name, marks=pytest.mark.slow) for name in MODELS],
+)
 def test_every_model_traces_for_accelerators(name: str, chosen: Target) -> None:
     """Its description and the gradient of it, which a GPU's attention restricts more."""
     model = MODELS[name]

@@ -195,6 +195,7 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
     assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
 
 
+@pytest.mark.slow
 def test_a_run_interrupted_between_batches_that_share_a_step_goes_on(
     tmp_path, places, params, monkeypatch
 ):
@@ -293,6 +294,7 @@ def test_validations_come_every_so_many_epochs_and_at_the_end(
     assert len(seen) == 2
 
 
+@pytest.mark.slow
 def test_a_validation_has_its_own_size(shared, places, tmp_path, monkeypatch):
     """Recalls of the model at that size, by hand; the weights keep the size of training."""
     town, seen = open_benchmark(shared / "town"), []

@@ -348,6 +348,7 @@ def test_gradients_of_several_batches_equal_torchs(kind: Literal["sgd", "adamw"]
     np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_gradient_that_waits_changes_no_parameter_and_a_step_not_finite_nothing(params) -> None:
     """Two batches of five share a step; the last of the epoch steps alone."""
     optimiser = OptimiserConfig(kind="sgd", learning_rate=1e-2, accumulate=2, weight_decay=0.0)
@@ -723,6 +724,7 @@ def test_another_configuration_or_loss_is_named(params) -> None:
         make_train_step(config, steps=5, loss="triplet")
 
 
+@pytest.mark.slow
 def test_a_setting_of_a_loss_keeps_its_default(params) -> None:
     """A third argument of another name is not given which images are valid."""
     seen = []
