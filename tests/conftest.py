@@ -167,6 +167,14 @@ def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
+@pytest.fixture(scope="module")
+def symbolic_shapes() -> Iterator[None]:
+    """For a module: the check of annotations cannot broadcast symbolic dimensions."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+        yield
+
+
 @pytest.fixture
 def city(tmp_path: pathlib.Path) -> pathlib.Path:
     """A training set that a test may spoil."""

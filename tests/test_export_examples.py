@@ -5,9 +5,7 @@ import pathlib
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 
-import jaxtyping
 import numpy as np
 import PIL.Image
 import pytest
@@ -17,6 +15,8 @@ from crisalad_jax.nn.model import Crisalad, describe, self_mask
 from tests.checkpoints.test_export import TOLERANCE, pictures
 from tests.conftest import MODEL
 
+pytestmark = pytest.mark.usefixtures("symbolic_shapes")
+
 EXAMPLES = pathlib.Path(__file__).parents[1] / "examples" / "export"
 WITHOUT_JAX = (
     "import runpy, sys\n"
@@ -24,14 +24,6 @@ WITHOUT_JAX = (
     "sys.argv = sys.argv[1:]\n"
     "runpy.run_path(sys.argv[0], run_name='__main__')\n"
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _symbolic_shapes() -> Iterator[None]:
-    """The check of annotations while tests run cannot broadcast symbolic dimensions."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def expected(params: Crisalad) -> np.ndarray:

@@ -21,9 +21,7 @@ from crisalad_jax.checkpoints.weights import CACHE_RECORD, save_weights
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import CACHE as CACHE
-from crisalad_jax.utils.files import cache_folder as cache_folder
-from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.files import cache_folder, read_json, write_json
 from crisalad_jax.utils.locks import next_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.version import VERSION

@@ -36,6 +36,7 @@ from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import check_types, choose
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.data.prepare import normalised
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import (
     Crisalad,
@@ -452,11 +453,7 @@ def _difference(
     count = how.batch_size or _PROBES
     images = np.random.default_rng(0).integers(0, 256, (count, *config.input_size, 3), np.uint8)
     if not _takes_bytes(config, how):
-        mean, deviation = (
-            np.array(each, np.float32)
-            for each in (config.preprocessing.mean, config.preprocessing.deviation)
-        )
-        images = (images / np.float32(255) - mean) / deviation
+        images = normalised(images, config.preprocessing)
     suffix = SUFFIXES[how.format][0]
     names = (TOKENS, ATTEND) if how.grouping == "any" else (DESCRIBE,)
     first, *second = (load_program(engine, folder / f"{name}{suffix}") for name in names)

@@ -38,8 +38,6 @@ _READS: Mapping[str, tuple[str, ...]] = {
     "openvino": ("openvino", "onnx"),
 }
 """Formats that an engine reads, its own first."""
-RUNTIMES = ("jax", *_READS)
-"""Names for --runtime."""
 
 
 @dataclasses.dataclass(frozen=True)

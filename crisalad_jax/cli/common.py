@@ -15,13 +15,14 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
 from crisalad_jax.utils.output import printable
 
-RuntimeName = Literal["jax", "onnxruntime", "openvino"]
-
 if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.checkpoints.runtime import Runtime
     from crisalad_jax.data.benchmarks import Benchmark
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Crisalad
+
+RuntimeName = Literal["jax", "onnxruntime", "openvino"]
+"""What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
 
 # Into a file or a pipe, wide enough that tables do not wrap. Brackets and colons in names are text.
 console = rich.console.Console(

@@ -9,8 +9,8 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
+    RuntimeName,
     check_json,
-    check_one_model,
     console,
     load_model,
     open_model,
@@ -107,7 +107,7 @@ class Evaluate:
     precision: float | None = None
     """Also print the similarity to ask for so that this share of the accepted first retrievals is
     right, such as 0.99, and the recall that is left."""
-    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
@@ -155,12 +155,11 @@ def run(arguments: Evaluate) -> None:
         "verify": arguments.verify,
         "quiet": arguments.quiet,
     }
-    if arguments.weights is None or arguments.runtime == "jax":
+    if arguments.weights is None or arguments.runtime == "jax":  # others have weights, no preset
         params, config, model_name = load_model(
             arguments.weights, preset=arguments.preset, seed=arguments.seed, **options
         )
     else:
-        check_one_model(arguments.weights, arguments.preset)
         params, config, model_name = open_model(
             arguments.weights,
             arguments.runtime,

@@ -5,7 +5,7 @@ import pathlib
 from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
+from crisalad_jax.cli.common import RuntimeName, give_json, open_model, prepare_json, say
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
@@ -55,7 +55,7 @@ class Extract:
     all): a cross-image model's descriptors depend on it."""
     batch_size: int = 16
     """Images described together."""
-    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None

@@ -7,7 +7,7 @@ from typing import Literal
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
+from crisalad_jax.cli.common import RuntimeName, give_json, open_model, prepare_json, say
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
@@ -57,7 +57,7 @@ class Index:
     bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
     batch_size: int = 16
     """Images described at once, each as if it were alone."""
-    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None

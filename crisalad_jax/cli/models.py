@@ -7,10 +7,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from crisalad_jax.checkpoints.cache import cache_folder, is_cached
+from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
 from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
 from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
+from crisalad_jax.utils.files import cache_folder
 
 EXAMPLE = "crisalad models salad"
 

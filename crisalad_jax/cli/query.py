@@ -9,7 +9,7 @@ import tyro
 
 from crisalad_jax.cli import live
 from crisalad_jax.cli.answers import answers_table
-from crisalad_jax.cli.common import STDOUT, console, say, talk_beside
+from crisalad_jax.cli.common import STDOUT, RuntimeName, console, say, talk_beside
 from crisalad_jax.retrieval.maps.calibration import Calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
@@ -65,7 +65,7 @@ class Query:
     """Frames described together, each with those just before it: a moving camera's."""
     weights: pathlib.Path | None = None
     """The model that made the map, as a file or a published name; by default where it was then."""
-    runtime: Literal["jax", "onnxruntime", "openvino"] = "jax"
+    runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""
     k: int = 5

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float32
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.resize import Pixels, check_pixels, resize_image
@@ -62,7 +63,15 @@ class Preparation:
             )
         if last != first:
             image = resize_image(image, last, pixels=how.pixels)
-        if how.pixels == "bytes":
-            return image
-        mean, deviation = (np.array(each, np.float32) for each in (how.mean, how.deviation))
-        return (image / np.float32(255) - mean) / deviation
+        return image if how.pixels == "bytes" else normalised(image, how)
+
+
+def normalised(pixels: Pixels, how: PreprocessingConfig) -> Float32[np.ndarray, "..."]:
+    """Normalise pixels from 0 to 255 by the mean and deviation of each colour.
+
+    Args:
+        pixels: RGB (..., 3), 8-bit or floats.
+        how: has the mean and the deviation, of pixels from 0 to 1.
+    """
+    mean, deviation = (np.array(each, np.float32) for each in (how.mean, how.deviation))
+    return (pixels / np.float32(255) - mean) / deviation

@@ -9,20 +9,17 @@ before. The script is what a user would write to be quick: numpy, OpenCV and ONN
 exported model and the map's descriptors in a file of numpy's.
 """
 
-import os
 import pathlib
 import resource
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 
 import cv2
 import jax
 import numpy as np
 from tables import Study, Table, bars, count, flags, leave, read
-from timing import Timed, measured, ratio, times
+from timing import Timed, measured, ratio, run_program, times
 
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.weights import save_weights
@@ -54,18 +51,11 @@ def write_photographs(folder: pathlib.Path) -> None:
         cv2.imwrite(str(folder / f"{number:03d}.jpg"), large)
 
 
-def run(command: list[str], cache: pathlib.Path) -> tuple[float, float]:
+def spent(command: list[str], cache: pathlib.Path) -> tuple[float, float]:
     """Run a program; return its seconds by the clock and of the processor."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    started = time.perf_counter()
-    subprocess.run(
-        command,
-        env=environment | {"XDG_CACHE_HOME": str(cache)},
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
-    seconds, after = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds, _ = run_program(command, {"XDG_CACHE_HOME": str(cache)})
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
@@ -82,17 +72,17 @@ def programs(
     crisalad, cache = [sys.executable, "-m", "crisalad_jax"], folder / "cache"
     model = ["--weights", str(weights)]
     shown = ["--images", str(photographs), "--out", str(places), "--quiet"]
-    run([*crisalad, "index", *model, *shown], cache)
+    spent([*crisalad, "index", *model, *shown], cache)
     rows = folder / "rows.npy"
     np.save(rows, np.load(next((places / "segments").glob("*.npy"))))
     image = str(photographs / "007.jpg")
 
     def asking(runtime: str) -> Callable[[], tuple[float, float]]:
         asked = [image, "--map", str(places), *model, "--runtime", runtime, "--quiet"]
-        return lambda: run([*crisalad, "query", *asked], cache)
+        return lambda: spent([*crisalad, "query", *asked], cache)
 
     by_hand = [sys.executable, "-c", SCRIPT, str(folder / "export/describe.onnx"), str(rows), image]
-    calls = {BY_HAND: lambda: run(by_hand, cache)}
+    calls = {BY_HAND: lambda: spent(by_hand, cache)}
     calls |= {f"crisalad query, {runtime}": asking(runtime) for runtime in runtimes}
     for call in calls.values():
         call()
@@ -113,14 +103,14 @@ def main() -> None:
             clock, processor = ({name: Timed([]) for name in calls} for _ in range(2))
             for _ in range(arguments.rounds):
                 for name, call in calls.items():
-                    seconds, spent = call()
+                    seconds, busy = call()
                     clock[name].rounds.append(1e3 * seconds)
-                    processor[name].rounds.append(1e3 * spent)
+                    processor[name].rounds.append(1e3 * busy)
         for name, one in clock.items():
             slower = ratio(one, clock[BY_HAND])
             more = ratio(processor[name], processor[BY_HAND])
-            spent = {"ms": one.rounds, "processor_ms": processor[name].rounds}
-            values.append({"model": preset, "contender": name, **spent, "slower": slower})
+            both = {"ms": one.rounds, "processor_ms": processor[name].rounds}
+            values.append({"model": preset, "contender": name, **both, "slower": slower})
             rows.append((preset, name, times(slower), times(more)))
     header = ("model", "program", "time over the script's", "processor's time over the script's")
     caption = (

@@ -11,12 +11,9 @@ sizes from this package, whose import, of jax too, does not count for torch.
 """
 
 import itertools
-import os
 import pathlib
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 
 import cv2
@@ -24,7 +21,7 @@ import jax
 import numpy as np
 import torch
 from tables import Study, Table, bars, count, flags, leave, read
-from timing import Timed, measured, ratio, times
+from timing import Timed, measured, ratio, run_program, times
 
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.nn.config import PRESETS
@@ -68,11 +65,8 @@ def programs(folder: pathlib.Path, preset: str) -> dict[str, Callable[[], float]
     numbers = itertools.count()
 
     def run(command: list[str], cache: pathlib.Path) -> tuple[float, str]:
-        environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
-        environment |= {"XDG_CACHE_HOME": str(cache), "TORCHINDUCTOR_CACHE_DIR": str(cache)}
-        started = time.perf_counter()
-        done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE)
-        return time.perf_counter() - started, done.stdout.decode()
+        own = str(cache)
+        return run_program(command, {"XDG_CACHE_HOME": own, "TORCHINDUCTOR_CACHE_DIR": own})
 
     def extract(warm: bool) -> float:
         number = next(numbers)

@@ -12,6 +12,7 @@ import itertools
 import os
 import pathlib
 import statistics
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -63,6 +64,16 @@ def race(contenders: Mapping[str, Callable[[], Any]], rounds: int, calls: int) -
                 times.append(1e3 * (time.perf_counter() - started))
             timed[name].rounds.append(statistics.median(times))
     return timed
+
+
+def run_program(command: list[str], caches: Mapping[str, str]) -> tuple[float, str]:
+    """Run a program as a user would, but with caches of its own; its seconds and what it prints."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    started = time.perf_counter()
+    done = subprocess.run(
+        command, env=environment | dict(caches), check=True, stdout=subprocess.PIPE
+    )
+    return time.perf_counter() - started, done.stdout.decode()
 
 
 def ratio(slow: Timed, fast: Timed) -> tuple[float, float, float]:

@@ -23,7 +23,7 @@ import torch
 import crisalad_jax as cj
 import crisalad_jax.utils.download
 from crisalad_jax.checkpoints import cache
-from crisalad_jax.checkpoints.cache import cache_folder, cached_weights, is_cached
+from crisalad_jax.checkpoints.cache import cached_weights, is_cached
 from crisalad_jax.checkpoints.layouts import public_shapes
 from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY
 from crisalad_jax.checkpoints.load import find_weights
@@ -38,7 +38,7 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.download import Patience
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import user_cache
+from crisalad_jax.utils.files import CACHE, cache_folder, user_cache
 from crisalad_jax.utils.notes import Note
 from tests.conftest import assert_equal
 from tests.file_server import FileServer, file_server
@@ -81,7 +81,7 @@ def model(server: FileServer, tmp_path: pathlib.Path, monkeypatch: pytest.Monkey
     """A published model on the server; the working directory is an empty folder."""
     for name in (cache.OFFLINE, cache.MIRROR, "http_proxy", "HTTP_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv(cache.CACHE, str(tmp_path / "cache"))
+    monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     # The stalls and pauses of the default would last for minutes.

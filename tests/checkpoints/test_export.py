@@ -7,13 +7,11 @@ import json
 import pathlib
 import subprocess
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -44,6 +42,8 @@ from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import GPU, PORTABLE, lowering_for, target
 from tests.conftest import BATCH, MODEL, write_picture
+
+pytestmark = pytest.mark.usefixtures("symbolic_shapes")
 
 SCRIPT = pathlib.Path(__file__).parents[2] / "scripts" / "run_exported.py"
 # The same operations, which another order of the compiler's rounds otherwise: numbers of a unit
@@ -77,14 +77,6 @@ def run_script(*arguments: object, cwd: pathlib.Path) -> subprocess.CompletedPro
         capture_output=True,
         text=True,
     )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _symbolic_shapes() -> Iterator[None]:
-    """The check of annotations while tests run cannot broadcast symbolic dimensions."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="module")

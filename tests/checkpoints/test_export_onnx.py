@@ -6,12 +6,11 @@ import hashlib
 import json
 import pathlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import onnx
 import onnxruntime
@@ -35,6 +34,8 @@ from crisalad_jax.utils.errors import InputError
 from tests.checkpoints.test_export import TOLERANCE, pictures
 from tests.conftest import BATCH, MODEL
 
+pytestmark = pytest.mark.usefixtures("symbolic_shapes")
+
 ALONE = CrossImageConfig(layers=0)
 # Operators that TensorRT's parser has had since version 8.4, of those that programs here may use:
 # github.com/onnx/onnx-tensorrt, docs/operators.md.
@@ -44,14 +45,6 @@ GreaterOrEqual Identity Less LessOrEqual Log MatMul Max MaxPool Min Mul Neg Not 
 ReduceMax ReduceMin ReduceProd ReduceSum Reshape Shape Sigmoid Sign Sin Slice Sqrt Squeeze Sub Tanh
 Transpose Where Xor
 """
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _symbolic_shapes() -> Iterator[None]:
-    """The check of annotations while tests run cannot broadcast symbolic dimensions."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="module")

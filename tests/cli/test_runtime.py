@@ -4,10 +4,8 @@ import json
 import pathlib
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import jax
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -17,6 +15,8 @@ from crisalad_jax.cli import main
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from tests.cli.test_cli import Capture, fails
 from tests.conftest import MODEL
+
+pytestmark = pytest.mark.usefixtures("symbolic_shapes")
 
 ENGINES = ("onnxruntime", "openvino")
 # As of exports: the same operations, rounded in another order.
@@ -33,14 +33,6 @@ def succeeds(capfd: Capture, *arguments: object) -> str:
     printed = capfd.readouterr()
     assert code == 0, printed.err
     return " ".join(printed.out.split())
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _symbolic_shapes() -> Iterator[None]:
-    """The check of annotations while tests run cannot broadcast symbolic dimensions."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
