@@ -170,9 +170,7 @@ def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -
             year, month = int(spot.rng.integers(2012, 2022)), MONTHS[view.season]
             northdeg, key = spot.northdeg(view), panoid(spot.rng)
             lines.append(f"{place_id},{year},{month},{northdeg},{name},{lat},{lon},{key}")
-            stem = (
-                f"{name}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{key}"
-            )
+            stem = f"{name}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{key}"
             write_jpeg(images / f"{stem}.jpg", render(spot.seed, view, config.image_size))
             yield
     table = folder / "Dataframes" / f"{name}.csv"
@@ -216,11 +214,13 @@ def _write_test(folder: pathlib.Path, config: SyntheticCityConfig) -> Iterator[N
 
 
 def write_jpeg(path: pathlib.Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write a picture as a JPEG of quality 92."""
     _, data = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 92))
     path.write_bytes(data.tobytes())
 
 
 def panoid(rng: np.random.Generator) -> str:
+    """Draw the name of a panorama."""
     return rng.bytes(8).hex()
 
 

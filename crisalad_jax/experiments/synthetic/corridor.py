@@ -139,7 +139,9 @@ def _floor(mesh: Mesh, rng: np.random.Generator, left: float, right: float, leng
         odd = (np.indices(x.shape).sum(0) % 2).astype(bool)
         x, z = x[odd], z[odd]
         mesh.add(
-            flat(x, z, np.minimum(x + size, right), z + size), scaled(colour, rng.uniform(0.5, 0.9)), UP
+            flat(x, z, np.minimum(x + size, right), z + size),
+            scaled(colour, rng.uniform(0.5, 0.9)),
+            UP,
         )
     count = int(rng.integers(0, 14))
     x, z = rng.uniform(left, right - 0.3, count), rng.uniform(0, length, count)
@@ -152,7 +154,9 @@ def _ceiling(
     mesh: Mesh, rng: np.random.Generator, left: float, right: float, height: float, length: float
 ) -> None:
     """Add the ceiling: plain, of panels, with beams, pipes or a skylight; and its lamps."""
-    colour = pick(rng, ((0.86, 0.85, 0.82), (0.72, 0.72, 0.70), (0.60, 0.56, 0.50), (0.3, 0.3, 0.3)))
+    colour = pick(
+        rng, ((0.86, 0.85, 0.82), (0.72, 0.72, 0.70), (0.60, 0.56, 0.50), (0.3, 0.3, 0.3))
+    )
     mesh.layer = GROUND_LAYER
     mesh.add(_level(left, _START, right, length, height), colour, _DOWN)
     mesh.layer = GROUND_LAYER - 1
@@ -214,7 +218,9 @@ def _end(
     if kind == "door":
         door = pick(rng, _WOOD)
         top = min(2.1, height - 0.1)
-        mesh.add(rectangles(low - 0.08, 0, high + 0.08, top + 0.08, length), scaled(door, 0.7), TO_CAMERA)
+        mesh.add(
+            rectangles(low - 0.08, 0, high + 0.08, top + 0.08, length), scaled(door, 0.7), TO_CAMERA
+        )
         mesh.add(rectangles(low, 0, high, top, length), door, TO_CAMERA)
         if rng.random() < 0.5:
             pane = rectangles(low + 0.15, 1.1, high - 0.15, top - 0.15, length)
@@ -260,7 +266,18 @@ def _along_wall(
     doors, trim = pick(rng, _WOOD), scaled(pick(rng, _WOOD), 0.9)
     # What recurs in this corridor; the distances, and what comes between, make the place.
     kinds = np.array(
-        ("door", "recess", "window", "board", "pillar", "cupboard", "bench", "box", "opening", "pipe")
+        (
+            "door",
+            "recess",
+            "window",
+            "board",
+            "pillar",
+            "cupboard",
+            "bench",
+            "box",
+            "opening",
+            "pipe",
+        )
     )
     weights = rng.dirichlet(np.full(len(kinds), 0.7))
     z = _START + rng.uniform(0.0, 2.0)
@@ -288,7 +305,9 @@ def _along_wall(
             wide *= 1.8
             side.add(rectangles(z, 0, z + wide, top * 1.05), (0.12, 0.12, 0.13))
             inner = rng.uniform(0.2, 0.9)
-            side.add(rectangles(z + wide * 0.5, 0, z + wide, top * 1.05), scaled((0.8, 0.8, 0.76), inner))
+            side.add(
+                rectangles(z + wide * 0.5, 0, z + wide, top * 1.05), scaled((0.8, 0.8, 0.76), inner)
+            )
         elif kind == "window":
             wide *= rng.uniform(1.0, 2.0)
             sill, high = rng.uniform(0.5, 1.2), height - rng.uniform(0.2, 0.7)
@@ -310,11 +329,15 @@ def _along_wall(
             mesh.layer = z
             colour = pick(rng, _WOOD + WALLS)
             if kind == "pillar":
-                side.boxes((z, 0.0, z + rng.uniform(0.3, 0.7), height), rng.uniform(0.1, 0.5), colour)
+                side.boxes(
+                    (z, 0.0, z + rng.uniform(0.3, 0.7), height), rng.uniform(0.1, 0.5), colour
+                )
             elif kind == "cupboard":
                 tall = rng.uniform(0.9, min(2.2, height - 0.1))
                 side.boxes((z, 0.0, z + wide, tall), rng.uniform(0.3, 0.5), colour)
-                front = rectangles(z + wide / 2 - 0.02, 0.05, z + wide / 2 + 0.02, tall - 0.05, 0.45)
+                front = rectangles(
+                    z + wide / 2 - 0.02, 0.05, z + wide / 2 + 0.02, tall - 0.05, 0.45
+                )
                 side.add(front, scaled(colour, 0.6))
             elif kind == "bench":
                 side.boxes((z, 0.35, z + wide * 1.4, 0.5), 0.45, colour)
@@ -355,7 +378,12 @@ def _hanging(
         mesh.layer = float(z)
         colour = pick(rng, _WOOD + SIGNS)
         if rng.random() < 0.4:
-            mesh.add(discs(x, 0.8, rng.uniform(0.2, 0.4), float(z)), (0.18, 0.34, 0.16), TO_CAMERA, Kind.NEEDLE)
+            mesh.add(
+                discs(x, 0.8, rng.uniform(0.2, 0.4), float(z)),
+                (0.18, 0.34, 0.16),
+                TO_CAMERA,
+                Kind.NEEDLE,
+            )
         else:
             half, tall = rng.uniform(0.1, 0.35), rng.uniform(0.3, 1.1)
             block(mesh, (x - half, 0, z), (x + half, tall, z + 2 * half), colour)

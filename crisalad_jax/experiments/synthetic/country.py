@@ -1,4 +1,4 @@
-"""One place in the country: a road, a railway, a path or a track through fields, woods and hills."""
+"""One place in the country: a road, railway or path through fields, woods and hills."""
 
 import numpy as np
 
@@ -106,7 +106,9 @@ def _ground(mesh: Mesh, rng: np.random.Generator, way: _Way, kind: str) -> float
             far = near + rng.uniform(20, 150)
             x0, x1 = sorted((side * near, side * far))
             slant = rng.normal(0, 0.2) * deep
-            field = polygons((x0, 0.0, z), (x1, 0.0, z), (x1 + slant, 0.0, z + deep), (x0, 0.0, z + deep))
+            field = polygons(
+                (x0, 0.0, z), (x1, 0.0, z), (x1 + slant, 0.0, z + deep), (x0, 0.0, z + deep)
+            )
             mesh.add(field, pick(rng, _FIELDS, 0.2), UP, Kind.SOIL)
             z += deep
     count = 60
@@ -140,7 +142,12 @@ def _ground(mesh: Mesh, rng: np.random.Generator, way: _Way, kind: str) -> float
         if rng.random() < 0.7:
             z = np.arange(rng.uniform(0, 6), 90, rng.uniform(4, 9))
             x0, x1 = way.at(z), way.at(z + 2.5)
-            dash = polygons((x0 - 0.07, 0.0, z), (x0 + 0.07, 0.0, z), (x1 + 0.07, 0.0, z + 2.5), (x1 - 0.07, 0.0, z + 2.5))
+            dash = polygons(
+                (x0 - 0.07, 0.0, z),
+                (x0 + 0.07, 0.0, z),
+                (x1 + 0.07, 0.0, z + 2.5),
+                (x1 - 0.07, 0.0, z + 2.5),
+            )
             mesh.add(dash, white, UP, Kind.ROAD)
         return half
     tracks = (0.0,) if rng.random() < 0.6 else (-2.2, 2.2)
@@ -177,9 +184,7 @@ def _masts(mesh: Mesh, rng: np.random.Generator, way: _Way, half: float) -> None
         mesh.add(wire, (0.15, 0.15, 0.16), TO_CAMERA)
 
 
-def _border(
-    mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: float
-) -> None:
+def _border(mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: float) -> None:
     """Add a hedge, a wall, a fence, a crash barrier or a cutting along one side of the way."""
     kind = rng.choice(
         ("none", "hedge", "wall", "fence", "barrier", "bank"), p=(0.3, 0.16, 0.1, 0.2, 0.08, 0.16)
@@ -198,26 +203,47 @@ def _border(
         x0, x1 = (float(way.at(each)) + side * off for each in (z, z + step))
         if kind in ("hedge", "wall"):
             height = low * (rng.uniform(0.7, 1.5) if kind == "hedge" else 1.0)
-            face = polygons((x0, 0.0, z), (x1, 0.0, z + step), (x1, height, z + step), (x0, height, z))
+            face = polygons(
+                (x0, 0.0, z), (x1, 0.0, z + step), (x1, height, z + step), (x0, height, z)
+            )
             colour = (hue, rng.uniform(0.5, 1.0), 0.0) if kind == "hedge" else stone
             mesh.add(face, colour, (-side, 0.0, 0.0), Kind.BUSH if kind == "hedge" else Kind.SOLID)
             back = side * 0.6
-            top = polygons((x0, height, z), (x1, height, z + step), (x1 + back, height, z + step), (x0 + back, height, z))
+            top = polygons(
+                (x0, height, z),
+                (x1, height, z + step),
+                (x1 + back, height, z + step),
+                (x0 + back, height, z),
+            )
             mesh.add(top, colour, UP, Kind.BUSH if kind == "hedge" else Kind.LEDGE)
         elif kind == "bank":
             height = max(0.5, min(9.0, height + rng.normal(0, 0.6)))
             wide = side * height * slope
-            face = polygons((x0, 0.0, z), (x1, 0.0, z + step), (x1 + wide, height, z + step), (x0 + wide, height, z))
+            face = polygons(
+                (x0, 0.0, z),
+                (x1, 0.0, z + step),
+                (x1 + wide, height, z + step),
+                (x0 + wide, height, z),
+            )
             rock = rng.random() < 0.4
             mesh.add(
-                face, scaled(stone, rng.uniform(0.8, 1.2)) if rock else (0.4, 0.45, 0.3),
-                (-side * 0.6, 0.8, 0.0), Kind.SOLID if rock else Kind.GRASS,
+                face,
+                scaled(stone, rng.uniform(0.8, 1.2)) if rock else (0.4, 0.45, 0.3),
+                (-side * 0.6, 0.8, 0.0),
+                Kind.SOLID if rock else Kind.GRASS,
             )
         else:
             rails = np.array((0.45, 0.9)) if kind == "fence" else np.array((0.5,))
             wide = 0.08 if kind == "fence" else 0.3
-            face = polygons((x0, rails, z), (x1, rails, z + step), (x1, rails + wide, z + step), (x0, rails + wide, z))
-            mesh.add(face, (0.5, 0.45, 0.38) if kind == "fence" else (0.6, 0.62, 0.64), (-side, 0.0, 0.0))
+            face = polygons(
+                (x0, rails, z),
+                (x1, rails, z + step),
+                (x1, rails + wide, z + step),
+                (x0, rails + wide, z),
+            )
+            mesh.add(
+                face, (0.5, 0.45, 0.38) if kind == "fence" else (0.6, 0.62, 0.64), (-side, 0.0, 0.0)
+            )
             mesh.add(rectangles(x0 - 0.06, 0, x0 + 0.06, 1.0, z), (0.42, 0.38, 0.33), TO_CAMERA)
 
 
@@ -230,7 +256,11 @@ def _woods(mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: f
         near = float(way.at(z)) * side + half + rng.uniform(3, 25)
         n = int(np.clip(wide, 12, 40))
         x = side * (near + np.linspace(0, wide, n))
-        tall = rng.uniform(5, 15) * (1 + 0.25 * rng.standard_normal(n)) * np.minimum(1, np.linspace(0.3, 6, n))
+        tall = (
+            rng.uniform(5, 15)
+            * (1 + 0.25 * rng.standard_normal(n))
+            * np.minimum(1, np.linspace(0.3, 6, n))
+        )
         tall = np.clip(tall, 1.0, None)
         spikes = rng.random() < 0.4
         mesh.layer = float(z)
@@ -239,14 +269,20 @@ def _woods(mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: f
             top = tall * part
             if spikes:
                 top[1::2] *= 0.7
-            band = polygons((x[:-1], 0.0, z), (x[1:], 0.0, z), (x[1:], top[1:], z), (x[:-1], top[:-1], z))
+            band = polygons(
+                (x[:-1], 0.0, z), (x[1:], 0.0, z), (x[1:], top[1:], z), (x[:-1], top[:-1], z)
+            )
             if spikes:
                 mesh.add(band, scaled((0.14, 0.26, 0.17), shade), (0.0, 0.5, -0.85), Kind.NEEDLE)
             else:
                 mesh.add(band, (hue, shade * 0.9, 0.0), (0.0, 0.5, -0.85), Kind.BUSH)
     row = rng.random() < 0.3
     count = int(rng.integers(0, 7))
-    depths = np.arange(count) * rng.uniform(5, 10) + rng.uniform(5, 9) if row else rng.uniform(6, 70, count)
+    depths = (
+        np.arange(count) * rng.uniform(5, 10) + rng.uniform(5, 9)
+        if row
+        else rng.uniform(6, 70, count)
+    )
     for z in sorted(depths, reverse=True):
         off = half + (2.5 if row else rng.uniform(1.5, 18.0))
         tree(mesh, rng, float(way.at(z)) + side * off, float(z))

@@ -181,5 +181,3 @@ def _park(mesh: Mesh, rng: np.random.Generator, x: float, length: float) -> None
         front = street_front(mesh, x, float(z))
         front.add(rectangles(0, 0, 3, height), colour)
         front.add(rectangles(0, height, 3, height + 0.12), colour, Kind.LEDGE)
-
-

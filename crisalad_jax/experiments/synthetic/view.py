@@ -9,7 +9,7 @@ Season = Literal["spring", "summer", "autumn", "winter"]
 Time = Literal["noon", "dusk", "night"]
 Weather = Literal["clear", "overcast", "haze", "rain"]
 Scenery = Literal["street", "corridor", "country"]
-"""What a place is: a street of a city, a corridor or hall, a road or railway through the country."""
+"""What a place is: a city's street, a corridor or hall, a road or railway through the country."""
 
 SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
 TIMES: tuple[Time, ...] = ("noon", "dusk", "night")

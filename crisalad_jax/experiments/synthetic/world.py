@@ -64,6 +64,10 @@ class WorldConfig:
             value = getattr(self, name)
             if value < 1:
                 raise InputError(f"WorldConfig.{name}: found {value}, expected at least 1")
+        if not self.repaint >= 0:
+            raise InputError(f"WorldConfig.repaint: found {self.repaint}, expected at least 0")
+        if not self.sceneries:
+            raise InputError("WorldConfig.sceneries: found (), expected at least one scenery")
         check_seed("WorldConfig.seed", self.seed)
         check_size("WorldConfig.image_size", self.image_size)
 
@@ -94,23 +98,31 @@ def write_world(
         return
     total = (config.scenes + config.test_scenes) * config.stations
     temporary = temporary_beside(root)
-    with made_folder(root.parent), in_use(temporary), told_of(root):
-        temporary.mkdir()
-        for number, _ in enumerate(_write(temporary, config), start=1):
+    with made_folder(root.parent), in_use(temporary):
+        for number, _ in enumerate(_write(temporary, root, config, identity), start=1):
             if progress is not None:
                 progress(number, total)
+
+
+def _write(
+    temporary: pathlib.Path, root: pathlib.Path, config: WorldConfig, identity: dict
+) -> Iterator[None]:
+    """Write the world into `temporary`, then rename that to `root`; yield after every place.
+
+    Raises:
+        InputError: the world cannot be written there.
+    """
+    with told_of(root):
+        temporary.mkdir()
+        for city in range(-(-config.scenes // SCENES_PER_CITY)):
+            scenery = config.sceneries[city % len(config.sceneries)]
+            first = city * SCENES_PER_CITY
+            scenes = range(first, min(first + SCENES_PER_CITY, config.scenes))
+            name = f"{scenery}{city:04d}"
+            yield from _write_city(temporary / "train", config, name, scenery, scenes)
+        yield from _write_test(temporary / "test" / "images" / "test", config)
         write_json(temporary / "world.json", identity)
         os.replace(temporary, root)
-
-
-def _write(root: pathlib.Path, config: WorldConfig) -> Iterator[None]:
-    cities = -(-config.scenes // SCENES_PER_CITY)
-    for city in range(cities):
-        scenery = config.sceneries[city % len(config.sceneries)]
-        first = city * SCENES_PER_CITY
-        scenes = range(first, min(first + SCENES_PER_CITY, config.scenes))
-        yield from _write_city(root / "train", config, f"{scenery}{city:04d}", scenery, scenes)
-    yield from _write_test(root / "test" / "images" / "test", config)
 
 
 def _write_city(
