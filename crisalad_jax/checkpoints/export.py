@@ -7,6 +7,7 @@ weights lie beside them unless the program holds them. StableHLO is of `jax.expo
 
 import contextlib
 import dataclasses
+import hashlib
 import os
 import pathlib
 import shutil
@@ -272,11 +273,16 @@ def write_export(
             manifest = _write_stablehlo(folder, params, config, how)
         else:
             manifest = _write_onnx(folder, params, config, how, os.fspath(out), calibration)
+        digest = model_hash(params, config)
+        if calibration is not None:  # its descriptors are its own
+            manifest |= {"quantised_from": digest}
+            parts = (digest, *(manifest[name]["sha256"] for name in ("program", "weights")))
+            digest = hashlib.sha256("".join(parts).encode()).hexdigest()
         manifest |= {
             "grouping": how.grouping,
             "grouping_means": GROUPINGS[how.grouping],
             "jax_version": jax.__version__,
-            "model_sha256": model_hash(params, config),
+            "model_sha256": digest,
             "model": to_plain(config),
         }
         write_json(folder / MANIFEST, manifest)

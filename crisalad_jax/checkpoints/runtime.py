@@ -51,7 +51,9 @@ class Runtime:
     """The exported folder."""
     engine: EngineName
     digest: str
-    """The `model_hash` of the weights that were exported."""
+    """The `model_hash` of the weights that were exported; of an int8 program one of its own."""
+    quantised_from: str | None
+    """The `model_hash` of the weights that an int8 program was made of."""
     grouping: str
     """What the programs are for; see `export.GROUPINGS`."""
     dim: int
@@ -180,6 +182,7 @@ def open_runtime(
         folder=path,
         engine=engine,
         digest=manifest["model_sha256"],
+        quantised_from=manifest.get("quantised_from"),
         grouping=manifest["grouping"],
         dim=manifest["descriptors"]["shape"][1],
         input_size=(height, width),
@@ -284,7 +287,7 @@ def _exported(
     any_grouping: bool,
 ) -> pathlib.Path:
     """Return the exported folder of a file of weights in the cache; export it the first time."""
-    known = _known(weights)
+    known = read_header(weights)
     plain = {} if known is None else known["config"]
     settings = {
         "image_size": list(image_size or plain.get("image_size", ())),
@@ -307,10 +310,17 @@ def _cached(digest: str, settings: Mapping[str, Any]) -> pathlib.Path:
     return cache_folder() / "exports" / hashlib.sha256(key.encode()).hexdigest()[:32]
 
 
-def _known(weights: pathlib.Path) -> dict[str, Any] | None:
-    """Read the digest and configuration in the metadata of a weight file; None where it has none.
+def read_header(weights: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Read what a file of weights says of its model, without its arrays.
 
     Its bytes are not compared with its checksum: the export is, and it was made of bytes that were.
+
+    Args:
+        weights: the file.
+
+    Returns:
+        The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values; None where
+        the file has none: it is of an older version, or is no such file.
     """
     import safetensors
 

@@ -158,7 +158,7 @@ def open_model(
     if runtime == "jax":
         options |= {"compute_dtype": compute_dtype, "verify": verify, "quiet": quiet}
         return load_model(weights, **options)
-    from crisalad_jax.checkpoints.runtime import open_runtime
+    from crisalad_jax.checkpoints.runtime import open_runtime, read_header
     from crisalad_jax.config.io import from_plain
     from crisalad_jax.nn.config import ModelConfig
 
@@ -167,12 +167,19 @@ def open_model(
         config = from_plain(ModelConfig, model.model, source=str(weights))
         config = dataclasses.replace(config, compute_dtype=compute_dtype or "float32")
         return model, config.resized(image_size, resize), str(weights)
-    _, config, name = load_model(weights, **options, verify=verify, quiet=quiet)
+    file = find_weights(weights, quiet=quiet)
+    header = read_header(file)
+    if header is None:
+        _, config, name = load_model(file, **options, verify=verify)
+    else:
+        name = _name(file)
+        config = from_plain(ModelConfig, header["config"], source=f"{file} (metadata)")
+        config = config.resized(image_size, resize)
     config = dataclasses.replace(config, compute_dtype=compute_dtype or config.compute_dtype)
     if config.compute_dtype == "float64":
         raise InputError(f"--runtime: found {runtime} with a model of float64, expected jax")
     model = open_runtime(
-        find_weights(weights, quiet=True),
+        file,
         runtime,
         image_size=config.image_size,
         preprocessing=config.preprocessing,
@@ -229,7 +236,12 @@ def load_model(
 
         weights = find_weights(weights, quiet=quiet)
         params, config = load_weights(weights, verify=verify)
-        name = f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
+        name = _name(weights)
     if compute_dtype is not None:
         config = dataclasses.replace(config, compute_dtype=compute_dtype)
     return params, config.resized(image_size, resize), name
+
+
+def _name(weights: pathlib.Path) -> str:
+    """Return what a file of weights is called in tables and titles."""
+    return f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name

@@ -14,9 +14,11 @@ from crisalad_jax.transport.problem import (
     ScalingProblem,
     zero_potentials,
 )
+from crisalad_jax.utils.target import target
 
 UNROLLED = 8
-"""Largest number of iterations that are unrolled for the compiler; more are a scan."""
+"""Largest number of iterations that are unrolled for an accelerator's compiler; more are a scan, as
+all are on a CPU, which is as fast and compiles less."""
 
 
 class _Progress(NamedTuple):
@@ -91,7 +93,11 @@ def iterate(
             return active.any() & (not isinstance(problem, ScalingProblem) or problem.in_range)
 
         progress = jax.lax.while_loop(unfinished, advance, progress)
-    elif isinstance(problem, ScalingProblem) and config.iterations <= UNROLLED:
+    elif (
+        isinstance(problem, ScalingProblem)
+        and config.iterations <= UNROLLED
+        and target().platform != "cpu"
+    ):
         for _ in range(config.iterations):
             progress = advance(progress)
     else:

@@ -18,6 +18,7 @@ from collections.abc import Callable
 import cv2
 import jax
 import numpy as np
+from engines import packages
 from tables import Study, Table, bars, count, flags, leave, read
 from timing import Timed, measured, ratio, run_program, times
 
@@ -115,7 +116,7 @@ def main() -> None:
     header = ("model", "program", "time over the script's", "processor's time over the script's")
     caption = (
         "From the start of a program to the answers to one photograph, what is kept being there: "
-        f"{measured(arguments.rounds)}."
+        f"{measured(arguments.rounds, *packages())}."
     )
     figure = bars(values, lambda value: str(value["model"]), "slower", "time over the script's")
     leave("bench_query", Study(Table(header, rows, caption, 2), values, figure), arguments)

@@ -65,8 +65,9 @@ def programs(folder: pathlib.Path, preset: str) -> dict[str, Callable[[], float]
     numbers = itertools.count()
 
     def run(command: list[str], cache: pathlib.Path) -> tuple[float, str]:
-        own = str(cache)
-        return run_program(command, {"XDG_CACHE_HOME": own, "TORCHINDUCTOR_CACHE_DIR": own})
+        own, here = str(cache), str(pathlib.Path(__file__).parent)
+        own_caches = {"XDG_CACHE_HOME": own, "TORCHINDUCTOR_CACHE_DIR": own}
+        return run_program(command, own_caches | {"PYTHONPATH": here})
 
     def extract(warm: bool) -> float:
         number = next(numbers)

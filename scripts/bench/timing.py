@@ -117,9 +117,9 @@ def wait() -> None:
         torch.cuda.synchronize()
 
 
-def measured(rounds: int) -> str:
+def measured(rounds: int, *packages: str) -> str:
     """On what, and how: for the caption of a table of `ratio`s."""
-    return f"{machine()}; medians and ranges of {rounds} rounds"
+    return f"{machine(*packages)}; medians and ranges of {rounds} rounds"
 
 
 def machine(*packages: str) -> str:

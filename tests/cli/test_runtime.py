@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
-from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.cli import main
+from crisalad_jax.data.images import read_image
 from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.retrieval.photographs import prepare_image
 from tests.cli.test_cli import Capture, fails
 from tests.conftest import MODEL
 
@@ -194,3 +196,30 @@ def test_a_program_of_other_weights_is_not_a_maps(
     succeeds(capfd, *index, "--weights", other)
     query = ("query", images, "--map", tmp_path / "map", "--weights", exported, "--quiet")
     fails(capfd, *query, "--runtime", "onnxruntime", words=(exported, "map"))
+
+
+def test_an_int8_program_is_a_model_of_its_own(
+    params: Crisalad, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+):
+    """It may ask a map of the weights that it was made of; nothing else may ask its maps."""
+    photographs = town(shared) / "queries"
+    calibration = np.stack(
+        [prepare_image(read_image(path), MODEL) for path in sorted(photographs.iterdir())]
+    )
+    eight = tmp_path / "int8"
+    manifest = write_export(
+        eight, params, MODEL, ExportConfig(format="onnx"), calibration=calibration
+    )
+    weights = shared / "weights.safetensors"
+    assert manifest["quantised_from"] == model_hash(params, MODEL) != manifest["model_sha256"]
+    of_floats, of_bytes = tmp_path / "floats.map", tmp_path / "bytes.map"
+    engine = ("--runtime", "onnxruntime")
+    index = ("index", "--images", photographs, "--quiet")
+    succeeds(capfd, *index, "--weights", weights, "--out", of_floats)
+    succeeds(capfd, *index, "--weights", eight, "--out", of_bytes, *engine)
+    query = ("query", photographs, "--quiet")
+    assert main([str(a) for a in (*query, "--map", of_floats, "--weights", eight, *engine)]) == 0
+    assert f"{eight}: an int8 program of the model that made {of_floats}" in capfd.readouterr().err
+    fails(capfd, *query, "--map", of_bytes, "--weights", weights, words=(of_bytes, "made by model"))
+    assert main([str(a) for a in (*query, "--map", of_bytes, "--weights", eight, *engine)]) == 0
+    assert "int8" not in capfd.readouterr().err

@@ -163,11 +163,17 @@ def has_images(folder: pathlib.Path) -> bool:
 
 
 def check_model(
-    description: MapHead, folder: str | os.PathLike[str], digest: str, weights: object
+    description: MapHead,
+    folder: str | os.PathLike[str],
+    digest: str,
+    weights: object,
+    *,
+    quantised_from: str | None = None,
 ) -> None:
     """Check that a map was made by the model with the hash `digest`.
 
-    A map of version 0.1 cannot be checked; a note tells so.
+    A map of version 0.1 cannot be checked; a note tells so. Another tells where the model is an
+    int8 program of `quantised_from`, which made the map.
 
     Raises:
         InputError: the hashes differ; the message has both.
@@ -176,6 +182,10 @@ def check_model(
         tell(
             f"{folder}: found a map of crisalad-jax 0.1, which cannot tell whether {weights} made "
             "it; `crisalad index` into a new folder makes one that can"
+        )
+    elif quantised_from == description.model:
+        tell(
+            f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
         )
     elif digest != description.model:
         raise InputError(

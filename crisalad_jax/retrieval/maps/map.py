@@ -590,8 +590,7 @@ class Map:
             precision=config.get("compute_dtype", "float32"),
             any_grouping=any_grouping,
         )
-        check_model(self.head, self.folder, runtime.digest, file)
-        self._checked = runtime
+        self._check_runtime(runtime, file)
         return runtime
 
     def _weights(self, weights: str | os.PathLike[str] | None) -> str | os.PathLike[str]:
@@ -612,13 +611,19 @@ class Map:
         """
         if params is not self._checked:
             if isinstance(params, Runtime):
-                digest = params.digest
-            else:
-                from crisalad_jax.checkpoints.weights import model_hash
+                self._check_runtime(params, "the given parameters")
+                return
+            from crisalad_jax.checkpoints.weights import model_hash
 
-                digest = model_hash(params, self.description.config)
+            digest = model_hash(params, self.description.config)
             check_model(self.head, self.folder, digest, "the given parameters")
             self._checked = params
+
+    def _check_runtime(self, runtime: Runtime, given: object) -> None:
+        check_model(
+            self.head, self.folder, runtime.digest, given, quantised_from=runtime.quantised_from
+        )
+        self._checked = runtime
 
     def close(self) -> None:
         """Close the store; a map that nothing refers to any more closes itself."""
