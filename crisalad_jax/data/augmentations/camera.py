@@ -23,6 +23,9 @@ class CameraAugmentConfig(LightAugmentConfig):
     """Largest shift of a corner, as a share of the side."""
     texture: float = 0.25
     """Largest deviation of a multiplied texture of several scales, which rendered walls lack."""
+    filters: float = 0.3
+    """Probability of random filters over all colours, which change textures and keep outlines (Xu
+    et al., ICLR 2021)."""
     occlusion: float = 0.3
     """Probability that something covers a part."""
     motion: float = 0.2
@@ -41,7 +44,7 @@ class CameraAugmentConfig(LightAugmentConfig):
         for name in ("texture", "noise"):
             value = getattr(self, name)
             require(value >= 0, f"CameraAugmentConfig.{name}: found {value}, expected at least 0")
-        for name in ("occlusion", "motion", "coarse", "jpeg"):
+        for name in ("filters", "occlusion", "motion", "coarse", "jpeg"):
             value = getattr(self, name)
             require(
                 0 <= value <= 1,
@@ -58,6 +61,8 @@ class CameraAugmentConfig(LightAugmentConfig):
             image = _moved(image, self.perspective, generator)
         if self.texture > 0:
             image = _textured(image, generator.uniform(0, self.texture), generator)
+        if generator.random() < self.filters:
+            image = _filtered(image, generator)
         image = light_augment(image, self, generator)
         if generator.random() < self.occlusion:
             image = _covered(image, generator)
@@ -95,6 +100,20 @@ def _textured(image: Image, deviation: float, generator: np.random.Generator) ->
         field += cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
     changed = image * (1 + 0.5 * deviation * field[..., None])
     return np.clip(np.round(changed), 0, 255).astype(np.uint8)
+
+
+def _filtered(image: Image, generator: np.random.Generator) -> Image:
+    """Mix the image with that of random filters, whose mean and deviation are the image's."""
+    side = int(generator.choice((1, 3, 5)))
+    weights = generator.standard_normal((3, 3, side, side), np.float32)
+    pixels = image.astype(np.float32)
+    found = np.stack(
+        [sum(cv2.filter2D(pixels[..., i], -1, each[i]) for i in range(3)) for each in weights],
+        axis=-1,
+    )
+    found = (found - found.mean()) / (found.std() + 1e-3) * pixels.std() + pixels.mean()
+    share = generator.uniform(0, 1)
+    return np.clip(np.round(share * found + (1 - share) * pixels), 0, 255).astype(np.uint8)
 
 
 def _covered(image: Image, generator: np.random.Generator) -> Image:
