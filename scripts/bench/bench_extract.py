@@ -38,7 +38,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
-from bench_describe import TOLERANCES, Sides, sides, title
+from bench_describe import ENGINES_TOLERANCES, Sides, sides, title
 from engines import onnx_file, packages, readers
 from tables import Study, Table, bars, count, flags, leave, read
 from timing import PAUSE, Timed, measured, ratio, times
@@ -277,7 +277,7 @@ def check(contenders: Sequence[Contender], folder: pathlib.Path, temporary: path
         one.run(folder, out, Watch())
         found.append(np.load(out).astype(np.float64))
         off = np.abs(found[-1] - found[0]).max()
-        if not off < TOLERANCES["float32"]:
+        if not off < ENGINES_TOLERANCES["float32"]:
             raise RuntimeError(f"{one.name}: differs from {contenders[0].name} by {off:.1e}")
 
 

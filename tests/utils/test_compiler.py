@@ -58,7 +58,7 @@ def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.Monk
 def test_an_accelerator_has_no_options(chosen: Target) -> None:
     for library in ("Eigen", "oneDNN", "YNN"):
         with lowering_for(chosen):
-            assert compiler.compiler_options(library, least_memory=True) == {}
+            assert compiler.compiler_options(library, brief=True) == {}
 
 
 def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,8 +100,8 @@ def test_whose_products_a_program_has(
     """A folder of compiled programs has no say: a notebook gives the command line's bits."""
     seen = []
 
-    def options(library: str, *, least_memory: bool) -> dict[str, bool]:
-        seen.append((library, least_memory))
+    def options(library: str, *, brief: bool) -> dict[str, bool]:
+        seen.append((library, brief))
         return {}
 
     monkeypatch.setattr(compiler, "compiler_options", options)
