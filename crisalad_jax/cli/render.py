@@ -5,6 +5,7 @@ import pathlib
 
 from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.experiments.synthetic import SCENERIES, Scenery, WorldConfig, write_world
+from crisalad_jax.experiments.synthetic.world import has_world
 from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.progress import progress_bar
 
@@ -48,6 +49,7 @@ def run(arguments: Render) -> None:
     config = WorldConfig(**given)
     places = config.scenes * config.stations
     total = places + config.test_scenes * config.stations
+    has_world(arguments.out, config)  # a wrong folder is told before there is a bar
     with progress_bar("rendering the world", total, "places", quiet=arguments.quiet) as bar:
         write_world(arguments.out, config, progress=lambda done, total: bar.advance(1))
     tests = config.test_scenes * config.stations

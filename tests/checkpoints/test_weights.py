@@ -116,7 +116,7 @@ def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shar
     with safetensors.safe_open(tmp_path / "half.safetensors", framework="numpy") as file:
         stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     assert {array.dtype for array in stored.values()} == {np.dtype(np.float16)}
-    found, config, digest = load_with_hash(tmp_path / "half.safetensors")
+    found, config, digest = weights.load_with_hash(tmp_path / "half.safetensors")
     assert config == MODEL
     for name, leaf in named_leaves(found).items():
         expected = np.asarray(named_leaves(params)[name])
@@ -124,7 +124,7 @@ def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shar
         np.testing.assert_array_equal(leaf, expected.astype(np.float16).astype(np.float32))
     assert digest == model_hash(found, MODEL) != model_hash(params, MODEL)
     save_weights(tmp_path / "again.safetensors", found, MODEL, half=True)
-    assert load_with_hash(tmp_path / "again.safetensors")[2] == digest
+    assert weights.load_with_hash(tmp_path / "again.safetensors")[2] == digest
     assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * (
         shared / "weights.safetensors"
     ).stat().st_size

@@ -76,7 +76,8 @@ class CameraAugmentConfig(LightAugmentConfig):
             image = np.clip(np.round(image + noise), 0, 255).astype(np.uint8)
         if generator.random() < self.jpeg:
             quality = (cv2.IMWRITE_JPEG_QUALITY, int(generator.integers(*_QUALITY)))
-            image = cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)
+            data = cv2.imencode(".jpg", image, quality)[1]
+            image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
         return image
 
 
@@ -86,8 +87,9 @@ def _moved(image: Image, most: float, generator: np.random.Generator) -> Image:
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     shifts = generator.uniform(-most, most, (4, 2)) * (width, height)
     matrix = cv2.getPerspectiveTransform(corners, (corners + shifts).astype(np.float32))
-    flags = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT}
-    return cv2.warpPerspective(image, matrix, (width, height), **flags)
+    return cv2.warpPerspective(
+        image, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
 
 
 def _textured(image: Image, deviation: float, generator: np.random.Generator) -> Image:

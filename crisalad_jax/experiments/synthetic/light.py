@@ -75,23 +75,22 @@ _AIRS: dict[Weather, _Air] = {
     "haze": _Air(sun=0.35, ambient=1.15, veil=0.75, grey=0.95, visibility=75.0),
     "rain": _Air(sun=0.05, ambient=1.05, veil=0.9, grey=0.8, visibility=190.0),
 }
+_LAMPS = Light(
+    ambient=(0.72, 0.71, 0.69),
+    sun=(0.22, 0.22, 0.21),
+    elevation=65.0,
+    zenith=(0.92, 0.95, 1.0),
+    horizon=(0.92, 0.95, 1.0),
+    lit=0.25,
+    veil=(0.22, 0.22, 0.22),
+    visibility=45.0,
+)
 _INDOORS: dict[Time, Light] = {
-    time: Light(
-        ambient=(0.72, 0.71, 0.69),
-        sun=(0.22, 0.22, 0.21),
-        elevation=65.0,
-        zenith=sky,
-        horizon=sky,
-        lit=lit,
-        veil=(0.22, 0.22, 0.22),
-        visibility=45.0,
-    )
-    for time, sky, lit in (
-        ("noon", (0.92, 0.95, 1.0), 0.25),
-        ("dusk", (0.55, 0.50, 0.52), 0.6),
-        ("night", (0.06, 0.06, 0.10), 0.8),
-    )
+    "noon": _LAMPS,
+    "dusk": _LAMPS._replace(zenith=(0.55, 0.50, 0.52), horizon=(0.55, 0.50, 0.52), lit=0.6),
+    "night": _LAMPS._replace(zenith=(0.06, 0.06, 0.10), horizon=(0.06, 0.06, 0.10), lit=0.8),
 }
+"""Light indoors; the sky is what windows show."""
 _SUN_HEIGHT: dict[Season, float] = {"spring": 0.85, "summer": 1.2, "autumn": 0.85, "winter": 0.5}
 _LEAVES: dict[Season, tuple[Colour, Colour]] = {
     "spring": ((0.44, 0.56, 0.22), (0.74, 0.60, 0.62)),

@@ -4,6 +4,7 @@ import dataclasses
 import os
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -91,22 +92,38 @@ def write_world(
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
     """
-    root = pathlib.Path(root)
-    identity = {"renderer": RENDERER, **dataclasses.asdict(config)}
-    identity |= {"image_size": list(config.image_size), "sceneries": list(config.sceneries)}
-    if root.exists() and holds(root, identity, "world.json", "a rendered world"):
+    if has_world(root, config):
         return
+    root = pathlib.Path(root)
     total = (config.scenes + config.test_scenes) * config.stations
     temporary = temporary_beside(root)
     with made_folder(root.parent), in_use(temporary):
-        for number, _ in enumerate(_write(temporary, root, config, identity), start=1):
+        for number, _ in enumerate(_write(temporary, root, config), start=1):
             if progress is not None:
                 progress(number, total)
 
 
-def _write(
-    temporary: pathlib.Path, root: pathlib.Path, config: WorldConfig, identity: dict
-) -> Iterator[None]:
+def has_world(root: str | os.PathLike[str], config: WorldConfig) -> bool:
+    """Return whether `root` holds this world already; False where it can be written there.
+
+    Args:
+        root: a folder.
+        config: the world.
+
+    Raises:
+        InputError: `root` is a file, or holds something else.
+    """
+    root = pathlib.Path(root)
+    return root.exists() and holds(root, _identity(config), "world.json", "a rendered world")
+
+
+def _identity(config: WorldConfig) -> dict[str, Any]:
+    """Return what world.json has of a world."""
+    lists = {"image_size": list(config.image_size), "sceneries": list(config.sceneries)}
+    return {"renderer": RENDERER, **dataclasses.asdict(config), **lists}
+
+
+def _write(temporary: pathlib.Path, root: pathlib.Path, config: WorldConfig) -> Iterator[None]:
     """Write the world into `temporary`, then rename that to `root`; yield after every place.
 
     Raises:
@@ -121,7 +138,7 @@ def _write(
             name = f"{scenery}{city:04d}"
             yield from _write_city(temporary / "train", config, name, scenery, scenes)
         yield from _write_test(temporary / "test" / "images" / "test", config)
-        write_json(temporary / "world.json", identity)
+        write_json(temporary / "world.json", _identity(config))
         os.replace(temporary, root)
 
 
