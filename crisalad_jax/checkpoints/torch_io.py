@@ -381,6 +381,7 @@ def convert(
     *,
     backbone: str | os.PathLike[str] | None = None,
     fields: Mapping[str, Any] | None = None,
+    half: bool = False,
 ) -> Conversion:
     """Convert a public checkpoint to a file of this package, or such a file to a public one.
 
@@ -390,6 +391,8 @@ def convert(
         layout: one of `LAYOUTS`, for a source of ours; by default the one its parts came from.
         backbone: the backbone's checkpoint, for a source that is a vocabulary of AnyLoc by itself.
         fields: see `read_vocabulary`.
+        half: whether to write a file of this package in half precision, of a source of ours too;
+            see `save_weights`.
 
     Returns:
         What was read and written.
@@ -418,7 +421,7 @@ def convert(
     if pathlib.Path(target).exists() and os.path.samefile(source, target):
         raise InputError(f"{target}: found the source itself, expected another file")
     suffix = pathlib.Path(target).suffix
-    if checkpoint.layout is None:
+    if checkpoint.layout is None and not half:
         layout = layout or layout_for(checkpoint.config, target)
         wanted = SUFFIXES[LAYOUTS[layout].stored]
         if suffix not in wanted:
@@ -431,6 +434,8 @@ def convert(
             raise InputError(f"{source}: {error}") from error
         write_checkpoint(target, checkpoint.params, checkpoint.config, layout, checkpoint.extras)
         return Conversion(None, layout, checkpoint.config)
+    if layout is not None and half:
+        raise InputError(f"layout: found {layout} with half precision, expected only one of them")
     if layout is not None:
         raise InputError(
             f"{source}: found a public checkpoint ({checkpoint.layout}) beside --layout {layout}, "
@@ -438,7 +443,7 @@ def convert(
         )
     if suffix != ".safetensors":
         raise InputError(f"{target}: found suffix {suffix!r}, expected .safetensors")
-    save_weights(target, checkpoint.params, checkpoint.config, extras=checkpoint.extras)
+    save_weights(target, checkpoint.params, checkpoint.config, extras=checkpoint.extras, half=half)
     return Conversion(checkpoint.layout, None, checkpoint.config)
 
 

@@ -50,6 +50,7 @@ def save_weights(
     config: ModelConfig,
     *,
     extras: Mapping[str, np.ndarray] | None = None,
+    half: bool = False,
 ) -> None:
     """Write parameters under their dotted names, and the configuration in the file's metadata.
 
@@ -58,6 +59,8 @@ def save_weights(
         params: all parameters of the model.
         config: the model.
         extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
+        half: whether to keep float32 parameters as float16, in half the room. They are rounded, and
+            are float32 again when they are read.
 
     Raises:
         InputError: parameters that `load_weights` would refuse; the folder cannot be made, or the
@@ -74,8 +77,13 @@ def save_weights(
         True
     """
     check_params(params, config, stored=True)
+    stored = params
+    if half:
+        stored = jax.tree.map(_halved, params)
+        params = jax.tree.map(lambda leaf, half: half.astype(leaf.dtype), params, stored)
+        check_params(params, config, stored=True)
     config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
-    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(stored).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
     metadata = {
         "config": to_plain(config),
@@ -86,6 +94,15 @@ def save_weights(
         _DIGEST: model_hash(params, config),
     }
     write_sealed(path, arrays, FORMAT, metadata)
+
+
+def _halved(leaf: Any) -> np.ndarray:
+    """Return a float32 array in half precision, and any other as it is."""
+    array = np.asarray(leaf)
+    if array.dtype != np.float32:
+        return array
+    with np.errstate(over="ignore"):  # infinity is told of as such
+        return array.astype(np.float16)
 
 
 def is_ours(path: str | os.PathLike[str]) -> bool:
@@ -312,6 +329,8 @@ def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path
         if name not in arrays:
             continue
         array = arrays[name]
+        if array.dtype == np.float16 and leaf.dtype == np.float32:
+            array = arrays[name] = array.astype(np.float32)
         if (array.dtype, array.shape) != (leaf.dtype, leaf.shape):
             problems.append(
                 f"{name} found {array.dtype} {array.shape}, expected {leaf.dtype} {leaf.shape}"

@@ -25,6 +25,7 @@ from crisalad_jax.utils.version import VERSION
 
 _COMMANDS = {
     "demo": "Render a small city, train a tiny model on it, and show Recall@K before and after.",
+    "render": "Render streets, corridors and country: places to train on, and others to test.",
     "train": "Train on places, each with several images; go on with the run that is there.",
     "convert": "Convert a public torch checkpoint to a file of this package, or back.",
     "models": "List the models that others published, which --weights takes by name.",

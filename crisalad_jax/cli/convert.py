@@ -58,6 +58,9 @@ class Convert:
     """With --backbone: query, key, value or token; by default value."""
     assignment: str | None = None
     """With --backbone: cosine, as published, or euclidean."""
+    half: bool = False
+    """Write a file of this package in half precision, in half the room; of a source of this package
+    too."""
     json: pathlib.Path | None = None
     """File for the result as JSON; - prints it."""
     plugin: tuple[str, ...] = ()
@@ -80,7 +83,12 @@ def run(arguments: Convert) -> None:
         )
     backbone = None if arguments.backbone is None else find_weights(arguments.backbone)
     done = convert(
-        arguments.source, arguments.target, arguments.layout, backbone=backbone, fields=fields
+        arguments.source,
+        arguments.target,
+        arguments.layout,
+        backbone=backbone,
+        fields=fields,
+        half=arguments.half,
     )
     source, target = map(_layout_words, (done.source, done.target))
     say(

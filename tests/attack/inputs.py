@@ -294,6 +294,7 @@ TARGETS: tuple[tuple[str, str], ...] = (
     ("vocabulary", "--out"),
     ("compare", "--out"),
     ("demo", "--out"),
+    ("render", "--out"),
 )
 SUFFIX = {
     ("extract", "--out"): ".npy",
@@ -368,7 +369,7 @@ HUGE = "99999999999999999999"
 VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     *(
         (verb, "--seed", ("-1", HUGE, str(2**32), "1.5", "nan", "x", "0x10"))
-        for verb in ("evaluate", "extract", "pca", "vocabulary", "demo", "train")
+        for verb in ("evaluate", "extract", "pca", "vocabulary", "demo", "render", "train")
     ),
     *(
         (verb, "--image-size", ("1400000014 1400000014", "0 0", "-14 -14", "13 14", "x 14", "14"))
@@ -438,6 +439,9 @@ VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("vocabulary", "--layer", ("3",)),
     ("index", "--store", ("x", "milvus", "milvus:", "../files")),
     ("index", "--dtype", ("int8",)),
+    ("render", "--scenes", ("0", "-1", "x")),
+    ("render", "--sceneries", ("x",)),
+    ("render", "--repaint", ("-1", "nan")),
 )
 
 

@@ -150,6 +150,10 @@ VERBS: Mapping[str, Callable[[World, pathlib.Path], Arguments]] = {
         *("info", "--weights", f"{world.weights}", "--json", f"{out / 'info.json'}"),
     ],
     "compare": _compare,
+    "render": lambda world, out: [
+        *("render", "--out", f"{out / 'world'}", "--scenes", "12", "--test-scenes", "3"),
+        *("--image-size", "30", "40", "--quiet"),
+    ],
     "demo": lambda world, out: ["demo", "--out", f"{out / 'demo'}", "--quiet"],
 }
 """A command of each verb that writes files, by what it writes into a folder."""

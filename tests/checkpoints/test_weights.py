@@ -110,6 +110,38 @@ def test_the_same_weights_give_the_same_bytes(tmp_path, params):
     assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
 
 
+def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shared, params):
+    """Read again they are float32, and of these the digest is."""
+    save_weights(tmp_path / "half.safetensors", params, MODEL, half=True)
+    with safetensors.safe_open(tmp_path / "half.safetensors", framework="numpy") as file:
+        stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    assert {array.dtype for array in stored.values()} == {np.dtype(np.float16)}
+    found, config, digest = weights.load_with_hash(tmp_path / "half.safetensors")
+    assert config == MODEL
+    for name, leaf in named_leaves(found).items():
+        expected = np.asarray(named_leaves(params)[name])
+        assert leaf.dtype == np.float32
+        np.testing.assert_array_equal(leaf, expected.astype(np.float16).astype(np.float32))
+    assert digest == model_hash(found, MODEL) != model_hash(params, MODEL)
+    save_weights(tmp_path / "again.safetensors", found, MODEL, half=True)
+    assert weights.load_with_hash(tmp_path / "again.safetensors")[2] == digest
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * (
+        shared / "weights.safetensors"
+    ).stat().st_size
+
+
+def test_what_half_precision_cannot_hold_is_named(tmp_path, params):
+    score = params.aggregator.score
+    large = dataclasses.replace(score.fc1, weight=score.fc1.weight.at[0, 0].set(1e5))
+    score = dataclasses.replace(score, fc1=large)
+    wrong = dataclasses.replace(
+        params, aggregator=dataclasses.replace(params.aggregator, score=score)
+    )
+    with pytest.raises(InputError, match=r"aggregator\.score\.fc1\.weight"):
+        save_weights(tmp_path / "half.safetensors", wrong, MODEL, half=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_only_what_parameters_do_not_depend_on_is_free(shared):
     path = shared / "weights.safetensors"
     other = dataclasses.replace(

@@ -7,12 +7,14 @@ from PIL import Image
 
 from crisalad_jax.data.augmentations import Augmentation, NoAugmentation
 from crisalad_jax.data.augmentations import rand_augment as module
+from crisalad_jax.data.augmentations.camera import CameraAugmentConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
 from crisalad_jax.data.augmentations.rand_augment import (
     OPERATIONS,
     RandAugmentConfig,
     rand_augment,
 )
+from crisalad_jax.utils.errors import InputError
 from parity.reference.augment import OPERATIONS as PILLOWS
 from parity.reference.augment import strengths as torchvisions
 
@@ -150,7 +152,9 @@ def augment(image: np.ndarray, config: Augmentation, generator: np.random.Genera
     return config.apply(image, generator, of_place=np.random.default_rng(99))
 
 
-@pytest.mark.parametrize("config", [RandAugmentConfig(), LightAugmentConfig()])
+@pytest.mark.parametrize(
+    "config", [RandAugmentConfig(), LightAugmentConfig(), CameraAugmentConfig()]
+)
 @pytest.mark.parametrize("shape", [(224, 224), (70, 126), (1, 1)])
 def test_the_same_seed_gives_the_same_picture(config, shape):
     image = picture(*shape)
@@ -323,3 +327,115 @@ def test_light_grey_has_equal_channels():
     )
     # Five standard deviations of 300 draws: 0.13.
     assert share == pytest.approx(0.3, abs=0.13)
+
+
+STEADY = {
+    **STILL,
+    **dict.fromkeys(("perspective", "texture", "filters", "occlusion", "motion"), 0.0),
+    **dict.fromkeys(("coarse", "noise", "jpeg"), 0.0),
+}
+
+
+def photographed(image, seed=0, **changes):
+    config = CameraAugmentConfig(**{**STEADY, **changes})
+    return augment(image, config, np.random.default_rng(seed))
+
+
+def test_a_camera_of_nothing_changes_nothing():
+    np.testing.assert_array_equal(photographed(picture(70, 126)), picture(70, 126))
+
+
+def test_another_stand_moves_a_spot_by_no_more_than_its_corners():
+    image = blob(90, 120, 60, 45)
+    moves = [
+        centroid(photographed(image, seed, perspective=0.05)) - centroid(image)
+        for seed in range(20)
+    ]
+    reach = np.abs(moves).max(axis=0)
+    # The middle is where the diagonals cross: to first order it moves by at most twice as much as
+    # the corners, which move by a twentieth of the sides.
+    assert (reach > 0.5).all()
+    assert (reach < 2 * 0.05 * np.array([120, 90])).all()
+
+
+def test_texture_keeps_the_mean_and_is_as_strong_as_asked():
+    """Four scales of unit deviation, times a half: at a strength of s the deviation is near s."""
+    grey = np.full((160, 160, 3), 128, np.uint8)
+    found = [photographed(grey, seed, texture=0.2).astype(float) / 128 for seed in range(30)]
+    assert abs(np.mean(found) - 1) < 0.02
+    deviations = [image.std() for image in found]
+    # Drawn from 0 to 0.2; interpolation between coarse numbers takes a part of it.
+    assert 0.1 < max(deviations) < 0.2
+    assert min(deviations) < 0.04
+
+
+def test_random_filters_keep_the_mean_and_the_deviation_of_the_colours():
+    image = np.clip(picture(70, 126), 60, 190)
+    for seed in range(6):
+        found = photographed(image, seed, filters=1.0).astype(float)
+        assert not np.array_equal(found, image)
+        # Mixed with the image, and clipped to bytes: up to a fifth of the deviation.
+        assert abs(found.mean() - image.mean()) < 0.2 * image.std()
+
+
+def test_what_covers_is_of_one_colour_and_no_more_than_a_part():
+    image = picture(70, 126)
+    for seed in range(10):
+        found = photographed(image, seed, occlusion=1.0)
+        changed = (found != image).any(axis=-1)
+        assert changed.mean() < 0.17  # at most two fifths of each side
+        colours = {tuple(colour) for colour in found[changed]}
+        assert len(colours) <= 1
+
+
+def test_motion_keeps_a_spot_in_its_place_and_spreads_it_along_a_line():
+    image = blob(90, 120, 60, 45)
+    before = (image > 100).any(axis=-1)
+    for seed in range(6):
+        found = photographed(image, seed, motion=1.0)
+        np.testing.assert_allclose(centroid(found), centroid(image), atol=1.0)
+        assert found.max() < image.max()
+        assert (found > 20).any(axis=-1).any(axis=0).sum() > before.any(axis=0).sum()
+
+
+def test_fewer_pixels_have_less_detail_and_the_same_size():
+    image = picture(70, 126)
+    for seed in range(6):
+        found = photographed(image, seed, coarse=1.0)
+        assert found.shape == image.shape
+        detail = [np.abs(np.diff(each.astype(float), axis=1)).mean() for each in (found, image)]
+        assert detail[0] < detail[1]
+
+
+def test_noise_is_at_most_as_strong_as_asked():
+    grey = np.full((100, 100, 3), 128, np.uint8)
+    deviations = [photographed(grey, seed, noise=6.0).std() for seed in range(30)]
+    assert max(deviations) < 6.5
+    assert max(deviations) > 4
+
+
+def test_jpeg_is_of_the_qualities_that_are_named():
+    """As OpenCV writes it of the qualities that are drawn."""
+    image = picture(64, 64)
+    files = {
+        cv2.imdecode(
+            cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))[1], cv2.IMREAD_COLOR
+        ).tobytes()
+        for quality in range(12, 85)
+    }
+    for seed in range(6):
+        assert photographed(image, seed, jpeg=1.0).tobytes() in files
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"perspective": 1.0}, "CameraAugmentConfig.perspective: found 1.0"),
+        ({"noise": -1.0}, "CameraAugmentConfig.noise: found -1.0"),
+        ({"jpeg": 1.5}, "CameraAugmentConfig.jpeg: found 1.5"),
+        ({"texture": float("nan")}, "CameraAugmentConfig.texture: found nan"),
+    ],
+)
+def test_bad_strengths_are_named(changes, words):
+    with pytest.raises(InputError, match=words):
+        CameraAugmentConfig(**changes)

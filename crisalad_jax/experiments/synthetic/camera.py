@@ -3,29 +3,28 @@
 import numpy as np
 from jaxtyping import Float
 
-from crisalad_jax.experiments.synthetic.mesh import EYE, Scene
+from crisalad_jax.experiments.synthetic.mesh import Scene
 from crisalad_jax.experiments.synthetic.view import View
 
-PITCH = np.deg2rad(8.0)
-"""Radians by which the camera looks up."""
-TAN_HALF_WIDTH = np.tan(np.deg2rad(80.0) / 2)
 NEAR = 0.4
 """Metres from the camera to the plane behind which nothing is seen."""
 
 
 class Camera:
-    """A pinhole 2.4 m above the street, 80 degrees wide, tilted up by 8 degrees."""
+    """A pinhole camera in a place."""
 
     def __init__(self, heading: float, view: View, size: tuple[int, int]) -> None:
         """Place the camera by the default view's heading in degrees, and its size in pixels."""
         height, width = size
-        self.focal = width / 2 / TAN_HALF_WIDTH
+        self.tan_half_width = np.tan(np.deg2rad(view.field) / 2)
+        self.focal = width / 2 / self.tan_half_width
+        self.pitch = np.deg2rad(view.pitch)
         self.centre = np.array((width / 2, height / 2))
         self.yaw = np.deg2rad(heading + view.heading)
-        self.position = np.array((view.lateral, EYE, view.forward))
+        self.position = np.array((view.lateral, view.height, view.forward))
         sin, cos = np.sin(self.yaw), np.cos(self.yaw)
         turn = np.array(((cos, 0, -sin), (0, 1, 0), (sin, 0, cos)))
-        sin, cos = np.sin(PITCH), np.cos(PITCH)
+        sin, cos = np.sin(self.pitch), np.cos(self.pitch)
         tilt = np.array(((1, 0, 0), (0, cos, -sin), (0, sin, cos)))
         self.rotation = tilt @ turn
 

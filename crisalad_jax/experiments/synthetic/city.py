@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from crisalad_jax.config.checks import check_seed, check_types
-from crisalad_jax.experiments.synthetic.camera import PITCH
-from crisalad_jax.experiments.synthetic.mesh import EYE
 from crisalad_jax.experiments.synthetic.picture import render
-from crisalad_jax.experiments.synthetic.street import build_place
+from crisalad_jax.experiments.synthetic.scenes import build_place
 from crisalad_jax.experiments.synthetic.view import (
+    EYE,
+    PITCH,
     SEASONS,
     TIMES,
     WEATHERS,
@@ -35,10 +35,10 @@ RENDERER = 1
 """Version of the renderer: increase it if pictures change, and cities on disk no longer match."""
 PLACE_SPACING = 80.0
 """Metres between neighbouring places: more than three times the 25 m that make a positive."""
-_MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
-_METRES_PER_DEGREE = 111_195.0
+MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
+METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
-_UTM_ORIGIN = (500_000.0, 5_000_000.0)
+UTM_ORIGIN = (500_000.0, 5_000_000.0)
 """East and north in zone 32T of the test city's south-west corner."""
 
 
@@ -100,7 +100,7 @@ def write_synthetic_city(
     root = pathlib.Path(root)
     identity = {"renderer": RENDERER, **dataclasses.asdict(config)}
     identity["image_size"] = list(config.image_size)
-    if root.exists() and _holds(root, identity):
+    if root.exists() and holds(root, identity, "city.json", "a synthetic city"):
         return
     total = config.train_places * config.images_per_place
     total += config.test_places * (config.database_per_place + config.queries_per_place)
@@ -130,8 +130,8 @@ def _write(
         os.replace(temporary, root)
 
 
-def _holds(root: pathlib.Path, identity: dict) -> bool:
-    """Return whether `root` already holds this city; False if it is an empty folder.
+def holds(root: pathlib.Path, identity: dict, file: str, what: str) -> bool:
+    """Return whether `root` already holds this city or world; False if it is an empty folder.
 
     Raises:
         InputError: `root` is no folder, or holds anything else.
@@ -141,15 +141,13 @@ def _holds(root: pathlib.Path, identity: dict) -> bool:
     if not any(root.iterdir()):
         return False
     try:
-        existing = read_json(root / "city.json", "a synthetic city")
+        existing = read_json(root / file, what)
     except InputError:
         existing = None
     if existing == identity:
         return True
-    what = (
-        "a synthetic city of another configuration" if existing else "a folder with other content"
-    )
-    raise InputError(f"{root}: found {what}, expected a new or empty folder")
+    found = f"{what} of another configuration" if existing else "a folder with other content"
+    raise InputError(f"{root}: found {found}, expected a new or empty folder")
 
 
 def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -> Iterator[None]:
@@ -166,16 +164,14 @@ def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -
         spot = _spot(config, 0, index, config.train_places)
         for view in _train_views(spot.rng, config.images_per_place):
             east, north = spot.stand(view)
-            lat = f"{centre[0] + north / _METRES_PER_DEGREE:.7f}"
-            per_degree = _METRES_PER_DEGREE * np.cos(np.deg2rad(centre[0]))
+            lat = f"{centre[0] + north / METRES_PER_DEGREE:.7f}"
+            per_degree = METRES_PER_DEGREE * np.cos(np.deg2rad(centre[0]))
             lon = f"{centre[1] + east / per_degree:.7f}"
-            year, month = int(spot.rng.integers(2012, 2022)), _MONTHS[view.season]
-            northdeg, panoid = spot.northdeg(view), _panoid(spot.rng)
-            lines.append(f"{place_id},{year},{month},{northdeg},{name},{lat},{lon},{panoid}")
-            stem = (
-                f"{name}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}"
-            )
-            _write_jpeg(images / f"{stem}.jpg", render(spot.seed, view, config.image_size))
+            year, month = int(spot.rng.integers(2012, 2022)), MONTHS[view.season]
+            northdeg, key = spot.northdeg(view), panoid(spot.rng)
+            lines.append(f"{place_id},{year},{month},{northdeg},{name},{lat},{lon},{key}")
+            stem = f"{name}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{key}"
+            write_jpeg(images / f"{stem}.jpg", render(spot.seed, view, config.image_size))
             yield
     table = folder / "Dataframes" / f"{name}.csv"
     table.parent.mkdir(exist_ok=True)
@@ -195,34 +191,36 @@ def _write_test(folder: pathlib.Path, config: SyntheticCityConfig) -> Iterator[N
         views += [("queries", _query_view(spot.rng)) for _ in range(config.queries_per_place)]
         for side, view in views:
             east, north = spot.stand(view)
-            year, month = int(spot.rng.integers(2012, 2022)), _MONTHS[view.season]
+            year, month = int(spot.rng.integers(2012, 2022)), MONTHS[view.season]
             fields = (
-                f"{_UTM_ORIGIN[0] + east:.2f}",
-                f"{_UTM_ORIGIN[1] + north:.2f}",
+                f"{UTM_ORIGIN[0] + east:.2f}",
+                f"{UTM_ORIGIN[1] + north:.2f}",
                 "32",
                 "T",
                 "",
                 "",
-                _panoid(spot.rng),
+                panoid(spot.rng),
                 "",
                 f"{spot.northdeg(view)}",
-                f"{np.rad2deg(PITCH):.0f}",
+                f"{PITCH:.0f}",
                 "0",
                 f"{EYE}",
                 f"{year:04d}{month:02d}",
                 f"{view.season}_{view.time}",
             )
             path = folder / side / f"@{'@'.join(fields)}@.jpg"
-            _write_jpeg(path, render(spot.seed, view, config.image_size))
+            write_jpeg(path, render(spot.seed, view, config.image_size))
             yield
 
 
-def _write_jpeg(path: pathlib.Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+def write_jpeg(path: pathlib.Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write a picture as a JPEG of quality 92."""
     _, data = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 92))
     path.write_bytes(data.tobytes())
 
 
-def _panoid(rng: np.random.Generator) -> str:
+def panoid(rng: np.random.Generator) -> str:
+    """Draw the name of a panorama."""
     return rng.bytes(8).hex()
 
 

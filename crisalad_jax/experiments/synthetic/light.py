@@ -21,6 +21,10 @@ class Light(NamedTuple):
     horizon: Colour
     lit: float
     """Brightness of lamps and windows, 0 to 1."""
+    veil: Colour = (0.0, 0.0, 0.0)
+    """What distance turns into."""
+    visibility: float = 900.0
+    """Metres over which contrast falls to 1/e."""
 
 
 _LIGHTS: dict[Time, Light] = {
@@ -71,6 +75,22 @@ _AIRS: dict[Weather, _Air] = {
     "haze": _Air(sun=0.35, ambient=1.15, veil=0.75, grey=0.95, visibility=75.0),
     "rain": _Air(sun=0.05, ambient=1.05, veil=0.9, grey=0.8, visibility=190.0),
 }
+_LAMPS = Light(
+    ambient=(0.72, 0.71, 0.69),
+    sun=(0.22, 0.22, 0.21),
+    elevation=65.0,
+    zenith=(0.92, 0.95, 1.0),
+    horizon=(0.92, 0.95, 1.0),
+    lit=0.25,
+    veil=(0.22, 0.22, 0.22),
+    visibility=45.0,
+)
+_INDOORS: dict[Time, Light] = {
+    "noon": _LAMPS,
+    "dusk": _LAMPS._replace(zenith=(0.55, 0.50, 0.52), horizon=(0.55, 0.50, 0.52), lit=0.6),
+    "night": _LAMPS._replace(zenith=(0.06, 0.06, 0.10), horizon=(0.06, 0.06, 0.10), lit=0.8),
+}
+"""Light indoors; the sky is what windows show."""
 _SUN_HEIGHT: dict[Season, float] = {"spring": 0.85, "summer": 1.2, "autumn": 0.85, "winter": 0.5}
 _LEAVES: dict[Season, tuple[Colour, Colour]] = {
     "spring": ((0.44, 0.56, 0.22), (0.74, 0.60, 0.62)),
@@ -78,12 +98,15 @@ _LEAVES: dict[Season, tuple[Colour, Colour]] = {
     "autumn": ((0.70, 0.46, 0.12), (0.60, 0.23, 0.10)),
 }
 """Two hues by season, between which a tree's leaves lie; in winter there are no leaves."""
+_TWIGS: Colour = (0.40, 0.34, 0.29)
 _SNOW: dict[int, float] = {
     Kind.ROOF: 0.92,
     Kind.LEDGE: 0.75,
     Kind.PAVEMENT: 0.85,
     Kind.ROAD: 0.5,
     Kind.GRASS: 0.95,
+    Kind.SOIL: 0.8,
+    Kind.BUSH: 0.3,
     Kind.NEEDLE: 0.4,
 }
 """Share of a surface that snow covers, by kind."""
@@ -104,17 +127,22 @@ GLOW: dict[int, tuple[float, Colour]] = {
 """Share of polygons that shine after dark and their colour, by kind."""
 
 
-def light_of(view: View) -> Light:
-    """Combine the light of the hour with the weather and the season's sun."""
+def light_of(view: View, *, indoors: bool = False) -> Light:
+    """Combine the light of the hour with the weather and the season's sun, or take lamps' light."""
+    if indoors:
+        return _INDOORS[view.time]
     light, air = _LIGHTS[view.time], _AIRS[view.weather]
     level = sum(light.horizon) / 3 * air.grey
     grey = (level, level, level)
+    horizon = _mixed(light.horizon, grey, air.veil)
     return light._replace(
         ambient=scaled(light.ambient, air.ambient),
         sun=scaled(light.sun, air.sun),
         elevation=light.elevation * _SUN_HEIGHT[view.season],
         zenith=_mixed(light.zenith, grey, air.veil),
-        horizon=_mixed(light.horizon, grey, air.veil),
+        horizon=horizon,
+        veil=horizon,
+        visibility=air.visibility,
     )
 
 
@@ -144,10 +172,13 @@ def part_colours(
     """Compute the colour of every part, 0 to 1: material, season, light and haze."""
     albedo = scene.albedo.copy()
     if view.season in _LEAVES:
-        leaf = scene.kind == Kind.LEAF
+        leaf = (scene.kind == Kind.LEAF) | (scene.kind == Kind.BUSH)
         first, second = (np.array(c) for c in _LEAVES[view.season])
         hue, shade = scene.albedo[leaf, 0:1], scene.albedo[leaf, 1:2]
         albedo[leaf] = (first * (1 - hue) + second * hue) * shade
+    else:
+        bush = scene.kind == Kind.BUSH
+        albedo[bush] = np.array(_TWIGS) * scene.albedo[bush, 1:2]
     albedo[scene.kind == Kind.GRASS] = GRASS[view.season]
     if view.season == "winter":
         cover = np.zeros(max(Kind) + 1)
@@ -159,10 +190,17 @@ def part_colours(
     facing = np.clip(scene.normal @ sun, 0, None)[:, None]
     skyward = 0.85 + 0.15 * scene.normal[:, 1:2]
     colour = albedo * (np.array(light.ambient) * skyward + np.array(light.sun) * facing)
+    if view.repaint:
+        rng = np.random.default_rng((view.seed, 5))
+        paint = rng.normal(0, view.repaint, (len(colour), 1))
+        tint = rng.normal(0, view.repaint / 3, colour.shape)
+        colour *= np.exp(paint + tint)
     glass = scene.kind == Kind.GLASS
     colour[glass] += 0.16 * np.array(light.zenith)
-    haze = 1 - np.exp(-np.clip(seen_depth, 0, 2000) / _AIRS[view.weather].visibility)[:, None]
-    return colour * (1 - haze) + np.array(light.horizon) * haze
+    window = scene.kind == Kind.WINDOW
+    colour[window] = np.array(light.horizon) * scene.albedo[window]
+    haze = 1 - np.exp(-np.clip(seen_depth, 0, 2000) / light.visibility)[:, None]
+    return colour * (1 - haze) + np.array(light.veil) * haze
 
 
 def shining(

@@ -24,6 +24,12 @@ class Kind(enum.IntEnum):
     LAMP = 10
     HEADLIGHT = 11
     TAILLIGHT = 12
+    SOIL = 13
+    """A field or ballast: of its own colour, under snow in winter."""
+    BUSH = 14
+    """Leaves that are bare twigs in winter."""
+    WINDOW = 15
+    """An opening to the sky, seen from inside."""
 
 
 WALLS: tuple[Colour, ...] = (

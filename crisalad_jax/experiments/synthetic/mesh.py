@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from crisalad_jax.experiments.synthetic.materials import Colour, Kind, scaled
+from crisalad_jax.experiments.synthetic.view import EYE
 
-EYE = 2.4
-"""Metres from the ground to the camera."""
 GROUND_LAYER = 1e6
 """Smallest layer of parts on the ground, which are painted below every shadow."""
 UP = (0.0, 1.0, 0.0)
@@ -43,8 +42,9 @@ def join_scenes(first: Scene, second: Scene) -> Scene:
 class Mesh:
     """A scene being built of parts: polygons of one colour, one normal and one layer."""
 
-    def __init__(self) -> None:
-        """Start without parts."""
+    def __init__(self, eye: float = EYE) -> None:
+        """Start without parts; cameras are some `eye` metres above the ground."""
+        self.eye = eye
         self.layer = 0.0
         """Painting order of the parts to come: larger is farther away."""
         self._points: list[np.ndarray] = []
@@ -144,7 +144,7 @@ class Front:
         u = u0 if self.sees_start else u1
         end = polygons((u, v0, 0.0), (u, v0, out), (u, v1, out), (u, v1, 0.0))
         self.add(end, albedo, normal=self.end_normal)
-        above = float(np.min(v0)) > EYE
+        above = float(np.min(v0)) > self.mesh.eye
         v = v0 if above else v1
         level = polygons((u0, v, 0.0), (u1, v, 0.0), (u1, v, out), (u0, v, out))
         self.add(level, albedo, normal=(0.0, -1.0, 0.0) if above else UP)

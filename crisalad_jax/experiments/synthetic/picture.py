@@ -9,8 +9,6 @@ from jaxtyping import Bool, Float, UInt8
 
 from crisalad_jax.experiments.synthetic.camera import (
     NEAR,
-    PITCH,
-    TAN_HALF_WIDTH,
     Camera,
     clip_near,
     project_outlines,
@@ -27,9 +25,10 @@ from crisalad_jax.experiments.synthetic.light import (
 )
 from crisalad_jax.experiments.synthetic.materials import Kind
 from crisalad_jax.experiments.synthetic.mesh import GROUND_LAYER, Scene, join_scenes
-from crisalad_jax.experiments.synthetic.street import Place, build_place
+from crisalad_jax.experiments.synthetic.place import Place
+from crisalad_jax.experiments.synthetic.scenes import build_place
 from crisalad_jax.experiments.synthetic.traffic import build_passers
-from crisalad_jax.experiments.synthetic.view import View, check_size
+from crisalad_jax.experiments.synthetic.view import Scenery, View, check_size
 from crisalad_jax.utils.errors import InputError
 
 _SUPERSAMPLING = 2
@@ -43,7 +42,10 @@ class _Canvas(NamedTuple):
 
 
 def render(
-    place_seed: int, view: View, image_size: tuple[int, int] = (126, 168)
+    place_seed: int,
+    view: View,
+    image_size: tuple[int, int] = (126, 168),
+    scenery: Scenery = "street",
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw one picture of a place, RGB. The same arguments give the same pixels.
 
@@ -51,6 +53,7 @@ def render(
         place_seed: which place; at least 0.
         view: where the camera stands, and the season, light, weather and traffic it meets.
         image_size: height and width in pixels.
+        scenery: what kind of place it is.
 
     Raises:
         InputError: a negative seed, or a size out of range.
@@ -58,16 +61,16 @@ def render(
     check_size("image_size", image_size)
     if place_seed < 0:
         raise InputError(f"place_seed: found {place_seed}, expected at least 0")
-    place = build_place(place_seed)
+    place = build_place(place_seed, scenery)
     size = (image_size[0] * _SUPERSAMPLING, image_size[1] * _SUPERSAMPLING)
     camera = Camera(place.heading, view, size)
-    light = light_of(view)
+    light = light_of(view, indoors=place.indoors)
     rng = np.random.default_rng((view.seed, 3))
     sun = sun_direction(light, view.time, place.bearing, rng)
     scene = place.scene
     draw = rng.random(len(scene.polygon_sizes))
     if view.occluders is not None:
-        passers = build_passers(view.occluders, place.lanes)
+        passers = build_passers(view.occluders, place.lanes, traffic=place.traffic)
         scene = join_scenes(scene, passers)
         # A draw of 0 switches the lights of every vehicle on.
         draw = np.concatenate((draw, np.zeros(len(passers.polygon_sizes))))
@@ -84,9 +87,12 @@ def render(
     if view.season == "winter":
         order = order[scene.kind[order] != Kind.LEAF]
     grounds = int((scene.layer[order] >= GROUND_LAYER).sum())
-    canvas = _Canvas(_sky(place, view, light, camera, size), np.zeros((*size, 3), np.uint8))
+    black = np.zeros((*size, 3), np.uint8)
+    sky = black.copy() if place.indoors else _sky(place, view, light, camera, size)
+    canvas = _Canvas(sky, black)
     _paint(canvas, scene, order[:grounds].tolist(), outlines, colours, shines, light.lit)
-    _shade_ground(canvas.picture, place, camera, light, sun)
+    if not place.indoors:
+        _shade_ground(canvas.picture, place, camera, light, sun)
     _paint(canvas, scene, order[grounds:].tolist(), outlines, colours, shines, light.lit)
     return _develop(canvas, place, view, light, camera, rng)
 
@@ -97,7 +103,7 @@ def _sky(
     """Draw the sky, its clouds, and the hills, which are too far to move with the camera."""
     height, width = size
     rng = np.random.default_rng((view.seed, 2))
-    horizon_row = height / 2 + camera.focal * np.tan(PITCH)
+    horizon_row = height / 2 + camera.focal * np.tan(camera.pitch)
     coarse = (height // 4, width // 4)
     rows = (np.arange(coarse[0]) + 0.5) * height / coarse[0]
     climb = np.clip(1 - rows / horizon_row, 0, 1)[:, None, None] ** 0.8
@@ -112,7 +118,7 @@ def _sky(
     canvas = cv2.resize(canvas, (width, height), interpolation=cv2.INTER_LINEAR)
 
     across = np.linspace(-1, 1, 33)
-    compass = camera.yaw + np.arctan(across * TAN_HALF_WIDTH) + np.deg2rad(place.bearing)
+    compass = camera.yaw + np.arctan(across * camera.tan_half_width) + np.deg2rad(place.bearing)
     bearings = np.arange(len(place.hills)) * (360 / len(place.hills))
     tangent = np.interp(np.rad2deg(compass) % 360, bearings, place.hills, period=360)
     ridge = np.stack((width / 2 * (1 + across), horizon_row - camera.focal * tangent), -1)
@@ -193,7 +199,7 @@ def _develop(
     picture = picture.astype(np.float32)
     if light.lit:
         picture = _lamplight(picture, canvas.glow, place, light, camera)
-    if view.weather == "rain":
+    if view.weather == "rain" and not place.indoors:
         picture = _rain(picture, rng)
     warmth, tint = rng.uniform(-0.13, 0.13), rng.uniform(-0.04, 0.04)
     picture *= (2.0 ** (view.exposure + np.array((warmth, tint, -warmth)))).astype(np.float32)

@@ -32,11 +32,20 @@ _TINTED: Colour = (0.10, 0.12, 0.14)
 
 
 @functools.lru_cache(maxsize=8)
-def build_passers(seed: int, lanes: tuple[float, float, float, float]) -> Scene:
-    """Build cars along the kerbs, traffic in the lanes, and people on the pavements."""
+def build_passers(
+    seed: int, lanes: tuple[float, float, float, float], *, traffic: bool = True
+) -> Scene:
+    """Build cars along the kerbs, traffic in the lanes, and people on the pavements.
+
+    Without traffic there are people alone; one is far away, so that there is somebody.
+    """
     rng = np.random.default_rng((seed, 1))
     mesh = Mesh()
     left, left_kerb, right_kerb, right = lanes
+    if not traffic:
+        for z in (120.0, *rng.uniform(3.0, 20.0, int(rng.integers(0, 3)))):
+            _person(mesh, rng, rng.uniform(left * 0.8, right * 0.8), z)
+        return mesh.scene()
     for x, away in ((left_kerb + 1.1, False), (right_kerb - 1.1, True)):
         if rng.random() < 0.6:
             z = rng.uniform(4.0, 12.0)

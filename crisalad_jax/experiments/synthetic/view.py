@@ -1,17 +1,27 @@
 """The view of a picture: the camera's pose, the season, hour and weather, and the traffic."""
 
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
 from crisalad_jax.utils.errors import InputError
 
 Season = Literal["spring", "summer", "autumn", "winter"]
 Time = Literal["noon", "dusk", "night"]
 Weather = Literal["clear", "overcast", "haze", "rain"]
+Scenery = Literal["street", "corridor", "country"]
+"""What a place is: a city's street, a corridor or hall, a road or railway through the country."""
 
 SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
 TIMES: tuple[Time, ...] = ("noon", "dusk", "night")
 WEATHERS: tuple[Weather, ...] = ("clear", "overcast", "haze", "rain")
+SCENERIES: tuple[Scenery, ...] = get_args(Scenery)
+
+EYE = 2.4
+"""Metres from the ground to the camera of the default view."""
+PITCH = 8.0
+"""Degrees by which it looks up."""
+FIELD = 80.0
+"""Degrees from its left border to the right."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +34,14 @@ class View:
     """Metres along the street, towards its far end."""
     heading: float = 0.0
     """Degrees clockwise from the direction in which the place is usually seen."""
+    height: float = EYE
+    """Metres from the ground to the camera."""
+    pitch: float = PITCH
+    """Degrees by which it looks up."""
+    field: float = FIELD
+    """Degrees from its left border to the right."""
+    repaint: float = 0.0
+    """Standard deviation of a change of every part's log colour: other paint, other light."""
     season: Season = "summer"
     time: Time = "noon"
     weather: Weather = "clear"
@@ -44,8 +62,12 @@ class View:
                 raise InputError(
                     f"View.{name}: found {value!r}, expected one of {', '.join(choices)}"
                 )
-        if not self.noise >= 0:
-            raise InputError(f"View.noise: found {self.noise}, expected at least 0")
+        for name in ("noise", "repaint"):
+            value = getattr(self, name)
+            if not value >= 0:
+                raise InputError(f"View.{name}: found {value}, expected at least 0")
+        if not 10 <= self.field <= 150:
+            raise InputError(f"View.field: found {self.field}, expected 10 to 150 degrees")
 
 
 def check_size(what: str, size: tuple[int, int]) -> None:

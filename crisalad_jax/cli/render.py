@@ -1,0 +1,63 @@
+"""`crisalad render`."""
+
+import dataclasses
+import pathlib
+
+from crisalad_jax.cli.common import give_json, prepare_json, say
+from crisalad_jax.experiments.synthetic import SCENERIES, Scenery, WorldConfig, write_world
+from crisalad_jax.experiments.synthetic.world import has_world
+from crisalad_jax.utils.output import counted
+from crisalad_jax.utils.progress import progress_bar
+
+EXAMPLE = "crisalad render --out world --scenes 2400"
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render a world of streets, corridors and country: places to train on, and others to test."""
+
+    out: pathlib.Path
+    """Folder for the world: train/ in the layout of GSV-Cities, test/ in that of
+    VPR-datasets-downloader."""
+    scenes: int = WorldConfig.scenes
+    """Scenes to train on."""
+    stations: int = WorldConfig.stations
+    """Places of a scene, one behind the other: they look alike."""
+    images_per_place: int = WorldConfig.images_per_place
+    """Images of a place, by other weather, light, season, traffic and cameras."""
+    test_scenes: int = WorldConfig.test_scenes
+    """Other scenes, to test on."""
+    image_size: tuple[int, int] = WorldConfig.image_size
+    """Height and width in pixels."""
+    sceneries: tuple[Scenery, ...] = SCENERIES
+    """What places are, in turn."""
+    repaint: float = WorldConfig.repaint
+    """Largest deviation of the log colour of things from image to image."""
+    seed: int = WorldConfig.seed
+    """Draws the world."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
+    quiet: bool = False
+    """No progress bars."""
+
+
+def run(arguments: Render) -> None:
+    """Render the world, and print what is in it."""
+    prepare_json(arguments.json)
+    fields = {field.name for field in dataclasses.fields(WorldConfig)}
+    given = {name: value for name, value in vars(arguments).items() if name in fields}
+    config = WorldConfig(**given)
+    places = config.scenes * config.stations
+    total = places + config.test_scenes * config.stations
+    has_world(arguments.out, config)  # a wrong folder is told before there is a bar
+    with progress_bar("rendering the world", total, "places", quiet=arguments.quiet) as bar:
+        write_world(arguments.out, config, progress=lambda done, total: bar.advance(1))
+    tests = config.test_scenes * config.stations
+    say(
+        f"{arguments.out}: {counted(places, 'place')} with {config.images_per_place} images each "
+        f"in {arguments.out / 'train'}; {tests} others in {arguments.out / 'test'}"
+    )
+    give_json(
+        arguments.json,
+        {"out": str(arguments.out), "places": places, "test_places": tests} | given,
+    )

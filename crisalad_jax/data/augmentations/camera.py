@@ -1,0 +1,154 @@
+"""What cameras do to a picture: another stand, motion, few pixels, a smudge, noise, JPEG."""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+
+from crisalad_jax.config.checks import require, require_fraction
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image
+from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
+
+_QUALITY = (12, 85)
+"""Least and most quality of a JPEG."""
+
+
+@AUGMENTATIONS.register("camera")
+@dataclasses.dataclass(frozen=True)
+class CameraAugmentConfig(LightAugmentConfig):
+    """The light augmentation, and then a cheap camera: for rendered pictures, which lack one."""
+
+    perspective: float = 0.04
+    """Largest shift of a corner, as a share of the side."""
+    texture: float = 0.25
+    """Largest deviation of a multiplied texture of several scales, which rendered walls lack."""
+    filters: float = 0.3
+    """Probability of random filters over all colours, which change textures and keep outlines (Xu
+    et al., ICLR 2021)."""
+    occlusion: float = 0.3
+    """Probability that something covers a part."""
+    motion: float = 0.2
+    """Probability of motion blur, of up to a sixteenth of the width."""
+    coarse: float = 0.3
+    """Probability of fewer pixels: down to two fifths of the sides."""
+    noise: float = 8.0
+    """Largest deviation of noise, in grey levels."""
+    jpeg: float = 0.4
+    """Probability of another JPEG."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        require_fraction(self, "perspective")
+        for name in ("texture", "noise"):
+            value = getattr(self, name)
+            require(value >= 0, f"CameraAugmentConfig.{name}: found {value}, expected at least 0")
+        for name in ("filters", "occlusion", "motion", "coarse", "jpeg"):
+            value = getattr(self, name)
+            require(
+                0 <= value <= 1,
+                f"CameraAugmentConfig.{name}: found {value}, expected a probability from 0 to 1",
+            )
+
+    def apply(
+        self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
+    ) -> Image:
+        """Mirror all images of a place alike, change this one's light, then photograph it."""
+        if self.flip > 0 and of_place.random() < self.flip:
+            image = cv2.flip(image, 1)
+        if self.perspective > 0:
+            image = _moved(image, self.perspective, generator)
+        if self.texture > 0:
+            image = _textured(image, generator.uniform(0, self.texture), generator)
+        if generator.random() < self.filters:
+            image = _filtered(image, generator)
+        image = light_augment(image, self, generator)
+        if generator.random() < self.occlusion:
+            image = _covered(image, generator)
+        if generator.random() < self.motion:
+            image = _smeared(image, generator)
+        if generator.random() < self.coarse:
+            image = _coarsened(image, generator)
+        if self.noise > 0:
+            deviation = generator.uniform(0, self.noise)
+            noise = deviation * generator.standard_normal(image.shape, np.float32)
+            image = np.clip(np.round(image + noise), 0, 255).astype(np.uint8)
+        if generator.random() < self.jpeg:
+            quality = (cv2.IMWRITE_JPEG_QUALITY, int(generator.integers(*_QUALITY)))
+            data = cv2.imencode(".jpg", image, quality)[1]
+            image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
+        return image
+
+
+def _moved(image: Image, most: float, generator: np.random.Generator) -> Image:
+    """Move the corners a little, as another stand does."""
+    height, width = image.shape[:2]
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    shifts = generator.uniform(-most, most, (4, 2)) * (width, height)
+    matrix = cv2.getPerspectiveTransform(corners, (corners + shifts).astype(np.float32))
+    return cv2.warpPerspective(
+        image, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
+
+
+def _textured(image: Image, deviation: float, generator: np.random.Generator) -> Image:
+    """Multiply by smooth noise of four scales."""
+    height, width = image.shape[:2]
+    field = np.zeros((height, width), np.float32)
+    for scale in (1, 2, 4, 8):
+        size = (height // scale + 1, width // scale + 1)
+        coarse = generator.standard_normal(size, np.float32)
+        field += cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    changed = image * (1 + 0.5 * deviation * field[..., None])
+    return np.clip(np.round(changed), 0, 255).astype(np.uint8)
+
+
+def _filtered(image: Image, generator: np.random.Generator) -> Image:
+    """Mix the image with that of random filters, whose mean and deviation are the image's."""
+    side = int(generator.choice((1, 3, 5)))
+    weights = generator.standard_normal((3, 3, side, side), np.float32)
+    pixels = image.astype(np.float32)
+    found = np.stack(
+        [sum(cv2.filter2D(pixels[..., i], -1, each[i]) for i in range(3)) for each in weights],
+        axis=-1,
+    )
+    found = (found - found.mean()) / (found.std() + 1e-3) * pixels.std() + pixels.mean()
+    share = generator.uniform(0, 1)
+    return np.clip(np.round(share * found + (1 - share) * pixels), 0, 255).astype(np.uint8)
+
+
+def _covered(image: Image, generator: np.random.Generator) -> Image:
+    """Cover a rectangle or an ellipse by one colour."""
+    image = image.copy()
+    height, width = image.shape[:2]
+    size = (generator.uniform(0.05, 0.4, 2) * (width, height)).astype(int)
+    corner = (generator.uniform(-0.1, 0.9, 2) * (width, height)).astype(int)
+    colour = generator.uniform(0, 255, 3).tolist()
+    if generator.random() < 0.5:
+        cv2.rectangle(image, corner.tolist(), (corner + size).tolist(), colour, -1)
+    else:
+        centre, axes = (corner + size // 2).tolist(), (size // 2 + 1).tolist()
+        cv2.ellipse(image, centre, axes, 0, 0, 360, colour, -1)
+    return image
+
+
+def _smeared(image: Image, generator: np.random.Generator) -> Image:
+    """Blur along a line, mostly a level one."""
+    length = int(generator.integers(2, max(3, image.shape[1] // 16 + 1)))
+    angle = generator.normal(0, 0.4)
+    kernel = np.zeros((2 * length + 1, 2 * length + 1), np.float32)
+    reach = length * np.array((math.cos(angle), math.sin(angle)))
+    ends = np.round(length + np.array((-reach, reach)) / 2).astype(int).tolist()
+    cv2.line(kernel, ends[0], ends[1], 1.0)
+    return cv2.filter2D(image, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+
+
+def _coarsened(image: Image, generator: np.random.Generator) -> Image:
+    """Take fewer pixels, and enlarge them again."""
+    height, width = image.shape[:2]
+    share = generator.uniform(0.4, 0.9)
+    size = (max(2, round(share * width)), max(2, round(share * height)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    how = cv2.INTER_LINEAR if generator.random() < 0.7 else cv2.INTER_CUBIC
+    return cv2.resize(small, (width, height), interpolation=how)

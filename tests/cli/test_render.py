@@ -1,0 +1,38 @@
+"""`crisalad render`: what it writes, says and refuses."""
+
+import json
+import pathlib
+
+from crisalad_jax.cli import main
+from tests.cli.test_cli import Capture, fails
+
+SMALL = ("--scenes", "3", "--stations", "2", "--test-scenes", "2", "--image-size", "30", "40")
+
+
+def test_it_says_what_it_wrote(tmp_path: pathlib.Path, capfd: Capture) -> None:
+    out = tmp_path / "world"
+    given = ["render", "--out", str(out), *SMALL, "--quiet", "--json", str(tmp_path / "said.json")]
+    assert main(given) == 0
+    said = " ".join(capfd.readouterr().out.split())
+    assert said == (
+        f"{out}: 6 places with 4 images each in {out / 'train'}; 4 others in {out / 'test'}"
+    )
+    assert len(list((out / "train").rglob("*.jpg"))) == 6 * 4
+    assert len(list((out / "test").rglob("*.jpg"))) == 4 * 2
+    told = json.loads((tmp_path / "said.json").read_text())
+    assert (told["places"], told["test_places"], told["seed"]) == (6, 4, 0)
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: pathlib.Path, capfd: Capture) -> None:
+    out = tmp_path / "world"
+    for flag, value, words in (
+        ("--scenes", "0", "WorldConfig.scenes: found 0, expected at least 1"),
+        ("--repaint", "-1", "WorldConfig.repaint: found -1.0, expected at least 0"),
+        ("--sceneries", "sea", "sea"),
+        ("--seed", "-1", "WorldConfig.seed: found -1"),
+    ):
+        fails(capfd, "render", "--out", out, *SMALL, flag, value, words=(words,))
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("mine")
+    fails(capfd, "render", "--out", tmp_path / "file", *SMALL, words=("found a file",))
+    assert (tmp_path / "file").read_text() == "mine"
