@@ -191,7 +191,7 @@ def test_a_configuration_without_a_checksum_is_read_with_a_note(tmp_path: pathli
         ),
         (
             {"augmentation": {"name": "x"}},
-            "augmentation: found 'x', expected one of colour-crop, light, none, ",
+            "augmentation: found 'x', expected one of camera, colour-crop, light, none, ",
             "augmentation",
         ),
         # Under the names of version 0.1:
@@ -212,7 +212,7 @@ def test_a_configuration_without_a_checksum_is_read_with_a_note(tmp_path: pathli
         ),
         (
             {"augment": "x", "light_augment": {}},
-            "augmentation: found 'x', expected one of colour-crop, light, none, ",
+            "augmentation: found 'x', expected one of camera, colour-crop, light, none, ",
             "augmentation",
         ),
     ],
