@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 import pathlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -38,6 +38,8 @@ PLACE_SPACING = 80.0
 MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
+GSV_COLUMNS = "place_id,year,month,northdeg,city_id,lat,lon,panoid"
+"""Header of a city's table in GSV-Cities."""
 UTM_ORIGIN = (500_000.0, 5_000_000.0)
 """East and north in zone 32T of the test city's south-west corner."""
 
@@ -158,7 +160,7 @@ def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -
     name, centre = CITY_NAMES[city], (10.0 + city, -40.0)
     images = folder / "Images" / name
     images.mkdir(parents=True)
-    lines = ["place_id,year,month,northdeg,city_id,lat,lon,panoid"]
+    lines = [GSV_COLUMNS]
     indices = range(city, config.train_places, len(CITY_NAMES))
     for place_id, index in enumerate(indices, start=1):
         spot = _spot(config, 0, index, config.train_places)
@@ -169,13 +171,11 @@ def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -
             lon = f"{centre[1] + east / per_degree:.7f}"
             year, month = int(spot.rng.integers(2012, 2022)), MONTHS[view.season]
             northdeg, key = spot.northdeg(view), panoid(spot.rng)
-            lines.append(f"{place_id},{year},{month},{northdeg},{name},{lat},{lon},{key}")
-            stem = f"{name}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{key}"
-            write_jpeg(images / f"{stem}.jpg", render(spot.seed, view, config.image_size))
+            row, file = gsv_image(name, place_id, (year, month), northdeg, (lat, lon), key)
+            lines.append(row)
+            write_jpeg(images / file, render(spot.seed, view, config.image_size))
             yield
-    table = folder / "Dataframes" / f"{name}.csv"
-    table.parent.mkdir(exist_ok=True)
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_gsv_table(folder, name, lines)
 
 
 def _write_test(folder: pathlib.Path, config: SyntheticCityConfig) -> Iterator[None]:
@@ -211,6 +211,37 @@ def _write_test(folder: pathlib.Path, config: SyntheticCityConfig) -> Iterator[N
             path = folder / side / f"@{'@'.join(fields)}@.jpg"
             write_jpeg(path, render(spot.seed, view, config.image_size))
             yield
+
+
+def gsv_image(
+    city: str,
+    place: int,
+    date: tuple[int, int],
+    northdeg: int,
+    position: tuple[str, str],
+    key: str,
+) -> tuple[str, str]:
+    """Return a training image's row of the table of GSV-Cities, and its file's name.
+
+    Args:
+        city: the city's name.
+        place: the place's number in the city.
+        date: year and month.
+        northdeg: degrees clockwise from north.
+        position: latitude and longitude, as they are written.
+        key: name of the panorama.
+    """
+    (year, month), (lat, lon) = date, position
+    row = f"{place},{year},{month},{northdeg},{city},{lat},{lon},{key}"
+    name = f"{city}_{place:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{key}.jpg"
+    return row, name
+
+
+def write_gsv_table(folder: pathlib.Path, city: str, lines: Sequence[str]) -> None:
+    """Write a city's table, whose first line is `GSV_COLUMNS`."""
+    table = folder / "Dataframes" / f"{city}.csv"
+    table.parent.mkdir(exist_ok=True)
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_jpeg(path: pathlib.Path, image: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -10,11 +10,14 @@ import numpy as np
 
 from crisalad_jax.config.checks import check_seed, check_types
 from crisalad_jax.experiments.synthetic.city import (
+    GSV_COLUMNS,
     METRES_PER_DEGREE,
     MONTHS,
     UTM_ORIGIN,
+    gsv_image,
     holds,
     panoid,
+    write_gsv_table,
     write_jpeg,
 )
 from crisalad_jax.experiments.synthetic.picture import render
@@ -151,7 +154,7 @@ def _write_city(
 ) -> Iterator[None]:
     images = root / "Images" / name
     images.mkdir(parents=True)
-    lines = ["place_id,year,month,northdeg,city_id,lat,lon,panoid"]
+    lines = [GSV_COLUMNS]
     for scene in scenes:
         for station in range(config.stations):
             place_id = scene * config.stations + station + 1
@@ -160,14 +163,12 @@ def _write_city(
             seed = _seed(config, 0, scene)
             for view in views(config, seed, scenery, station, config.images_per_place, rng):
                 year, month = int(rng.integers(2012, 2022)), MONTHS[view.season]
-                key = panoid(rng)
-                lines.append(f"{place_id},{year},{month},0,{name},{lat},-40.0000000,{key}")
-                stem = f"{name}_{place_id:07d}_{year:04d}_{month:02d}_000_{lat}_-40.0000000_{key}"
-                write_jpeg(images / f"{stem}.jpg", render(seed, view, config.image_size, scenery))
+                position = lat, "-40.0000000"
+                row, file = gsv_image(name, place_id, (year, month), 0, position, panoid(rng))
+                lines.append(row)
+                write_jpeg(images / file, render(seed, view, config.image_size, scenery))
             yield
-    table = root / "Dataframes" / f"{name}.csv"
-    table.parent.mkdir(exist_ok=True)
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_gsv_table(root, name, lines)
 
 
 def _write_test(folder: pathlib.Path, config: WorldConfig) -> Iterator[None]:
