@@ -5,6 +5,7 @@ import pathlib
 import re
 from typing import TYPE_CHECKING, NamedTuple
 
+from crisalad_jax.checkpoints import starter
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 
@@ -27,7 +28,7 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
         path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
             DINO-SALAD, CricaVPR or another layout in `docs/methods.md`; torch files need torch. Or
             the name of a published model, as `crisalad models` lists them: it is downloaded once
-            into the cache.
+            into the cache. Or "starter", the small model in this package.
         verify: whether to check the bytes of a file of this package against its checksum.
 
     Returns:
@@ -52,14 +53,16 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
     return Model(checkpoint.params, checkpoint.config)
 
 
-def find_weights(weights: str | os.PathLike[str], *, quiet: bool = False) -> pathlib.Path:
+def find_weights(
+    weights: str | os.PathLike[str] | None, *, quiet: bool = False
+) -> pathlib.Path:
     """Return the file that is meant by a path, or by the name of a published model.
 
-    A published model is downloaded the first time, and its licence told each time. A file of the
+    None is the small model in this package, with a note; it has a name, too, "starter". A published model is downloaded the first time, and its licence told each time. A file of the
     same name in the working directory is taken instead, with a note.
 
     Args:
-        weights: a path, or a name of `crisalad models`.
+        weights: a path, or a name of `crisalad models`, or None.
         quiet: no progress bar.
 
     Returns:
@@ -75,11 +78,15 @@ def find_weights(weights: str | os.PathLike[str], *, quiet: bool = False) -> pat
         ...
         crisalad_jax.utils.errors.InputError: megalok: found no such file, ...; nearest: megaloc...
     """
+    if weights is None:
+        return starter.default_weights()
     path = pathlib.Path(weights)
     name = os.fspath(weights)
     is_there = os.path.isfile(path)
     if is_there and path.suffix:
         return path
+    if name == starter.NAME and not is_there:
+        return starter.FILE
     # Imported here: the published models, whose names have no suffix, need JAX.
     from crisalad_jax.checkpoints.published import PUBLISHED
     from crisalad_jax.checkpoints.published.base import nearest_names

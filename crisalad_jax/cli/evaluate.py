@@ -6,6 +6,7 @@ import pathlib
 from typing import Any, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.starter import default_weights
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
@@ -65,10 +66,10 @@ class Evaluate:
     """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
     folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     weights: pathlib.Path | None = None
-    """A .safetensors file of this package, or a published model's name (`crisalad models`); none
-    evaluates an untrained model of --preset."""
+    """A .safetensors file of this package, or a published model's name (`crisalad models`); by
+    default the small model in this package, starter."""
     preset: str | None = None
-    """Model to start untrained where there are no weights, by default b14."""
+    """Evaluate an untrained model of this size in place of one with weights: tiny, s14, b14..."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
@@ -145,6 +146,8 @@ def run(arguments: Evaluate) -> None:
     if arguments.precision is not None:
         check_precision(arguments.precision)
     _check_files(arguments)
+    if arguments.weights is None and arguments.preset is None:
+        arguments = dataclasses.replace(arguments, weights=default_weights())
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
@@ -155,7 +158,7 @@ def run(arguments: Evaluate) -> None:
         "verify": arguments.verify,
         "quiet": arguments.quiet,
     }
-    if arguments.weights is None or arguments.runtime == "jax":  # others have weights, no preset
+    if arguments.weights is None or arguments.runtime == "jax":
         params, config, model_name = load_model(
             arguments.weights, preset=arguments.preset, seed=arguments.seed, **options
         )
@@ -244,10 +247,6 @@ def _check_files(arguments: Evaluate) -> None:
                 raise InputError(
                     f"--{name}: found with --runtime {arguments.runtime}, expected jax"
                 )
-        if arguments.weights is None:
-            raise InputError(
-                f"--runtime: found {arguments.runtime} without --weights, expected both"
-            )
     if arguments.rerank is None and arguments.rerank_weights is not None:
         raise InputError(
             "rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"

@@ -36,13 +36,14 @@ EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
 class Extract:
     """Write a descriptor of every image in a folder, in sorted path order."""
 
-    weights: pathlib.Path
-    """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
     images: pathlib.Path
     """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
     (docs/how-to/image-sources.md)."""
     out: pathlib.Path
     """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
+    weights: pathlib.Path | None = None
+    """A .safetensors file of this package, or a published model's name (`crisalad models`); by
+    default the small model in this package, starter."""
     fps: float | None = None
     """Frames a second taken of a video."""
     image_size: tuple[int, int] | None = None

@@ -6,13 +6,14 @@ from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
+from crisalad_jax.checkpoints.starter import resolved
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import RuntimeName, give_json, open_model, prepare_json, say
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
-from crisalad_jax.retrieval.maps.head import has_images
+from crisalad_jax.retrieval.maps.head import has_images, read_head
 from crisalad_jax.retrieval.maps.manifest import read_description
 from crisalad_jax.utils.output import counted
 
@@ -23,14 +24,15 @@ EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --
 class Index:
     """Make a map of a folder of images, or append to it those that it lacks."""
 
-    weights: pathlib.Path
-    """A .safetensors file of this package, or a published model's name (`crisalad models`); of a
-    map that is there, the same model's."""
     images: pathlib.Path
     """Folder, file, pattern, list, table or video (docs/how-to/image-sources.md); the map names
     images by their paths in the folder, subfolders included."""
     out: pathlib.Path
     """The map's folder. After a kill the same command goes on."""
+    weights: pathlib.Path | None = None
+    """A .safetensors file of this package, or a published model's name (`crisalad models`); by
+    default that of the map that is there, and of a new map the small model in this package,
+    starter."""
     fps: float | None = None
     """Frames a second taken of a video."""
     positions: pathlib.Path | None = None
@@ -77,7 +79,7 @@ class Index:
 def run(arguments: Index) -> None:
     """Index the images, and print what became of them."""
     prepare_json(arguments.json)
-    weights = find_weights(arguments.weights, quiet=arguments.quiet)
+    weights = _weights(arguments)
     params, config = _model(arguments, weights)
     result = index(
         params,
@@ -121,6 +123,15 @@ def run(arguments: Index) -> None:
             "resized": description.config.images_in_words,
         },
     )
+
+
+def _weights(arguments: Index) -> pathlib.Path:
+    """Find the model's file, by default that of the map."""
+    if arguments.weights is None and has_images(arguments.out):
+        there = read_head(arguments.out)
+        if there is not None:
+            return resolved(there.weights)
+    return find_weights(arguments.weights, quiet=arguments.quiet)
 
 
 def _model(arguments: Index, weights: pathlib.Path) -> tuple[Crisalad | Runtime, ModelConfig]:

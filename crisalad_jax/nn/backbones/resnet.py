@@ -7,7 +7,7 @@ from typing import Any, Literal
 import jax
 from jaxtyping import PRNGKeyArray
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.backbones.base import BACKBONES
 from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages, Valid
@@ -22,8 +22,6 @@ BLOCKS: dict[Layers, tuple[int, ...]] = {
     152: (3, 8, 36, 3),
 }
 """Number of residual blocks of each stage, by the number of layers."""
-STEM_DIM = 64
-"""Width of the first convolution, and within the blocks of the first stage."""
 STEM_SIDE = 7
 """Side of the first convolution's kernel."""
 
@@ -46,6 +44,8 @@ class ResNetConfig(StagedBackbone):
     """Number of layers. 18 has blocks of two convolutions, the others of three."""
     stages: int = 4
     """Number of stages that are kept, from the first."""
+    width: int = 64
+    """Width of the first convolution, and within the blocks of the first stage; as published 64."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -53,6 +53,7 @@ class ResNetConfig(StagedBackbone):
             1 <= self.stages <= 4,
             f"ResNetConfig.stages: found {self.stages}, expected 1 to 4",
         )
+        require_positive(self, "width")
 
     @property
     def depth(self) -> int:
@@ -72,11 +73,12 @@ class ResNetConfig(StagedBackbone):
     @property
     def extras(self) -> str:
         """The number of layers."""
-        return f", ResNet-{self.layers}"
+        width = "" if self.width == 64 else f" of width {self.width}"
+        return f", ResNet-{self.layers}{width}"
 
     def widths(self, stage: int) -> tuple[int, ...]:
         """Return the widths of a block's convolutions in the stage of this number, from 0."""
-        width = STEM_DIM * 2**stage
+        width = self.width * 2**stage
         return (width, width) if self.layers == 18 else (width, width, 4 * width)
 
     def kernels(self) -> tuple[int, ...]:
@@ -92,7 +94,7 @@ class ResNetConfig(StagedBackbone):
         """Draw parameters as torchvision does before training."""
         stem_key, *keys = draw.split(key, 1 + self.stages)
         return Stages(
-            init_conv_norm(stem_key, STEM_SIDE, 3, STEM_DIM),
+            init_conv_norm(stem_key, STEM_SIDE, 3, self.width),
             tuple(Stage(tuple(self._init_stage(keys[i], i))) for i in range(self.stages)),
         )
 
@@ -105,7 +107,7 @@ class ResNetConfig(StagedBackbone):
         return changed, dataclasses.replace(params, blocks=blocks)
 
     def _init_stage(self, key: PRNGKeyArray, stage: int) -> Iterator[Residual]:
-        d_in = self.widths(stage - 1)[-1] if stage else STEM_DIM
+        d_in = self.widths(stage - 1)[-1] if stage else self.width
         for block_key in draw.split(key, BLOCKS[self.layers][stage]):
             shortcut_key, *keys = draw.split(block_key, 4)
             widths = self.widths(stage)

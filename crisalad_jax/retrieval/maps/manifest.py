@@ -8,6 +8,7 @@ import pathlib
 import uuid
 from collections.abc import Iterator
 
+from crisalad_jax.checkpoints.starter import recorded
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.retrieval.maps.head import (
@@ -26,7 +27,6 @@ from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.retrieval.model import Model, model_hash
 from crisalad_jax.retrieval.pca import Pca, pca_hash
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.temporaries import remove_temporaries
 
 
@@ -64,7 +64,7 @@ def describe_map(
             )
     return MapDescription(
         model=model_hash(params, config),
-        weights=str(real_path(weights)),
+        weights=recorded(weights),
         config=config,
         descriptor_length=config.descriptor_dim if pca is None else len(pca.components),
         store=store_name(store, folder, dtype),

@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
+from crisalad_jax.checkpoints.starter import resolved
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
@@ -595,7 +596,7 @@ class Map:
 
     def _weights(self, weights: str | os.PathLike[str] | None) -> str | os.PathLike[str]:
         """Return a model's file, by default where it was when the map was made."""
-        file = pathlib.Path(self.head.weights) if weights is None else weights
+        file = resolved(self.head.weights) if weights is None else weights
         if weights is None and not pathlib.Path(file).exists():
             raise InputError(
                 f"{self.folder}: found no {file}, which made this map, expected it there or as "

@@ -1,0 +1,40 @@
+"""The model in this package: small, trained on rendered pictures alone, there before any download.
+
+docs/starter.md says how it was trained, and what it recalls. It is no published model: its file is
+part of the package, and its licence the package's.
+"""
+
+import os
+import pathlib
+
+from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.notes import tell
+
+NAME = "starter"
+"""Its name, for `--weights` and `load`."""
+FILE = pathlib.Path(__file__).with_name(f"{NAME}.safetensors")
+BEST = "megaloc"
+"""The published model that recalls the most, which a note names."""
+
+
+def default_weights() -> pathlib.Path:
+    """Return the file of the model in this package, and tell that it was taken."""
+    tell(
+        f"no --weights: taking {NAME}, the small model in this package, trained on rendered "
+        f"pictures alone (docs/{NAME}.md); for the best recall: --weights {BEST}"
+    )
+    return FILE
+
+
+def recorded(weights: str | os.PathLike[str]) -> str:
+    """Return what a map records of where its weights are: a path, or the name of this model.
+
+    The package has another place on another machine, where a map may be taken.
+    """
+    path = real_path(pathlib.Path(weights))
+    return NAME if path == real_path(FILE) else str(path)
+
+
+def resolved(recorded: str) -> pathlib.Path:
+    """Return the file that `recorded` was made of."""
+    return FILE if recorded == NAME else pathlib.Path(recorded)
