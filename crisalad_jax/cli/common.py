@@ -185,6 +185,7 @@ def open_model(
         preprocessing=config.preprocessing,
         precision=config.compute_dtype,
         any_grouping=any_grouping and config.cross_image.layers > 0,
+        verify=verify,
     )
     return model, config, f"{name}, {runtime}"
 

@@ -86,7 +86,12 @@ def model_of(places: Map, arguments: "Query") -> "Crisalad | Runtime":
     weights = find_given(arguments.weights, quiet=arguments.quiet)
     if arguments.runtime == "jax":
         return places.load_params(weights)
-    return places.load_runtime(arguments.runtime, weights, any_grouping=arguments.window > 1)
+    return places.load_runtime(
+        arguments.runtime,
+        weights,
+        any_grouping=arguments.window > 1,
+        verify=arguments.verify,
+    )
 
 
 def sequence_of(arguments: "Query") -> BayesFilter | None:

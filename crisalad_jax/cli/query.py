@@ -91,8 +91,8 @@ class Query:
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
     verify: bool = True
-    """Check the map's descriptors against their checksums; --no-verify skips that, where files are
-    huge."""
+    """Check the map's descriptors, and an exported model, against their checksums; --no-verify
+    skips that, where files are huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     plugin: tuple[str, ...] = ()

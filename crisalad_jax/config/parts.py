@@ -47,7 +47,8 @@ class Part:
         """Pickle by name, so that another process finds a part of a plug-in file."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         plugin = plugin_of(type(self).__module__)
-        return _restore, (self.registry.kind, self.part_name, fields, plugin)
+        # By its base class, whose package registers the parts as it is imported.
+        return _restore, (self.registry.base, self.part_name, fields, plugin)
 
 
 P = TypeVar("P", bound=Part)
@@ -69,8 +70,8 @@ REGISTRIES: dict[str, "Registry[Any]"] = {}
 """All registries by kind."""
 
 
-def _restore(kind: str, name: str, fields: Mapping[str, Any], plugin: str | None) -> Part:
-    registry = REGISTRIES[kind]
+def _restore(base: type[Part], name: str, fields: Mapping[str, Any], plugin: str | None) -> Part:
+    registry = base.registry
     if plugin is not None and name not in registry.names():
         load_plugin(plugin)
     return registry.find(name)(**fields)

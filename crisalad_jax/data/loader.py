@@ -8,13 +8,12 @@ import os
 import pathlib
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from typing import Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
-from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
@@ -24,6 +23,9 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
+
+if TYPE_CHECKING:  # who only reads images starts sooner without them
+    from crisalad_jax.data.augmentations import Augmentation
 
 OnBadImage = Literal["skip", "stop"]
 BATCHES_AHEAD = 2
@@ -107,7 +109,7 @@ def training_batches(
     places_per_batch: int,
     images_per_place: int,
     order: Order,
-    augmentation: Augmentation,
+    augmentation: "Augmentation",
     seed: int,
     epoch: int,
     preprocessing: PreprocessingConfig = PreprocessingConfig(),
@@ -209,7 +211,7 @@ def batches_of_groups(
     labels: Int[np.ndarray, "steps groups images"],
     *,
     image_size: tuple[int, int],
-    augmentation: Augmentation,
+    augmentation: "Augmentation",
     seed: tuple[int, ...],
     preprocessing: PreprocessingConfig = PreprocessingConfig(),
     start_step: int = 0,
@@ -286,7 +288,7 @@ class _TrainingImages:
     how: Preparation
     batch_size: int
     images_per_group: int
-    augmentation: Augmentation
+    augmentation: "Augmentation"
     seed: tuple[int, ...]
 
     def __call__(self, position: int) -> Pixels:

@@ -57,6 +57,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.pixels import LOCAL_NOISE, LOCAL_WINDOW
 from crisalad_jax.retrieval import describe as describing
 from crisalad_jax.retrieval.descriptor_files import write_descriptors
+from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.host import usable_cores
 
@@ -248,7 +249,9 @@ def by_us(both: Sides, batch: int) -> list[Contender]:
         model = both.ours, both.config
         with mock.patch.multiple(
             describing,
-            image_batches=lambda *args, **kwargs: watch.each(image_batches(*args, **kwargs)),
+            photograph_batches=lambda *args, **kwargs: watch.each(
+                photograph_batches(*args, **kwargs)
+            ),
             extract_tokens=watch.program(describing.extract_tokens),
         ):
             tokens = describing.read_tokens(

@@ -122,7 +122,7 @@ class FileStore:
         """Compute exact similarities of candidates; no other rows are read."""
         similarities = np.empty(numbers.shape, np.float32)
         segments = np.searchsorted(firsts, numbers, side="right") - 1
-        for segment in np.unique(segments):
+        for segment in sorted(set(segments.ravel().tolist())):
             first = firsts[segment]
             query, column = np.nonzero(segments == segment)
             similarities[query, column] = exact_similarities(
@@ -159,7 +159,7 @@ class FileStore:
         firsts = np.array(list(self._counts))
         rows = np.empty((len(numbers), self._length), np.float32)
         segments = np.searchsorted(firsts, numbers, side="right") - 1
-        for segment in np.unique(segments):
+        for segment in sorted(set(segments.ravel().tolist())):
             places, first = np.flatnonzero(segments == segment), int(firsts[segment])
             if first not in self._mapped:
                 if len(self._mapped) >= _MAPPED:

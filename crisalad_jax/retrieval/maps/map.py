@@ -567,6 +567,7 @@ class Map:
         weights: str | os.PathLike[str] | None = None,
         *,
         any_grouping: bool = False,
+        verify: bool = True,
     ) -> Runtime:
         """Open the model that made the map in another engine; JAX is not imported for it.
 
@@ -574,6 +575,7 @@ class Map:
             engine: "onnxruntime" or "openvino".
             weights: an exported folder or the file; None is where it was then.
             any_grouping: whether queries look at each other.
+            verify: whether to compare the exported files with their checksums.
 
         Returns:
             The model, in the place of parameters.
@@ -590,6 +592,7 @@ class Map:
             preprocessing=config.get("preprocessing"),
             precision=config.get("compute_dtype", "float32"),
             any_grouping=any_grouping,
+            verify=verify,
         )
         self._check_runtime(runtime, file)
         return runtime
