@@ -53,13 +53,12 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
     return Model(checkpoint.params, checkpoint.config)
 
 
-def find_weights(
-    weights: str | os.PathLike[str] | None, *, quiet: bool = False
-) -> pathlib.Path:
+def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False) -> pathlib.Path:
     """Return the file that is meant by a path, or by the name of a published model.
 
-    None is the small model in this package, with a note; it has a name, too, "starter". A published model is downloaded the first time, and its licence told each time. A file of the
-    same name in the working directory is taken instead, with a note.
+    None is the small model in this package, with a note; it has a name, too, "starter". A published
+    model is downloaded the first time, and its licence told each time. A file of the same name in
+    the working directory is taken instead, with a note.
 
     Args:
         weights: a path, or a name of `crisalad models`, or None.

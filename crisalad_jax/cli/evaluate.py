@@ -6,8 +6,8 @@ import pathlib
 from typing import Any, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.starter import default_weights
 from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.checkpoints.starter import default_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     RuntimeName,

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
 from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
@@ -39,6 +40,7 @@ def run(arguments: Models) -> None:
         if hidden:
             say(f"left out in {width} columns: {', '.join(hidden)} (crisalad models | less -S)")
         say(f"{len(models)} models; * in the cache, {cache_folder()}")
+        say(f"{starter.NAME}: a small model in this package, which commands take without --weights")
         say("crisalad models NAME tells all of one: its images, paper, file and address")
         values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
     else:

@@ -1,0 +1,70 @@
+"""The model in the package: its file, its numbers on another machine, what it tells apart."""
+
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+import safetensors
+
+from crisalad_jax.checkpoints import starter
+from crisalad_jax.checkpoints.load import find_weights, load
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.images import read_image
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.metrics import recalls
+from crisalad_jax.experiments.baselines import hog_descriptors
+from crisalad_jax.experiments.synthetic import WorldConfig, write_world
+from crisalad_jax.nn.model import describe
+from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.retrieval.search import search
+from crisalad_jax.utils.notes import Note
+
+GOLDEN = pathlib.Path(__file__).parents[2] / "parity" / "goldens" / "starter.npz"
+"""Two pictures, and their descriptors on the machine that trained the model."""
+# Another processor adds up in another order; the descriptors are unit vectors.
+TOLERANCE = 1e-5
+
+
+def test_it_is_small_enough_for_a_package() -> None:
+    """The limits that were set for it: 6 million parameters, 12 MB."""
+    assert starter.FILE.stat().st_size <= 12e6
+    assert sum(leaf.size for leaf in jax.tree.leaves(load("starter").params)) <= 6e6
+    with safetensors.safe_open(starter.FILE, framework="numpy") as file:
+        types = {file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
+    assert types == {"F16"}
+
+
+def test_another_machine_gets_the_same_descriptors() -> None:
+    golden = np.load(GOLDEN)
+    params, config = load("starter")
+    images = np.stack([prepare_image(image, config) for image in golden["images"]])
+    found = np.asarray(describe(params, images, config))
+    np.testing.assert_allclose(found, golden["descriptors"], rtol=0, atol=TOLERANCE)
+
+
+def test_its_name_is_its_file_and_no_weights_mean_it_with_a_note() -> None:
+    assert find_weights("starter") == starter.FILE
+    with pytest.warns(Note, match=r"no --weights: taking starter.*--weights megaloc"):
+        assert find_weights(None) == starter.FILE
+
+
+def test_a_file_of_its_name_is_taken_instead(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "starter").write_bytes(b"mine")
+    assert find_weights("starter") == pathlib.Path("starter")
+
+
+def test_it_tells_places_apart_that_it_never_saw(tmp_path: pathlib.Path) -> None:
+    """On scenes of another seed it recalls more than HOG, which needs no training."""
+    world = WorldConfig(scenes=1, stations=2, images_per_place=4, test_scenes=16, seed=20261125)
+    write_world(tmp_path / "world", world)
+    benchmark = open_benchmark(tmp_path / "world" / "test")
+    params, config = load("starter")
+    (result,) = evaluate(params, config, benchmark, groupings=["single"], quiet=True)
+    sides = (benchmark.database, benchmark.queries)
+    database, queries = (hog_descriptors([read_image(path) for path in side]) for side in sides)
+    hog = recalls(search(database, queries, k=1).indices, benchmark.ground_truth(), (1,))
+    assert result.recalls[1] > hog[1]

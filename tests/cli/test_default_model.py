@@ -1,0 +1,93 @@
+"""Commands without --weights: the model in the package, and one line that says so."""
+
+import json
+import pathlib
+import shutil
+
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.load import load
+from crisalad_jax.cli import main
+from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.nn.model import describe
+from crisalad_jax.retrieval.photographs import prepare_image
+from tests.cli.test_cli import Capture
+
+NOTE = "crisalad: note: no --weights: taking starter"
+
+
+def said(capfd: Capture, *arguments: object) -> tuple[str, list[str]]:
+    """Run; the words on stdout, and the notes."""
+    code = main([str(a) for a in arguments])
+    printed = capfd.readouterr()
+    assert code == 0, printed.err
+    notes = [line for line in printed.err.splitlines() if line.startswith("crisalad: note")]
+    return " ".join(printed.out.split()), notes
+
+
+def test_extract_takes_it(shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture) -> None:
+    given = ("extract", "--images", shared / "town", "--quiet")
+    _, (note,) = said(capfd, *given, "--out", tmp_path / "default.npy")
+    assert note.startswith(NOTE)
+    assert note.endswith("for the best recall: --weights megaloc")
+    _, notes = said(capfd, *given, "--out", tmp_path / "named.npy", "--weights", "starter")
+    assert notes == []
+    params, config = load("starter")
+    paths = list_images(shared / "town")
+    images = np.stack([prepare_image(read_image(path), config) for path in paths])
+    expected = np.asarray(describe(params, images, config))
+    for name in ("default", "named"):
+        # Batches of another size add up in another order; descriptors are unit vectors.
+        found = np.load(tmp_path / f"{name}.npy")
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+
+
+@pytest.mark.usefixtures("symbolic_shapes")
+@pytest.mark.parametrize("runtime", ["jax", "onnxruntime"])
+def test_a_map_is_made_asked_and_grown_without_weights(
+    runtime: str, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
+    flags = ("--out", out, "--runtime", runtime, "--quiet")
+    _, notes = said(capfd, "index", "--images", images, *flags)
+    assert notes[0].startswith(NOTE)
+    # The name and no path: the package lies elsewhere on another machine.
+    assert json.loads((out / "map.json").read_text())["weights"] == "starter"
+    photograph = list_images(images)[1]
+    asked = ("query", photograph, "--map", out, "--runtime", runtime, "--quiet", "--json", "-")
+    answers, notes = said(capfd, *asked)
+    first = json.loads(answers)["neighbours"][0]
+    assert (first["name"], notes) == (photograph.name, [])
+    assert first["similarity"] == pytest.approx(1, abs=1e-5)  # six digits are printed
+    shutil.copytree(images, tmp_path / "more")
+    shutil.copy(photograph, tmp_path / "more" / "new.jpg")
+    words, notes = said(capfd, "index", "--images", tmp_path / "more", *flags)
+    assert "1 image added" in words
+    assert notes == []
+
+
+def test_a_map_grows_by_its_own_model(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    images, out = shared / "town" / "images" / "test", tmp_path / "map"
+    flags = ("--out", out, "--quiet")
+    weights = ("--weights", shared / "weights.safetensors")
+    said(capfd, "index", "--images", images / "database", *weights, *flags)
+    before = json.loads((out / "map.json").read_text())["model"]
+    words, notes = said(capfd, "index", "--images", images / "queries", *flags)
+    assert "added" in words
+    assert notes == []
+    assert json.loads((out / "map.json").read_text())["model"] == before
+
+
+def test_evaluate_takes_it_and_a_preset_is_still_untrained(
+    shared: pathlib.Path, capfd: Capture
+) -> None:
+    given = ("evaluate", "--data", shared / "town", "--quiet")
+    words, (note,) = said(capfd, *given)
+    assert note.startswith(NOTE)
+    assert "starter.safetensors" in words
+    words, notes = said(capfd, *given, "--preset", "tiny", "--grouping", "single")
+    assert "untrained tiny, seed 0" in words
+    assert notes == []
