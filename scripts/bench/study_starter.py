@@ -1,0 +1,87 @@
+"""What the model in the package recalls, beside HOG and the same network untrained.
+
+    python scripts/bench/study_starter.py --data SET... [--weights FILE] [--page docs/starter.md]
+
+Every image is described alone. An interval is the bootstrap's, of 95 %. With --page the table takes
+its place in the page.
+"""
+
+import argparse
+import pathlib
+from collections.abc import Iterator, Mapping
+
+import jax
+import numpy as np
+
+from crisalad_jax.checkpoints import starter
+from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.images import read_image
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.metrics import (
+    Interval,
+    bootstrap_interval,
+    recalls,
+    right_retrievals,
+)
+from crisalad_jax.experiments.baselines import hog_descriptors
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.retrieval.search import search
+from crisalad_jax.utils.files import around
+
+KS = (1, 5, 10)
+
+
+def by_hog(data: Benchmark) -> tuple[Mapping[int, float], Interval]:
+    """Recalls of HOG, and the interval of the first."""
+    sides = (data.database, data.queries)
+    database, queries = (hog_descriptors([read_image(path) for path in side]) for side in sides)
+    indices, positives = search(database, queries, k=max(KS)).indices, data.ground_truth()
+    hits = np.asarray(right_retrievals(indices[:, :1], positives)).reshape(-1).astype(int)
+    return recalls(indices, positives, KS), bootstrap_interval(hits)
+
+
+def by_model(
+    params: Crisalad, config: ModelConfig, data: Benchmark
+) -> tuple[Mapping[int, float], Interval]:
+    """Recalls of a model, and the interval of the first."""
+    (result,) = evaluate(params, config, data, groupings=["single"], quiet=True)
+    return result.recalls, result.intervals[1]
+
+
+def rows(weights: pathlib.Path, sets: list[Benchmark]) -> Iterator[str]:
+    """The lines of the table."""
+    params, config = load_weights(weights)
+    untrained = init_crisalad(jax.random.key(0), config)
+    for data in sets:
+        for name, (found, interval) in (
+            ("HOG", by_hog(data)),
+            ("untrained", by_model(untrained, config, data)),
+            ("**starter**", by_model(params, config, data)),
+        ):
+            first, *others = (f"{100 * found[k]:.1f}" for k in KS)
+            low, high = (f"{100 * each:.1f}" for each in (interval.low, interval.high))
+            cells = (data.name, str(len(data.queries)), name, f"{first} ({low} to {high})", *others)
+            yield f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=pathlib.Path, nargs="+", required=True)
+    parser.add_argument("--weights", type=pathlib.Path, default=starter.FILE)
+    parser.add_argument("--page", type=pathlib.Path)
+    given = parser.parse_args()
+    sets = [open_benchmark(path) for path in given.data]
+    heads = ["set", "queries", "descriptor", *(f"R@{k}" for k in KS)]
+    lines = [f"| {' | '.join(heads)} |", "| --- | ---: | --- | ---: | ---: | ---: |"]
+    for line in rows(given.weights, sets):
+        lines.append(line)
+        print(line, flush=True)
+    if given.page is not None:
+        before, after = around(given.page, "recalls")
+        given.page.write_text(before + "\n".join(lines) + "\n" + after, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
