@@ -21,6 +21,7 @@ from crisalad_jax.checkpoints import export as exports
 from crisalad_jax.checkpoints.engines import import_openvino, load_program
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.onnx_format.program import write_onnx
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
@@ -167,6 +168,7 @@ def test_what_tensorrt_needs_of_a_program(beside: pathlib.Path):
         dataclasses.replace(MODEL, aggregator="netvlad", cross_image=ALONE),
         dataclasses.replace(MODEL, aggregator="supervlad"),
         dataclasses.replace(MODEL, aggregator="class-token", cross_image=ALONE),
+        dataclasses.replace(MODEL, aggregator=AnyLocConfig(layer=-1), cross_image=ALONE),
         dataclasses.replace(
             MODEL,
             image_size=(64, 96),
@@ -178,7 +180,7 @@ def test_what_tensorrt_needs_of_a_program(beside: pathlib.Path):
     ],
     ids=[
         *("pyramid", "GeM", "Conv-AP", "CosPlace", "MixVPR", "BoQ", "NetVLAD", "SuperVLAD"),
-        *("class token", "ResNet", "tiny"),
+        *("class token", "AnyLoc", "ResNet", "tiny"),
     ],
 )
 @pytest.mark.parametrize("format", ["onnx", "openvino"])
