@@ -3,23 +3,27 @@
 # about another. Without a folder it draws some places to try it on. No weights to download.
 set -euo pipefail
 usage="usage: bash scripts/find.sh [FOLDER [PHOTOGRAPH]]"
-[ $# -le 2 ] || { echo "$usage" >&2; exit 2; }
-for path in "$@"; do
-  [ -e "$path" ] || { echo "$path: found no such file or folder; $usage" >&2; exit 2; }
-done
-[ $# -eq 0 ] || images="$(realpath "$1")"
-[ $# -lt 2 ] || photograph="$(realpath "$2")"
+stop() { echo "$1; $usage" >&2; exit 2; }
+case "${1:-}" in -h | --help) echo "$usage"; exit ;; esac
+[ $# -le 2 ] || stop "found $# arguments, expected at most 2"
+[ $# -lt 1 ] || [ -d "$1" ] || stop "$1: found no such folder"
+[ $# -lt 2 ] || [ -e "$2" ] || stop "$2: found no such photograph"
+[ $# -lt 1 ] || images="$(realpath -- "$1")"
+[ $# -lt 2 ] || photograph="$(realpath -- "$2")"
 cd "$(dirname "$0")/.."
-source scripts/environment.sh "[maps]"
+source scripts/environment.sh "[maps,report]"
 if [ $# -eq 0 ]; then
   echo "No folder given: drawing 96 places to try it on. $usage" >&2
   crisalad render --out found/world --scenes 1 --test-scenes 24
-  images=found/world/test/images/test/database
-  photograph=found/world/test/images/test/queries
+  images="$PWD/found/world/test/images/test/database"
+  photograph="$PWD/found/world/test/images/test/queries"
+elif [ $# -eq 1 ]; then
+  echo "No photograph given: asking about the folder's first, which will find itself first." >&2
+  photograph="$(python -c 'import sys
+from crisalad_jax.data.images import list_images
+print(list_images(sys.argv[1])[0])' "$images")"
 fi
-map="found/$(basename "$images").map"
-crisalad index --images "$images" --out "$map"
-if [ $# -eq 1 ]; then
-  photograph="$(find "$images" -type f \( -iname '*.jpg' -o -iname '*.jpeg' -o -iname '*.png' \) -print -quit)"
-fi
-crisalad query "$photograph" --map "$map" --gallery found/answers.png
+# A map for each folder: of two with the same name, too.
+map="$PWD/found/$(basename -- "$images")-$(cksum <<<"$images" | cut -d " " -f 1).map"
+crisalad index --images "$images" --out "$map" --on-bad-image skip
+crisalad query "$photograph" --map "$map" --gallery "$PWD/found/answers.png"

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pathlib
+import pickle
 import shutil
 import subprocess
 import sys
@@ -703,3 +704,12 @@ def close(batch):
     monkeypatch.setattr(source, "_file_digest", source._file_digest.__wrapped__)
     words = f"{out}: found another source of loss.kind close than the run began with; expected"
     fails(capfd, *given, words=(words,))
+
+
+def test_settings_of_the_transport_are_unpickled_by_a_new_process(tmp_path: pathlib.Path):
+    """The gradient's part is registered by a module that the configuration does not import."""
+    config = cj.SinkhornConfig(iterations=7)
+    (tmp_path / "config").write_bytes(pickle.dumps(config))
+    program = f"import pickle; print(pickle.load(open({str(tmp_path / 'config')!r}, 'rb')))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.returncode) == (repr(config), 0)

@@ -57,8 +57,8 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
     """Return the file that is meant by a path, or by the name of a published model.
 
     None is the small model in this package, with a note; it has a name, too, "starter". A published
-    model is downloaded the first time, and its licence told each time. A file of the same name in
-    the working directory is taken instead, with a note.
+    model is downloaded the first time, and its licence told each time. A file of such a name in the
+    working directory is taken instead, with a note.
 
     Args:
         weights: a path, or a name of `crisalad models`, or None.
@@ -92,8 +92,8 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
 
     model = PUBLISHED.get(name)
     if is_there:
-        if model is not None:
-            tell(f"{name}: found a file of this name here, and took that, not the published model")
+        if model is not None or name == starter.NAME:
+            tell(f"{name}: found a file of this name here, and took that, not the model so named")
         return path
     if model is not None:
         from crisalad_jax.checkpoints.cache import cached_weights

@@ -32,9 +32,10 @@ def recorded(weights: str | os.PathLike[str]) -> str:
     The package has another place on another machine, where a map may be taken.
     """
     path = real_path(pathlib.Path(weights))
-    return NAME if path == real_path(FILE) else str(path)
+    is_named = os.fspath(weights) == NAME and not path.exists()
+    return NAME if is_named or path == real_path(FILE) else str(path)
 
 
-def resolved(recorded: str) -> pathlib.Path:
-    """Return the file that `recorded` was made of."""
-    return FILE if recorded == NAME else pathlib.Path(recorded)
+def resolved(record: str) -> pathlib.Path:
+    """Return the file of weights that a map has a record of, the opposite of `recorded`."""
+    return FILE if record == NAME else pathlib.Path(record)

@@ -205,7 +205,7 @@ def load_model(
 
     Args:
         weights: the file, or a published model's name.
-        preset: the size of the untrained model; None is b14.
+        preset: the size of the untrained model, where there is no file.
         seed: draws the parameters of the untrained model.
         image_size: height and width in pixels; None is the model's.
         resize: words that change how images are resized; see `ModelConfig.resized`.
@@ -227,7 +227,7 @@ def load_model(
         from crisalad_jax.nn.model import init_crisalad
         from crisalad_jax.training.recipes import recipe
 
-        preset = preset or "b14"
+        assert preset is not None  # `evaluate` takes starter where neither is given
         config = recipe(preset).model
         check_seed("seed", seed)
         params = init_crisalad(jax.random.key(seed), config)

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.checkpoints.starter import default_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     RuntimeName,
@@ -66,10 +65,10 @@ class Evaluate:
     """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
     folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     weights: pathlib.Path | None = None
-    """A .safetensors file of this package, or a published model's name (`crisalad models`); by
-    default the small model in this package, starter."""
+    """By default starter, the small model in this package; or a .safetensors file, or a published
+    model's name (`crisalad models`)."""
     preset: str | None = None
-    """Evaluate an untrained model of this size in place of one with weights: tiny, s14, b14..."""
+    """Evaluate an untrained model of this size in place of weights: tiny, s14, b14, l14 or g14."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
@@ -147,7 +146,7 @@ def run(arguments: Evaluate) -> None:
         check_precision(arguments.precision)
     _check_files(arguments)
     if arguments.weights is None and arguments.preset is None:
-        arguments = dataclasses.replace(arguments, weights=default_weights())
+        arguments = dataclasses.replace(arguments, weights=find_weights(None))
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)

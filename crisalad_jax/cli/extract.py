@@ -42,8 +42,8 @@ class Extract:
     out: pathlib.Path
     """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
     weights: pathlib.Path | None = None
-    """A .safetensors file of this package, or a published model's name (`crisalad models`); by
-    default the small model in this package, starter."""
+    """By default starter, the small model in this package; or a .safetensors file, or a published
+    model's name (`crisalad models`)."""
     fps: float | None = None
     """Frames a second taken of a video."""
     image_size: tuple[int, int] | None = None

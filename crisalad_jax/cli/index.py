@@ -6,14 +6,13 @@ from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
-from crisalad_jax.checkpoints.starter import resolved
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import RuntimeName, give_json, open_model, prepare_json, say
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
-from crisalad_jax.retrieval.maps.head import has_images, read_head
+from crisalad_jax.retrieval.maps.head import has_images, read_head, weights_of
 from crisalad_jax.retrieval.maps.manifest import read_description
 from crisalad_jax.utils.output import counted
 
@@ -30,9 +29,8 @@ class Index:
     out: pathlib.Path
     """The map's folder. After a kill the same command goes on."""
     weights: pathlib.Path | None = None
-    """A .safetensors file of this package, or a published model's name (`crisalad models`); by
-    default that of the map that is there, and of a new map the small model in this package,
-    starter."""
+    """By default starter, the small model in this package, and of a map that is there the model
+    that made it; or a .safetensors file, or a published model's name (`crisalad models`)."""
     fps: float | None = None
     """Frames a second taken of a video."""
     positions: pathlib.Path | None = None
@@ -129,8 +127,8 @@ def _weights(arguments: Index) -> pathlib.Path:
     """Find the model's file, by default that of the map."""
     if arguments.weights is None and has_images(arguments.out):
         there = read_head(arguments.out)
-        if there is not None:
-            return resolved(there.weights)
+        assert there is not None  # or it would have no images
+        return weights_of(there, arguments.out)
     return find_weights(arguments.weights, quiet=arguments.quiet)
 
 

@@ -40,7 +40,10 @@ def run(arguments: Models) -> None:
         if hidden:
             say(f"left out in {width} columns: {', '.join(hidden)} (crisalad models | less -S)")
         say(f"{len(models)} models; * in the cache, {cache_folder()}")
-        say(f"{starter.NAME}: a small model in this package, which commands take without --weights")
+        say(
+            f"{starter.NAME}: the small model in this package, which extract, index and evaluate "
+            "take by default"
+        )
         say("crisalad models NAME tells all of one: its images, paper, file and address")
         values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
     else:

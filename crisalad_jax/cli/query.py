@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import importlib
 import pathlib
 from typing import Annotated, Literal
 
@@ -136,11 +137,12 @@ def run(arguments: Query) -> None:
     unknown = _unknown(answers, places.calibration)
     if answers.unreadable:
         say(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
+    asked = f"{len(answers.queries)} {'query' if len(answers.queries) == 1 else 'queries'}"
     of = f"in a map of {counted(len(answers.images), 'image')}{unknown}"
-    if arguments.json is None and arguments.gallery is None:
+    if arguments.json is None:
         title = f"{arguments.map}, {counted(len(answers.images), 'image')}{unknown}"
         console.print(answers_table(answers, title))
-    elif file is None and arguments.json is not None:
+    elif file is None:
         for line in json_lines(answers):
             print(line)
     with contextlib.ExitStack() as staged:  # so that both files appear, or none
@@ -159,9 +161,8 @@ def run(arguments: Query) -> None:
             write_answers(file, answers)
     if arguments.gallery is not None:
         shown = f"{_ROWS} of " if len(answers.queries) > _ROWS else ""
-        say(f"{arguments.gallery}: {shown}{len(answers.queries)} queries {of}")
+        say(f"{arguments.gallery}: {shown}{asked} {of}")
     if file is not None:
-        asked = f"{len(answers.queries)} {'query' if len(answers.queries) == 1 else 'queries'}"
         say(f"{file}: {asked} {of}")
 
 
@@ -183,6 +184,7 @@ def _check_files(file: pathlib.Path | None, arguments: Query) -> None:
     if file is not None:
         check_target(file)
     if gallery is not None:
+        importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
         check_target(gallery)
     elif arguments.map_images is not None:
         raise InputError("--map-images: found without --gallery, expected both")

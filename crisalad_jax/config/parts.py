@@ -6,6 +6,7 @@ class, which defines the methods, and a registry, which maps names to classes.
 
 import dataclasses
 import functools
+import importlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
@@ -46,9 +47,8 @@ class Part:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by name, so that another process finds a part of a plug-in file."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        plugin = plugin_of(type(self).__module__)
-        # By its base class, whose package registers the parts as it is imported.
-        return _restore, (self.registry.base, self.part_name, fields, plugin)
+        module = type(self).__module__
+        return _restore, (self.registry.base, self.part_name, fields, module, plugin_of(module))
 
 
 P = TypeVar("P", bound=Part)
@@ -70,10 +70,15 @@ REGISTRIES: dict[str, "Registry[Any]"] = {}
 """All registries by kind."""
 
 
-def _restore(base: type[Part], name: str, fields: Mapping[str, Any], plugin: str | None) -> Part:
+def _restore(
+    base: type[Part], name: str, fields: Mapping[str, Any], module: str, plugin: str | None
+) -> Part:
     registry = base.registry
-    if plugin is not None and name not in registry.names():
-        load_plugin(plugin)
+    if name not in registry.names():  # a new process: what registers the part was not imported yet
+        if plugin is None:
+            importlib.import_module(module)
+        else:
+            load_plugin(plugin)
     return registry.find(name)(**fields)
 
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 _CLI = ("tyro", "rich", "shtab")
 EXTRAS: Mapping[str, tuple[str, ...]] = {
+    "report": ("jinja2", "matplotlib", *_CLI),
     "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
     "maps": ("faiss", "h5py", "PIL", *_CLI),
-    "report": ("jinja2", "matplotlib", *_CLI),
     "export": ("flatbuffers", *_CLI),
     "onnx": ("onnx", "onnxruntime", *_CLI),
     "openvino": ("openvino", "onnx", *_CLI),
@@ -15,7 +15,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "convert": ("torch", *_CLI),
     "accelerators": ("libtpu", "jax_cuda12_plugin", *_CLI),
 }
-"""Modules of each extra, by its name."""
+"""Modules of each extra, by its name; of two with a module the smaller is first."""
 
 
 def missing_extra(error: ModuleNotFoundError, what: str) -> str:

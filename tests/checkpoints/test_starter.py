@@ -9,6 +9,7 @@ import safetensors
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights, load
+from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.evaluation.evaluate import evaluate
@@ -54,7 +55,13 @@ def test_a_file_of_its_name_is_taken_instead(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "starter").write_bytes(b"mine")
-    assert find_weights("starter") == pathlib.Path("starter")
+    with pytest.warns(Note, match="starter: found a file of this name here, and took that"):
+        assert find_weights("starter") == pathlib.Path("starter")
+
+
+def test_the_names_are_of_different_models() -> None:
+    assert starter.BEST in PUBLISHED
+    assert starter.NAME not in PUBLISHED
 
 
 def test_it_tells_places_apart_that_it_never_saw(tmp_path: pathlib.Path) -> None:

@@ -11,8 +11,10 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.nn.model import describe
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.photographs import prepare_image
-from tests.cli.test_cli import Capture
+from tests.cli.test_cli import Capture, fails
 
 NOTE = "crisalad: note: no --weights: taking starter"
 
@@ -74,11 +76,46 @@ def test_a_map_grows_by_its_own_model(
     flags = ("--out", out, "--quiet")
     weights = ("--weights", shared / "weights.safetensors")
     said(capfd, "index", "--images", images / "database", *weights, *flags)
-    before = json.loads((out / "map.json").read_text())["model"]
     words, notes = said(capfd, "index", "--images", images / "queries", *flags)
-    assert "added" in words
+    count = len(list_images(images / "queries"))
+    assert f"{count} images added" in words
     assert notes == []
-    assert json.loads((out / "map.json").read_text())["model"] == before
+
+
+def test_a_map_whose_weights_have_gone_names_itself_and_the_flag(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
+    weights = tmp_path / "mine.safetensors"
+    shutil.copy(shared / "weights.safetensors", weights)
+    said(capfd, "index", "--images", images, "--weights", weights, "--out", out, "--quiet")
+    weights.unlink()
+    words = (f"{out}: found no {weights}, which made this map", "--weights")
+    fails(capfd, "index", "--images", images, "--out", out, "--quiet", words=words)
+
+
+def test_a_map_of_another_versions_model_says_so(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
+    said(capfd, "index", "--images", images, "--out", out, "--quiet")
+    value = json.loads((out / "map.json").read_text())
+    value["model"] = "0" * 64
+    del value["checksum"]  # as who edits the file
+    (out / "map.json").write_text(json.dumps(value))
+    words = ("starter of another version of this package", "`crisalad index` into a new folder")
+    fails(capfd, "query", list_images(images)[0], "--map", out, words=words)
+
+
+def test_a_map_made_in_python_by_its_name_is_asked_without_weights(
+    shared: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    images = shared / "town" / "images" / "test" / "database"
+    params, config = load("starter")
+    index(params, config, images, tmp_path / "map", weights="starter", quiet=True)
+    with Map.open(tmp_path / "map") as places:
+        assert places.head.weights == "starter"
+        assert places.load_params() is not None
 
 
 def test_evaluate_takes_it_and_a_preset_is_still_untrained(

@@ -72,7 +72,7 @@ class ResNetConfig(StagedBackbone):
 
     @property
     def extras(self) -> str:
-        """The number of layers."""
+        """The number of layers, and the width where it is not the published one."""
         width = "" if self.width == 64 else f" of width {self.width}"
         return f", ResNet-{self.layers}{width}"
 

@@ -9,6 +9,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+from crisalad_jax.checkpoints.starter import NAME, resolved
 from crisalad_jax.config.io import from_plain
 from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
@@ -37,7 +38,7 @@ class MapHead:
     model: str
     """The `model_hash` of the weights that describe its images, and its queries."""
     weights: str
-    """Where those weights were."""
+    """Where those weights were: a path, or `starter.NAME`."""
     descriptor_length: int
     store: str = "files"
     """Where descriptors are stored; see `store.store_name`."""
@@ -188,10 +189,26 @@ def check_model(
             f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
         )
     elif digest != description.model:
+        version = " of another version of this package" if description.weights == NAME else ""
         raise InputError(
             f"{folder}: found a map made by model {description.model[:12]} "
-            f"({description.weights}), but {weights} is model {digest[:12]}"
+            f"({description.weights}{version}), but {weights} is model {digest[:12]}: expected the "
+            "same (--weights), or a new map (`crisalad index` into a new folder)"
         )
+
+
+def weights_of(description: MapHead, folder: str | os.PathLike[str]) -> pathlib.Path:
+    """Return the file of the weights that made a map.
+
+    Raises:
+        InputError: it is no longer where it was.
+    """
+    file = resolved(description.weights)
+    if not file.exists():
+        raise InputError(
+            f"{folder}: found no {file}, which made this map, expected it there or as --weights"
+        )
+    return file
 
 
 def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | None = None) -> None:

@@ -19,7 +19,6 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
-from crisalad_jax.checkpoints.starter import resolved
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
@@ -599,13 +598,7 @@ class Map:
 
     def _weights(self, weights: str | os.PathLike[str] | None) -> str | os.PathLike[str]:
         """Return a model's file, by default where it was when the map was made."""
-        file = resolved(self.head.weights) if weights is None else weights
-        if weights is None and not pathlib.Path(file).exists():
-            raise InputError(
-                f"{self.folder}: found no {file}, which made this map, expected it there or as "
-                "--weights"
-            )
-        return file
+        return weights_of(self.head, self.folder) if weights is None else weights
 
     def check_params(self, params: "Crisalad | Runtime") -> None:
         """Check that parameters are of the model that made the map; the same ones only once.

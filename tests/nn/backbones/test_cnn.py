@@ -67,6 +67,15 @@ def test_a_resnet_has_the_published_parameters_and_work(
     assert (macs(backbone) + 1000 * backbone.dim) / 1e9 == pytest.approx(gmacs, abs=0.01)
 
 
+def test_a_narrower_resnet_has_the_parameters_of_its_widths() -> None:
+    """One stage of width 32: a kernel of 7 x 7, four of 3 x 3, a scale and a shift after each."""
+    backbone = ResNetConfig(layers=18, stages=1, width=32)
+    leaves = jax.tree_util.tree_leaves_with_path(jax.eval_shape(backbone.init, jax.random.key(0)))
+    learnt = sum(leaf.size for path, leaf in leaves if "running" not in str(path[-1]))
+    assert learnt == 7 * 7 * 3 * 32 + 4 * 3 * 3 * 32 * 32 + 5 * 2 * 32
+    assert backbone.dim == 32
+
+
 def test_vgg_16_has_the_published_parameters_and_work() -> None:
     """Of the paper's 138 M parameters 123,642,856 are the classifier's, by its shapes."""
     shapes = jax.eval_shape(VggConfig().init, jax.random.key(0))
