@@ -44,6 +44,7 @@ from crisalad_jax.retrieval.maps.head import (
     read_components,
     read_head,
     read_value,
+    weights_of,
     write_record,
 )
 from crisalad_jax.retrieval.maps.store import Store, open_store
