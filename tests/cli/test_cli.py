@@ -170,7 +170,7 @@ def test_no_command_prints_the_usage(capfd):
         ("info --colour red", "--colour"),
         ("train --data d --out o --epoch 3", "--epochs"),  # perhaps you meant
         ("train --data d", "--out"),
-        ("extract", "--weights PATH --images PATH --out PATH"),
+        ("extract", "--images PATH --out PATH"),
         ("train --data d --out o --seed one", "--seed"),
         ("train --data d --out o --preset", "--preset"),
         ("train --data d --out o --seed -1", "TrainConfig.seed: found -1"),

@@ -359,7 +359,10 @@ def test_a_description_is_read_as_it_was_written(tmp_path):
 def test_another_model_is_refused_by_both_hashes():
     made = dataclasses.replace(description("files"), model="a" * 64, weights="/w/old.safetensors")
     check_model(made, "map", "a" * 64, "new")
-    words = r"map: found a map made by model a{12} \(/w/old\.safetensors\), but new is model b{12}$"
+    words = (
+        r"map: found a map made by model a{12} \(/w/old\.safetensors\), but new is model b{12}: "
+        r"expected the same \(--weights\), or a new map"
+    )
     with pytest.raises(InputError, match=words):
         check_model(made, "map", "b" * 64, "new")
 
