@@ -10,7 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.search import search
 from crisalad_jax.utils.errors import InputError
 
 _SIDE = 128
@@ -35,6 +39,19 @@ def hog_descriptors(
     if len(images) == 0:
         raise InputError("images: found none, expected at least one")
     return np.stack([_hog(image) for image in images])
+
+
+def hog_neighbours(benchmark: Benchmark, k: int) -> Neighbours:
+    """Search a benchmark's database for the k images whose HOG is most like each query's.
+
+    Raises:
+        InputError: an image cannot be read, or what `search` raises.
+    """
+    database, queries = (
+        hog_descriptors([read_image(path) for path in side])
+        for side in (benchmark.database, benchmark.queries)
+    )
+    return search(database, queries, k=k)
 
 
 def _hog(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 8100"]:

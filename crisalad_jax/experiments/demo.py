@@ -12,12 +12,11 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.evaluation.evaluate import KS, evaluate
 from crisalad_jax.evaluation.metrics import recalls
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.experiments.baselines import hog_descriptors
+from crisalad_jax.experiments.baselines import hog_neighbours
 from crisalad_jax.experiments.report import (
     RecallRow,
     prediction_gallery,
@@ -27,7 +26,6 @@ from crisalad_jax.experiments.report import (
 )
 from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.nn.model import init_crisalad
-from crisalad_jax.retrieval.search import search
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -159,8 +157,4 @@ def _rows(benchmark: Benchmark, model: str, results: list[GroupingResult]) -> li
 
 
 def _hog_recalls(benchmark: Benchmark) -> dict[int, float]:
-    sides = [
-        hog_descriptors([read_image(path) for path in paths])
-        for paths in (benchmark.database, benchmark.queries)
-    ]
-    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)
+    return recalls(hog_neighbours(benchmark, max(KS)).indices, benchmark.ground_truth(), KS)

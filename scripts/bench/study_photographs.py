@@ -15,15 +15,13 @@ import time
 import jax
 
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.evaluation.evaluate import KS, evaluate
 from crisalad_jax.evaluation.metrics import recalls
-from crisalad_jax.experiments.baselines import hog_descriptors
+from crisalad_jax.experiments.baselines import hog_neighbours
 from crisalad_jax.experiments.report import RecallRow, recall_markdown
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
-from crisalad_jax.retrieval.search import search
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
@@ -63,11 +61,7 @@ def train(
 
 
 def hog_recalls(benchmark: Benchmark) -> dict[int, float]:
-    sides = [
-        hog_descriptors([read_image(path) for path in paths])
-        for paths in (benchmark.database, benchmark.queries)
-    ]
-    return recalls(search(*sides, k=max(KS)).indices, benchmark.ground_truth(), KS)
+    return recalls(hog_neighbours(benchmark, max(KS)).indices, benchmark.ground_truth(), KS)
 
 
 def main() -> None:

@@ -16,7 +16,6 @@ import numpy as np
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.images import read_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import (
     Interval,
@@ -24,10 +23,9 @@ from crisalad_jax.evaluation.metrics import (
     recalls,
     right_retrievals,
 )
-from crisalad_jax.experiments.baselines import hog_descriptors
+from crisalad_jax.experiments.baselines import hog_neighbours
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
-from crisalad_jax.retrieval.search import search
 from crisalad_jax.utils.files import around
 
 KS = (1, 5, 10)
@@ -35,9 +33,7 @@ KS = (1, 5, 10)
 
 def by_hog(data: Benchmark) -> tuple[Mapping[int, float], Interval]:
     """Recalls of HOG, and the interval of the first."""
-    sides = (data.database, data.queries)
-    database, queries = (hog_descriptors([read_image(path) for path in side]) for side in sides)
-    indices, positives = search(database, queries, k=max(KS)).indices, data.ground_truth()
+    indices, positives = hog_neighbours(data, max(KS)).indices, data.ground_truth()
     hits = np.asarray(right_retrievals(indices[:, :1], positives)).reshape(-1).astype(int)
     return recalls(indices, positives, KS), bootstrap_interval(hits)
 

@@ -38,7 +38,7 @@ PLACE_SPACING = 80.0
 MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
-GSV_COLUMNS = "place_id,year,month,northdeg,city_id,lat,lon,panoid"
+_COLUMNS = "place_id,year,month,northdeg,city_id,lat,lon,panoid"
 """Header of a city's table in GSV-Cities."""
 UTM_ORIGIN = (500_000.0, 5_000_000.0)
 """East and north in zone 32T of the test city's south-west corner."""
@@ -160,7 +160,7 @@ def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -
     name, centre = CITY_NAMES[city], (10.0 + city, -40.0)
     images = folder / "Images" / name
     images.mkdir(parents=True)
-    lines = [GSV_COLUMNS]
+    rows: list[str] = []
     indices = range(city, config.train_places, len(CITY_NAMES))
     for place_id, index in enumerate(indices, start=1):
         spot = _spot(config, 0, index, config.train_places)
@@ -172,10 +172,10 @@ def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -
             year, month = int(spot.rng.integers(2012, 2022)), MONTHS[view.season]
             northdeg, key = spot.northdeg(view), panoid(spot.rng)
             row, file = gsv_image(name, place_id, (year, month), northdeg, (lat, lon), key)
-            lines.append(row)
+            rows.append(row)
             write_jpeg(images / file, render(spot.seed, view, config.image_size))
             yield
-    write_gsv_table(folder, name, lines)
+    write_gsv_table(folder, name, rows)
 
 
 def _write_test(folder: pathlib.Path, config: SyntheticCityConfig) -> Iterator[None]:
@@ -237,11 +237,11 @@ def gsv_image(
     return row, name
 
 
-def write_gsv_table(folder: pathlib.Path, city: str, lines: Sequence[str]) -> None:
-    """Write a city's table, whose first line is `GSV_COLUMNS`."""
+def write_gsv_table(folder: pathlib.Path, city: str, rows: Sequence[str]) -> None:
+    """Write a city's table of rows that `gsv_image` returned."""
     table = folder / "Dataframes" / f"{city}.csv"
     table.parent.mkdir(exist_ok=True)
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    table.write_text("\n".join([_COLUMNS, *rows]) + "\n", encoding="utf-8")
 
 
 def write_jpeg(path: pathlib.Path, image: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 
 from crisalad_jax.config.checks import check_seed, check_types
 from crisalad_jax.experiments.synthetic.city import (
-    GSV_COLUMNS,
     METRES_PER_DEGREE,
     MONTHS,
     UTM_ORIGIN,
@@ -154,7 +153,7 @@ def _write_city(
 ) -> Iterator[None]:
     images = root / "Images" / name
     images.mkdir(parents=True)
-    lines = [GSV_COLUMNS]
+    rows: list[str] = []
     for scene in scenes:
         for station in range(config.stations):
             place_id = scene * config.stations + station + 1
@@ -165,10 +164,10 @@ def _write_city(
                 year, month = int(rng.integers(2012, 2022)), MONTHS[view.season]
                 position = lat, "-40.0000000"
                 row, file = gsv_image(name, place_id, (year, month), 0, position, panoid(rng))
-                lines.append(row)
+                rows.append(row)
                 write_jpeg(images / file, render(seed, view, config.image_size, scenery))
             yield
-    write_gsv_table(root, name, lines)
+    write_gsv_table(root, name, rows)
 
 
 def _write_test(folder: pathlib.Path, config: WorldConfig) -> Iterator[None]:

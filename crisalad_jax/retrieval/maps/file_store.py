@@ -122,7 +122,7 @@ class FileStore:
         """Compute exact similarities of candidates; no other rows are read."""
         similarities = np.empty(numbers.shape, np.float32)
         segments = np.searchsorted(firsts, numbers, side="right") - 1
-        for segment in sorted(set(segments.ravel().tolist())):
+        for segment in _distinct(segments):
             first = firsts[segment]
             query, column = np.nonzero(segments == segment)
             similarities[query, column] = exact_similarities(
@@ -159,7 +159,7 @@ class FileStore:
         firsts = np.array(list(self._counts))
         rows = np.empty((len(numbers), self._length), np.float32)
         segments = np.searchsorted(firsts, numbers, side="right") - 1
-        for segment in sorted(set(segments.ravel().tolist())):
+        for segment in _distinct(segments):
             places, first = np.flatnonzero(segments == segment), int(firsts[segment])
             if first not in self._mapped:
                 if len(self._mapped) >= _MAPPED:
@@ -188,3 +188,8 @@ def _largest_products(
     products = queries @ block.T
     places = np.argpartition(-products, k - 1, axis=1)[:, :k]
     return np.take_along_axis(products, places, axis=1), places
+
+
+def _distinct(numbers: Int64[np.ndarray, "*shape"]) -> list[int]:
+    """List each number once, in order; `np.unique` would import masked arrays into every query."""
+    return sorted(set(numbers.ravel().tolist()))

@@ -361,7 +361,7 @@ def test_another_model_is_refused_by_both_hashes():
     check_model(made, "map", "a" * 64, "new")
     words = (
         r"map: found a map made by model a{12} \(/w/old\.safetensors\), but new is model b{12}: "
-        r"expected the same \(--weights\), or a new map"
+        r"expected the same \(--weights\), or a new map \(`crisalad index` into a new folder\)$"
     )
     with pytest.raises(InputError, match=words):
         check_model(made, "map", "b" * 64, "new")
