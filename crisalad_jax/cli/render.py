@@ -5,7 +5,7 @@ import pathlib
 
 from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.experiments.synthetic import SCENERIES, Scenery, WorldConfig, write_world
-from crisalad_jax.experiments.synthetic.world import has_world
+from crisalad_jax.experiments.synthetic.world import VARIATIONS, Variation, has_world
 from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.progress import progress_bar
 
@@ -33,6 +33,9 @@ class Render:
     """What places are, in turn."""
     repaint: float = WorldConfig.repaint
     """Largest deviation of the log colour of things from image to image."""
+    varied: tuple[Variation, ...] = VARIATIONS
+    """What changes between the training images of a place, besides paint; test images change in
+    everything."""
     seed: int = WorldConfig.seed
     """Draws the world."""
     json: pathlib.Path | None = None

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -35,6 +35,17 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import told_of, write_json
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
+Variation = Literal["stand", "season", "time", "weather", "traffic", "exposure"]
+"""What changes from image to image of a place, besides paint; exposure has the noise with it."""
+VARIATIONS: tuple[Variation, ...] = get_args(Variation)
+_FIELDS: dict[Variation, tuple[str, ...]] = {
+    "season": ("season",),
+    "time": ("time",),
+    "weather": ("weather",),
+    "traffic": ("occluders",),
+    "exposure": ("exposure", "noise"),
+}
+"""Fields of `View` that are one variation; the stand has the camera's, which a scene chooses."""
 RENDERER = 1
 """Version of the world: increase it if pictures change."""
 SCENES_PER_CITY = 12
@@ -58,6 +69,9 @@ class WorldConfig:
     sceneries: tuple[Scenery, ...] = SCENERIES
     repaint: float = 0.3
     """Largest `View.repaint`."""
+    varied: tuple[Variation, ...] = VARIATIONS
+    """What changes between the training images of a place; the rest is as in a plain `View`. Test
+    images change in everything."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -71,6 +85,11 @@ class WorldConfig:
             raise InputError(f"WorldConfig.repaint: found {self.repaint}, expected at least 0")
         if not self.sceneries:
             raise InputError("WorldConfig.sceneries: found (), expected at least one scenery")
+        if unknown := set(self.varied) - set(VARIATIONS):
+            raise InputError(
+                f"WorldConfig.varied: found {', '.join(sorted(unknown))}, expected of "
+                f"{', '.join(VARIATIONS)}"
+            )
         check_seed("WorldConfig.seed", self.seed)
         check_size("WorldConfig.image_size", self.image_size)
 
@@ -122,7 +141,12 @@ def has_world(root: str | os.PathLike[str], config: WorldConfig) -> bool:
 def _identity(config: WorldConfig) -> dict[str, Any]:
     """Return what world.json has of a world."""
     lists = {"image_size": list(config.image_size), "sceneries": list(config.sceneries)}
-    return {"renderer": RENDERER, **dataclasses.asdict(config), **lists}
+    found = {"renderer": RENDERER, **dataclasses.asdict(config), **lists}
+    if set(config.varied) == set(VARIATIONS):
+        del found["varied"]  # as worlds of earlier versions have it
+    else:
+        found["varied"] = [name for name in VARIATIONS if name in config.varied]
+    return found
 
 
 def _write(temporary: pathlib.Path, root: pathlib.Path, config: WorldConfig) -> Iterator[None]:
@@ -171,6 +195,7 @@ def _write_city(
 
 
 def _write_test(folder: pathlib.Path, config: WorldConfig) -> Iterator[None]:
+    config = dataclasses.replace(config, varied=VARIATIONS)
     for side in ("database", "queries"):
         (folder / side).mkdir(parents=True)
     for scene in range(config.test_scenes):
@@ -223,7 +248,7 @@ def _view(
     height, pitch, field = camera
     reach = place.reach
     time = TIMES[rng.choice(3, p=(0.6, 0.25, 0.15))]
-    return View(
+    view = View(
         lateral=float(rng.uniform(-1, 1) * reach.lateral),
         forward=float(along + rng.uniform(-1, 1) * reach.forward),
         heading=float(rng.uniform(-5, 5)),
@@ -239,3 +264,11 @@ def _view(
         noise=float(rng.uniform(1, 5) + 2 * (time == "night")),
         seed=int(rng.integers(2**31)),
     )
+    still = {
+        name for one in VARIATIONS if one not in config.varied for name in _FIELDS.get(one, ())
+    }
+    plain = {name: getattr(View(), name) for name in still}
+    if "stand" not in config.varied:
+        stand = {"lateral": 0.0, "forward": along, "heading": 0.0}
+        plain |= stand | {"height": height, "pitch": pitch, "field": field}
+    return dataclasses.replace(view, **plain)

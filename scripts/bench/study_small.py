@@ -1,0 +1,225 @@
+"""What parts of a model and variations of the rendered world are worth: many short trainings.
+
+    python scripts/bench/study_small.py --runs RUNS [--data SET...] [--page PAGE] [STUDY...]
+
+Studies: transport and encoder (a small ViT with SALAD, five seeds) and world (a small ResNet with
+Conv-AP, from which the world leaves out one variation at a time). All train on rendered places
+alone, and are asked on other rendered places and on each SET. Runs that RUNS already holds are gone
+on with; two studies may run at once. Each run takes one to two minutes of a core.
+"""
+
+import collections
+import dataclasses
+import hashlib
+import json
+import pathlib
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import scipy.stats
+from study_transport import with_transport
+from tables import Study, Table, flags, leave, read_some
+
+from crisalad_jax.config.io import read_config, to_plain
+from crisalad_jax.data.augmentations.camera import CameraAugmentConfig
+from crisalad_jax.data.augmentations.light import LightAugmentConfig
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.places import read_places
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.experiments.synthetic import SCENERIES, WorldConfig, write_world
+from crisalad_jax.experiments.synthetic.world import VARIATIONS
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.progress import progress_bar
+
+STARTER = pathlib.Path(__file__).parents[2] / "docs" / "starter" / "config.json"
+BATCH = {"places_per_batch": 24, "images_per_place": 2, "min_images": 2}
+TRANSPORTS: dict[str, dict[str, Any]] = {
+    "published, k = 3": {},
+    "converged, implicit": {"tolerance": 1e-3, "iterations": 200, "gradient": "implicit"},
+    "dustbin a token": {"dustbin": "token"},
+    "dustbin's mass learnt": {"dustbin": "mass"},
+    "column tau 0.9, k = 20": {"column_tau": 0.9, "iterations": 20},
+    "epsilon learnt": {"learn_epsilon": True},
+    "softmax": {"step": "softmax"},
+}
+WATCHED = ("column_error", "dustbin_share", "patches_per_cluster")
+
+
+class Arm(NamedTuple):
+    """One row of a study: how to train, and on which world."""
+
+    label: str
+    config: TrainConfig
+    world: WorldConfig
+
+
+def small_vit() -> TrainConfig:
+    """The recipe of `tiny` with half its width, three blocks, 5 x 7 patches, and no encoder."""
+    start = recipe("tiny")
+    backbone: Any = start.model.backbone
+    model = dataclasses.replace(
+        start.model,
+        image_size=(70, 98),
+        backbone=dataclasses.replace(backbone, dim=64, depth=3, heads=2),
+        cross_image=dataclasses.replace(start.model.cross_image, layers=0),
+    )
+    return dataclasses.replace(start, model=model, epochs=3, batch_order="shuffled", **BATCH)
+
+
+def with_encoder(config: TrainConfig) -> TrainConfig:
+    """The same with the encoder of `tiny`."""
+    encoder: CrossImageConfig = recipe("tiny").model.cross_image
+    model = dataclasses.replace(config.model, cross_image=encoder)
+    return dataclasses.replace(config, model=model)
+
+
+def small_resnet() -> TrainConfig:
+    """The recipe of the model in the package with half its width and fewer pixels."""
+    start = read_config(TrainConfig, STARTER, quiet=True)
+    backbone: Any = start.model.backbone
+    model = dataclasses.replace(
+        start.model, image_size=(96, 96), backbone=dataclasses.replace(backbone, width=16)
+    )
+    return dataclasses.replace(start, model=model, epochs=4, **BATCH)
+
+
+def transport() -> list[Arm]:
+    """Each transport in the place of the published one."""
+    world = WorldConfig()
+    return [
+        Arm(label, with_transport(small_vit(), fields), world)
+        for label, fields in TRANSPORTS.items()
+    ]
+
+
+def encoder() -> list[Arm]:
+    """Without and with the cross-image encoder."""
+    without, world = small_vit(), WorldConfig()
+    return [Arm("without", without, world), Arm("with", with_encoder(without), world)]
+
+
+def world() -> list[Arm]:
+    """The whole world, and worlds that leave out one variation each."""
+    whole, config = WorldConfig(scenes=600, test_scenes=1), small_resnet()
+    arms = [Arm("whole", config, whole)]
+    for name in VARIATIONS:
+        varied = tuple(one for one in VARIATIONS if one != name)
+        arms.append(Arm(f"no {name}", config, dataclasses.replace(whole, varied=varied)))
+    arms.append(Arm("no paint", config, dataclasses.replace(whole, repaint=0.0)))
+    for name in SCENERIES:
+        kinds = tuple(one for one in SCENERIES if one != name)
+        arms.append(Arm(f"no {name}", config, dataclasses.replace(whole, sceneries=kinds)))
+    camera: Any = config.augmentation
+    light = {
+        field.name: getattr(camera, field.name) for field in dataclasses.fields(LightAugmentConfig)
+    }
+    assert isinstance(camera, CameraAugmentConfig)
+    plain = dataclasses.replace(config, augmentation=LightAugmentConfig(**light))
+    arms.append(Arm("no camera's faults", plain, whole))
+    return arms
+
+
+STUDIES = {"transport": transport, "encoder": encoder, "world": world}
+
+
+def named(value: Any) -> str:
+    """A short name for a configuration: runs and worlds of two studies are shared by it."""
+    return hashlib.sha256(json.dumps(to_plain(value), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def run(arm: Arm, seed: int, asked: Mapping[str, Benchmark], runs: pathlib.Path) -> dict[str, Any]:
+    """Recalls of one trained model by set and grouping, and its transport's statistics."""
+    config = dataclasses.replace(arm.config, seed=seed)
+    root = runs / "worlds" / named(arm.world)
+    folder = runs / "runs" / f"{named(config)}-{named(arm.world)}"
+    result = folder / "recalls.json"
+    found: dict[str, Any] = json.loads(result.read_text()) if result.exists() else {}
+    if set(asked) <= found.keys():
+        return found
+    write_world(root, arm.world)
+    places = read_places(root / "train", min_images=config.min_images)
+    params = fit(config, places, folder, quiet=True).params
+    alone = config.model.cross_image.layers == 0
+    groupings = ("single",) if alone else ("single", "shuffled", "sequential")
+    for name, data in asked.items():
+        results = evaluate(params, config.model, data, groupings=groupings, quiet=True)
+        found[name] = {
+            grouping: {f"R@{k}": 100 * each.recalls[k] for k in (1, 5)}
+            for grouping, each in zip(groupings, results, strict=True)
+        }
+    last = read_metrics(folder / "metrics.jsonl")[-1]
+    found |= {name: last[name] for name in WATCHED if name in last}
+    write_json(result, found)
+    return found
+
+
+def paired(values: Sequence[float], base: Sequence[float]) -> str:
+    """The mean difference of runs of the same seeds, with its 95 % interval by Student's t."""
+    differences = [a - b for a, b in zip(values, base, strict=True)]
+    mean = statistics.mean(differences)
+    if len(differences) < 2:
+        return f"{mean:+.1f}"
+    error = statistics.stdev(differences) / len(differences) ** 0.5
+    reach = float(scipy.stats.t.ppf(0.975, len(differences) - 1)) * error
+    return f"{mean:+.1f} ({mean - reach:+.1f} to {mean + reach:+.1f})"
+
+
+def study_of(name: str, results: Mapping[str, list[dict[str, Any]]], sets: Sequence[str]) -> Study:
+    """A row an arm and grouping: recall, and how much it differs from the first arm's."""
+    first = next(iter(results.values()))
+    rows = []
+    for label, runs in results.items():
+        base = first[: len(runs)]
+        for grouping in runs[0][sets[0]]:
+            cells = [label, grouping, str(len(runs))]
+            for data in sets:
+                values = [one[data][grouping]["R@1"] for one in runs]
+                fives = [one[data][grouping]["R@5"] for one in runs]
+                cells.append(f"{statistics.mean(values):.1f} / {statistics.mean(fives):.1f}")
+                is_base = runs is first and grouping == "single"
+                cells.append(
+                    "" if is_base else paired(values, [one[data]["single"]["R@1"] for one in base])
+                )
+            rows.append(tuple(cells))
+    header = ["trained with", "images described", "seeds"]
+    for data in sets:
+        header += [f"{data}: R@1 / R@5", "R@1, difference"]
+    caption = (
+        "Mean recall in percent. A difference is to the first row, of runs with the same seeds, "
+        "with its 95 % interval by Student's t over seeds."
+    )
+    return Study(Table(tuple(header), rows, caption, 2), {"study": name, "runs": results})
+
+
+def main() -> None:
+    parser = flags("Train and tabulate; see the top.", "docs/small")
+    parser.add_argument("--runs", type=pathlib.Path, required=True, help="where trainings are kept")
+    parser.add_argument("--data", type=pathlib.Path, nargs="*", default=[], help="also asked")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    arguments = read_some(parser, STUDIES)
+    write_world(arguments.runs / "worlds" / named(WorldConfig()), WorldConfig())
+    test = arguments.runs / "worlds" / named(WorldConfig()) / "test"
+    asked = {"rendered": open_benchmark(test)}
+    asked |= {path.name: open_benchmark(path) for path in arguments.data}
+    arms = {name: STUDIES[name]() for name in arguments.studies}
+    results: dict[str, dict[str, list[dict[str, Any]]]] = collections.defaultdict(dict)
+    total = sum(map(len, arms.values())) * len(arguments.seeds)
+    with progress_bar("trainings", total, "runs", quiet=False) as bar:
+        for seed in arguments.seeds:
+            for name, those in arms.items():
+                for arm in those:
+                    found = run(arm, seed, asked, arguments.runs)
+                    results[name].setdefault(arm.label, []).append(found)
+                    bar.advance(1, note=f"{name}, {arm.label}, seed {seed}")
+    for name, found in results.items():
+        leave(name, study_of(name, found, list(asked)), arguments)
+
+
+if __name__ == "__main__":
+    main()
