@@ -1,10 +1,13 @@
 """What convolutional backbones are made of: convolutions with a batch norm, and maxima."""
 
 import dataclasses
+import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.nn import draw
@@ -76,14 +79,57 @@ def conv_norm(
 def max_pool(
     x: Float[Array, "*batch height width dim"], size: int, *, stride: int = 2, padding: int = 0
 ) -> Float[Array, "*batch rows columns dim"]:
-    """Return the maximum of each window of size x size pixels; padding never wins."""
+    """Return the maximum of each window of size x size pixels; padding never wins.
+
+    The gradient goes to the first of equal pixels, as torch's does.
+    """
     images = x.reshape(-1, *x.shape[-3:])
-    y = jax.lax.reduce_window(
-        images,
-        -jnp.inf,
-        jax.lax.max,
-        window_dimensions=(1, size, size, 1),
-        window_strides=(1, stride, stride, 1),
-        padding=((0, 0), (padding, padding), (padding, padding), (0, 0)),
-    )
+    y = _max_pool(images, size, stride, padding)
     return y.reshape(*x.shape[:-3], *y.shape[1:])
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2, 3))
+def _max_pool(x: Array, size: int, stride: int, padding: int) -> Array:
+    """Pool a batch.
+
+    The gradient is told to JAX because its own, a scatter of each window's maximum, takes four
+    times as long on a CPU, and keeps all pixels for it.
+    """
+    margins = ((0, 0), (padding, padding), (padding, padding), (0, 0))
+    window, strides = (1, size, size, 1), (1, stride, stride, 1)
+    return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, window, strides, margins)
+
+
+def _max_pool_forward(x: Array, size: int, stride: int, padding: int) -> tuple[Array, Any]:
+    """Keep which pixel of each window was its first maximum, and the images' height and width."""
+    y = _max_pool(x, size, stride, padding)
+    rows, columns = y.shape[1:3]
+    margin = (padding, padding)
+    padded = jnp.pad(x, ((0, 0), margin, margin, (0, 0)), constant_values=-jnp.inf)
+    winner = jnp.zeros(y.shape, jnp.uint8)
+    for number, (top, left) in reversed(list(enumerate(np.ndindex(size, size)))):
+        bottom, right = top + (rows - 1) * stride + 1, left + (columns - 1) * stride + 1
+        pixels = padded[:, top:bottom:stride, left:right:stride]
+        winner = jnp.where(pixels == y, jnp.uint8(number), winner)
+    return y, (winner, x.shape[1:3])
+
+
+def _max_pool_backward(
+    size: int, stride: int, padding: int, kept: tuple[Array, tuple[int, int]], change: Array
+) -> tuple[Array]:
+    """Put every window's gradient where its maximum was; windows overlap, and add up."""
+    winner, (height, width) = kept
+    zero = jnp.zeros((), change.dtype)
+    total: Any = 0
+    for number, (top, left) in enumerate(np.ndindex(size, size)):
+        margins = [(0, 0, 0)] * 4
+        for axis, start, length in ((1, top, height), (2, left, width)):
+            end = start + (change.shape[axis] - 1) * stride + 1
+            # Negative margins cut the padding off again.
+            margins[axis] = (start - padding, length + padding - end, stride - 1)
+        here = jnp.where(winner == number, change, zero)
+        total = total + jax.lax.pad(here, zero, margins)
+    return (total,)
+
+
+_max_pool.defvjp(_max_pool_forward, _max_pool_backward)

@@ -104,6 +104,30 @@ def test_maxima_are_torchs(size: int, stride: int, padding: int) -> None:
     np.testing.assert_array_equal(found, expected.permute(0, 2, 3, 1))
 
 
+@pytest.mark.parametrize("tied", [False, True])
+@pytest.mark.parametrize("sides", [(7, 10), (8, 9), (3, 3)])
+@pytest.mark.parametrize(
+    ("size", "stride", "padding"), [(3, 2, 1), (2, 2, 0), (3, 2, 0), (3, 3, 1), (3, 1, 1)]
+)
+def test_the_gradient_of_maxima_is_torchs(
+    size: int, stride: int, padding: int, sides: tuple[int, int], tied: bool
+) -> None:
+    """Of equal pixels, as behind a ReLU, the first has it in both."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2, *sides, 3)).astype(np.float32)
+    x = np.round(np.maximum(x, 0)) if tied else x
+    images = torch.from_numpy(x).permute(0, 3, 1, 2).requires_grad_()
+    pooled = F.max_pool2d(images, size, stride, padding)
+    change = rng.integers(-4, 5, tuple(pooled.shape)).astype(np.float32)  # sums are exact
+    pooled.backward(torch.from_numpy(change))
+    _, to_images = jax.vjp(
+        lambda x: max_pool(x, size, stride=stride, padding=padding), jnp.asarray(x)
+    )
+    (found,) = to_images(jnp.asarray(change.transpose(0, 2, 3, 1)))
+    assert images.grad is not None
+    np.testing.assert_array_equal(found, images.grad.permute(0, 2, 3, 1))
+
+
 @pytest.mark.parametrize("bias", [False, True])
 def test_a_folded_norm_is_torchs_convolution_and_norm(bias: bool) -> None:
     rng = np.random.default_rng(0)
