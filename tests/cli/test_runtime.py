@@ -135,6 +135,26 @@ def exported(params: Crisalad, tmp_path: pathlib.Path) -> pathlib.Path:
     return tmp_path / "onnx"
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_a_query_by_an_exported_folder_starts_without_jax(
+    exported: pathlib.Path, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture, told: bool
+):
+    places, asked = tmp_path / "map", town(shared) / "queries"
+    by = ("--weights", exported, "--runtime", "onnxruntime")
+    succeeds(capfd, "index", "--images", asked, "--out", places, *by, "--quiet")
+    query = ("query", asked, "--map", places, *by[0 if told else 2 :], "--quiet")
+    program = (
+        "import sys\n"
+        "from crisalad_jax.cli import main\n"
+        f"assert main({list(map(str, query))!r}) == 0\n"
+        "print('jax' in sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.endswith("\nFalse\n")
+
+
 def test_an_exported_folder_is_a_model(
     exported: pathlib.Path,
     shared: pathlib.Path,
