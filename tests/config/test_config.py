@@ -1,6 +1,7 @@
 """Presets, recipes, and what a configuration refuses."""
 
 import dataclasses
+import pathlib
 import re
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from crisalad_jax.checkpoints.export import ExportConfig
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.config.io import from_plain
+from crisalad_jax.config.io import from_plain, read_config
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
@@ -46,6 +47,8 @@ from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
+
+ROOT = pathlib.Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
@@ -336,6 +339,15 @@ def test_every_recipe_fits_every_preset(preset: str, name: str):
         assert found.model.backbone.dim == PRESETS[preset].backbone.dim
     else:  # the published sizes, for every preset but one
         assert (found.model == recipe("b14", name).model) == (preset != "tiny")
+
+
+def test_the_recipe_of_starter_is_that_of_its_first_run_in_another_number_of_epochs():
+    """Its fields but those of an encoder of no layers, which says nothing."""
+    run = read_config(TrainConfig, ROOT / "docs" / "starter" / "config.json", quiet=True)
+    found = recipe("b14", "starter")
+    assert found.model.cross_image.layers == run.model.cross_image.layers == 0
+    model = dataclasses.replace(found.model, cross_image=run.model.cross_image)
+    assert dataclasses.replace(found, model=model, epochs=run.epochs) == run
 
 
 def test_augmentation_is_the_one_named():

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import itertools
+import json
 import pathlib
 
 import numpy as np
@@ -12,6 +13,7 @@ from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.experiments.synthetic import SCENERIES, View, WorldConfig, render, write_world
 from crisalad_jax.experiments.synthetic.scenes import build_place
+from crisalad_jax.experiments.synthetic.world import VARIATIONS, views
 from crisalad_jax.utils.errors import InputError
 
 SMALL = WorldConfig(
@@ -72,6 +74,54 @@ def test_a_part_of_a_world_is_the_whole_ones(world, tmp_path):
     for name, data in part.items():
         if name != "world.json":
             assert whole[name] == data
+
+
+VIEWS: dict[str, set[str]] = {
+    "stand": {"lateral", "forward", "heading", "height", "pitch", "field"},
+    "season": {"season"},
+    "time": {"time"},
+    "weather": {"weather"},
+    "traffic": {"occluders"},
+    "exposure": {"exposure", "noise"},
+}
+
+
+@pytest.mark.parametrize("left_out", VARIATIONS)
+def test_what_does_not_vary_is_the_same_in_every_view_and_the_rest_as_before(left_out):
+    """Twenty views each of two stations of two scenes."""
+    others = tuple(name for name in VARIATIONS if name != left_out)
+    less = dataclasses.replace(SMALL, varied=others)
+    for seed, station in itertools.product((3, 4), (0, 2)):
+        drawn = [
+            views(config, seed, "street", station, 20, np.random.default_rng(0))
+            for config in (SMALL, less)
+        ]
+        before, after = ([dataclasses.asdict(view) for view in each] for each in drawn)
+        for name in before[0]:
+            values = {view[name] for view in after}
+            if name in VIEWS[left_out]:
+                assert len(values) == 1
+                assert len({view[name] for view in before}) > 1
+            else:
+                assert [view[name] for view in after] == [view[name] for view in before]
+
+
+def test_test_images_vary_in_everything(world, tmp_path):
+    less = dataclasses.replace(SMALL, varied=("season",), scenes=1)
+    write_world(tmp_path / "less", less)
+    found, whole = contents(tmp_path / "less"), contents(world)
+    tests = {name for name in whole if name.startswith("test/")}
+    assert tests
+    assert {name: found[name] for name in tests} == {name: whole[name] for name in tests}
+    assert any(found[name] != whole[name] for name in found if name.startswith("train/Images/"))
+
+
+def test_a_world_of_an_earlier_version_is_the_same(world):
+    """Its file names no variations."""
+    assert "varied" not in json.loads((world / "world.json").read_text())
+    write_world(world, dataclasses.replace(SMALL, varied=tuple(reversed(VARIATIONS))))
+    with pytest.raises(InputError, match="found a rendered world of another configuration"):
+        write_world(world, dataclasses.replace(SMALL, varied=VARIATIONS[1:]))
 
 
 @pytest.mark.parametrize("scenery", SCENERIES)
@@ -144,6 +194,10 @@ def test_views_vary_within_the_place(world):
         ({"image_size": (8, 8)}, r"WorldConfig.image_size: found \(8, 8\)"),
         ({"seed": -1}, "WorldConfig.seed: found -1"),
         ({"repaint": -0.5}, "WorldConfig.repaint: found -0.5, expected at least 0"),
+        (
+            {"varied": ("sun",)},
+            r"WorldConfig.varied: found \('sun',\), expected a tuple, each one of",
+        ),
         ({"sceneries": ()}, r"WorldConfig.sceneries: found \(\), expected at least one"),
     ],
 )

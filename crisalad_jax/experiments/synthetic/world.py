@@ -85,11 +85,6 @@ class WorldConfig:
             raise InputError(f"WorldConfig.repaint: found {self.repaint}, expected at least 0")
         if not self.sceneries:
             raise InputError("WorldConfig.sceneries: found (), expected at least one scenery")
-        if unknown := set(self.varied) - set(VARIATIONS):
-            raise InputError(
-                f"WorldConfig.varied: found {', '.join(sorted(unknown))}, expected of "
-                f"{', '.join(VARIATIONS)}"
-            )
         check_seed("WorldConfig.seed", self.seed)
         check_size("WorldConfig.image_size", self.image_size)
 
