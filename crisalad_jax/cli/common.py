@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import rich.console
 
+from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.utils.errors import InputError
@@ -245,4 +246,6 @@ def load_model(
 
 def _name(weights: pathlib.Path) -> str:
     """Return what a file of weights is called in tables and titles."""
+    if weights == starter.FILE:
+        return starter.NAME
     return f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name

@@ -145,11 +145,12 @@ def run(arguments: Evaluate) -> None:
     if arguments.precision is not None:
         check_precision(arguments.precision)
     _check_files(arguments)
-    if arguments.weights is None and arguments.preset is None:
-        arguments = dataclasses.replace(arguments, weights=find_weights(None))
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
+    benchmark = open_set(arguments)
+    if arguments.weights is None and arguments.preset is None:
+        arguments = dataclasses.replace(arguments, weights=find_weights(None))
     options: dict[str, Any] = {
         "image_size": arguments.image_size,
         "resize": arguments.resize,
@@ -170,7 +171,6 @@ def run(arguments: Evaluate) -> None:
         )
     rerank = _reranking(arguments, config)
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
-    benchmark = open_set(arguments)
     say(model_name)
     say(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()

@@ -64,6 +64,9 @@ class Index:
     """Type of the matrix products, by default the map's, and in a new map the model's."""
     on_bad_image: Literal["stop", "skip"] = "stop"
     """Stop at an unreadable image, or leave it out and say so."""
+    verify: bool = True
+    """Check the weights, or an exported model, against their checksums; --no-verify skips that,
+    where files are huge."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
     json: pathlib.Path | None = None
@@ -135,7 +138,7 @@ def _weights(arguments: Index) -> pathlib.Path:
 def _model(arguments: Index, weights: pathlib.Path) -> tuple[Crisalad | Runtime, ModelConfig]:
     """Load the model; for another engine, in the size and type in which the map has its images."""
     if arguments.runtime == "jax":
-        return load_weights(weights)
+        return load_weights(weights, verify=arguments.verify)
     there = read_description(arguments.out)
     if there is not None and has_images(arguments.out):
         config = there.config
@@ -145,6 +148,7 @@ def _model(arguments: Index, weights: pathlib.Path) -> tuple[Crisalad | Runtime,
             image_size=config.image_size,
             preprocessing=config.preprocessing,
             precision="bfloat16" if config.compute_dtype == "bfloat16" else "float32",
+            verify=arguments.verify,
         )
         return runtime, config
     params, config, _ = open_model(
@@ -153,6 +157,7 @@ def _model(arguments: Index, weights: pathlib.Path) -> tuple[Crisalad | Runtime,
         image_size=arguments.image_size,
         resize=arguments.resize,
         compute_dtype=arguments.compute_dtype,
+        verify=arguments.verify,
         quiet=arguments.quiet,
     )
     return params, config

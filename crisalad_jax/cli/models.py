@@ -5,11 +5,13 @@ import pathlib
 import sys
 from typing import Annotated, Any
 
+import jax
 import tyro
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
+from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
 from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
 from crisalad_jax.utils.files import cache_folder
@@ -47,7 +49,8 @@ def run(arguments: Models) -> None:
         say("crisalad models NAME tells all of one: its images, paper, file and address")
         values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
     else:
-        values = _facts(published_model(arguments.name))
+        own = arguments.name == starter.NAME
+        values = _own_facts() if own else _facts(published_model(arguments.name))
         width = max(map(len, values))
         say("\n".join(f"{name:<{width}}  {_cell(value)}" for name, value in values.items()))
     if arguments.json is not None:
@@ -62,6 +65,22 @@ def _facts(model: Published) -> dict[str, Any]:
         "licence": licence["name"],
         "commercial": licence["commercial"],
         "cached": is_cached(model),
+    }
+
+
+def _own_facts() -> dict[str, Any]:
+    """Return what is known of the model in this package, in the words for published ones."""
+    params, config = load_weights(starter.FILE)
+    return {
+        "name": starter.NAME,
+        "descriptor": config.descriptor_dim,
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(params)),
+        "images": config.images_in_words,
+        "file": str(starter.FILE),
+        "note": f"in this package; trained on rendered pictures alone (docs/{starter.NAME}.md)",
+        "licence": "Apache-2.0",
+        "commercial": True,
+        "cached": True,
     }
 
 

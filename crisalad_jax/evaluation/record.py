@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.evaluate import same_place_rule
@@ -49,7 +50,11 @@ def evaluation_settings(
         The values by name.
     """
     files = {"weights": weights, "pca": pca, "rerank_weights": rerank_weights}
-    words = {name: None if file is None else str(file) for name, file in files.items()}
+    # Of the model in the package its name: a path says nothing on another machine.
+    words = {
+        name: None if file is None else starter.NAME if file == starter.FILE else str(file)
+        for name, file in files.items()
+    }
     return {
         "weights": words["weights"],
         "benchmark": benchmark.name,

@@ -118,13 +118,41 @@ def test_a_map_made_in_python_by_its_name_is_asked_without_weights(
         assert places.load_params() is not None
 
 
+def test_a_map_of_it_is_calibrated_without_weights(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    town, out = shared / "town", tmp_path / "map"
+    database = town / "images" / "test" / "database"
+    said(capfd, "index", "--images", database, "--out", out, "--quiet")
+    flags = ("--map", out, "--data", town, "--precision", 0.01, "--quiet")
+    words, notes = said(capfd, "calibrate", *flags)
+    assert "are unknown from now on" in words
+    assert notes == []
+
+
+def test_damaged_weights_are_found_unless_told_not_to_look(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    data = bytearray((shared / "weights.safetensors").read_bytes())
+    data[-1] ^= 1  # the last bit of a number
+    (tmp_path / "damaged.safetensors").write_bytes(data)
+    database = shared / "town" / "images" / "test" / "database"
+    given = ("index", "--images", database, "--weights", tmp_path / "damaged.safetensors")
+    fails(capfd, *given, "--out", tmp_path / "a", "--quiet", words=("damaged.safetensors",))
+    words, _ = said(capfd, *given, "--out", tmp_path / "b", "--quiet", "--no-verify")
+    assert "7 images added" in words
+
+
 def test_evaluate_takes_it_and_a_preset_is_still_untrained(
-    shared: pathlib.Path, capfd: Capture
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
 ) -> None:
     given = ("evaluate", "--data", shared / "town", "--quiet")
-    words, (note,) = said(capfd, *given)
+    words, (note,) = said(capfd, *given, "--json", tmp_path / "said.json")
     assert note.startswith(NOTE)
-    assert "starter.safetensors" in words
+    assert "starter images at 96 x 128" in words
+    assert json.loads((tmp_path / "said.json").read_text())["weights"] == "starter"
+    # What is wrong is told by itself, and no note before it.
+    fails(capfd, "evaluate", "--data", tmp_path / "none", words=(f"{tmp_path / 'none'}",))
     words, notes = said(capfd, *given, "--preset", "tiny", "--grouping", "single")
     assert "untrained tiny, seed 0" in words
     assert notes == []

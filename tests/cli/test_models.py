@@ -120,13 +120,23 @@ def test_both_are_written_as_json(capfd, tmp_path):
     assert (facts["licence"], facts["commercial"]) == ("MIT", True)
 
 
-def test_an_unknown_name_is_one_line(capfd):
-    for arguments in (["models", "megalok"], ["info", "--weights", "megalok"]):
+def test_the_model_in_the_package_is_told_of_in_the_same_words(capfd):
+    out, _ = runs(capfd, "models", "starter")
+    facts = dict(line.split(maxsplit=1) for line in out.splitlines())
+    known = {"descriptor": "2,304", "parameters": "709,664", "licence": "Apache-2.0"}
+    assert facts.items() >= known.items()  # docs/starter.md
+    assert facts["images"].startswith("96 x 128")
+    assert pathlib.Path(facts["file"]).is_file()
+
+
+@pytest.mark.parametrize(("name", "nearest"), [("megalok", "megaloc"), ("startr", "starter")])
+def test_an_unknown_name_is_one_line(capfd, name, nearest):
+    for arguments in (["models", name], ["info", "--weights", name]):
         assert main(arguments) == 2
         error = capfd.readouterr().err
         assert error.count("\n") == 1
-        assert error.startswith("crisalad: megalok: found no ")
-        assert "nearest: megaloc" in error
+        assert error.startswith(f"crisalad: {name}: found no ")
+        assert f"nearest: {nearest}" in error
 
 
 def test_weights_by_name(capfd, tmp_path):

@@ -196,7 +196,7 @@ def test_views_vary_within_the_place(world):
         ({"repaint": -0.5}, "WorldConfig.repaint: found -0.5, expected at least 0"),
         (
             {"varied": ("sun",)},
-            r"WorldConfig.varied: found \('sun',\), expected a tuple, each one of",
+            r"WorldConfig.varied: found \('sun',\), expected a tuple",
         ),
         ({"sceneries": ()}, r"WorldConfig.sceneries: found \(\), expected at least one"),
     ],

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.retrieval.maps.build import index
@@ -73,6 +74,20 @@ def test_many_clients_get_the_answers_of_query(service, pictures, expected):
         assert reply.status == 200
         assert_answers(reply.json["neighbours"], expected[name])
         assert reply.json["latency_ms"] > 0
+
+
+def test_a_map_of_the_model_in_the_package_is_served_by_it(sides, pictures, tmp_path):
+    own, config = load("starter")
+    index(own, config, sides[0], tmp_path / "map", weights="starter", quiet=True)
+    with Map.open(tmp_path / "map") as places:
+        params = places.load_params()
+        answers = query(places, params, sides[1], k=1, quiet=True)
+    with serving(tmp_path / "map", params) as service:
+        for path, ranked in answers.rows():
+            reply = service.ask("POST", "/locate?k=1", path.read_bytes())
+            assert_answers(
+                reply.json["neighbours"], [answer_fields(one, answers.axes) for one in ranked]
+            )
 
 
 def test_a_calibrated_map_knows_what_it_does_not_know(own_map, params, pictures, expected):
