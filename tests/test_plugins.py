@@ -37,6 +37,23 @@ WITHOUT_ENCODER = dataclasses.replace(
 pytestmark = pytest.mark.usefixtures("own_parts")
 
 
+@pytest.mark.parametrize("kind", ["dist-info", "egg-info"])
+def test_an_installed_packages_entry_points_are_plugins(kind, tmp_path, monkeypatch):
+    part = "import crisalad_jax as cj\n@cj.register_aggregator('first-patch')\n"
+    part += "def first_patch(features):\n    return features.patches[0]\n"
+    (tmp_path / "installed_part.py").write_text(part)
+    folder = tmp_path / f"installed_part-1.0.{kind}"
+    folder.mkdir()
+    name = "METADATA" if kind == "dist-info" else "PKG-INFO"
+    (folder / name).write_text("Metadata-Version: 2.1\nName: installed-part\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[crisalad_jax.plugins]\nmine = installed_part\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(plugins, "_ENTERED", set())
+    plugins.load_entry_points()
+    assert "first-patch" in REGISTRIES["aggregator"]
+    sys.modules.pop("installed_part")
+
+
 # Bad input, in the library and through the command line
 
 BROKEN = {

@@ -52,6 +52,7 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
     import tyro
 
     from crisalad_jax.cli import help as helping
+    from crisalad_jax.cli.quick_types import quicken
     from crisalad_jax.config.flags import unboxed
 
     program = f"crisalad {name}"
@@ -65,7 +66,8 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
         with contextlib.redirect_stderr(complaint):
             if hasattr(module, "parse"):
                 return module.parse(program, given)
-            return tyro.cli(helping.class_of(name, module, given), prog=program, args=given)
+            kind = quicken(helping.class_of(name, module, given))
+            return tyro.cli(kind, prog=program, args=given)
     except SystemExit as stop:
         if not stop.code:
             raise

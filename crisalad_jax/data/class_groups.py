@@ -9,12 +9,12 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.views import Views, views_of
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Bool, Float64, Int64
 
 _ADVICE = "; --loss.kind.classes.kind places takes its places for classes"
 _ONE_SPOT = 1e-3

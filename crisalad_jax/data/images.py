@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
 from crisalad_jax.data.resize import resize_image
@@ -19,6 +18,7 @@ from crisalad_jax.data.video import frame_time, read_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.shapes import UInt8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 """Suffixes of images for `list_images`, in lower case. Decoding goes by content, not by suffix."""

@@ -11,7 +11,6 @@ from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.images import IMAGE_SUFFIXES, read_image
@@ -19,6 +18,7 @@ from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.shapes import UInt8
 
 _POLL = 0.05
 """Seconds between two looks into a folder, and four times what a look takes if that is longer."""

@@ -11,7 +11,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.images import read_image
@@ -23,6 +22,7 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
+from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
 
 if TYPE_CHECKING:  # who only reads images starts sooner without them
     from crisalad_jax.data.augmentations import Augmentation

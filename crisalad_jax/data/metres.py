@@ -1,7 +1,8 @@
 """Project latitudes and longitudes to metres east and north of one zone of UTM."""
 
 import numpy as np
-from jaxtyping import Float64
+
+from crisalad_jax.utils.shapes import Float64
 
 _EQUATOR, _FLATTENING = 6_378_137.0, 1 / 298.257223563
 """Ellipsoid of WGS84, in metres."""

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, has_sides, has_split, listing
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float64
 
 TABLE = "places.csv"
 _COLUMNS = "name,place[,lat,lon[,heading]]"

@@ -14,12 +14,12 @@ from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, Int, Int32, Int64
 
 from crisalad_jax.data.own_places import read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
 from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.shapes import Float64, Int, Int32, Int64
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
 IDS_PER_CITY = 10**5

@@ -4,11 +4,11 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.resize import Pixels, check_pixels, resize_image
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float32
 
 
 @dataclasses.dataclass(frozen=True)

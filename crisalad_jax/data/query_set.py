@@ -5,13 +5,13 @@ import os
 import pathlib
 
 import numpy as np
-from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import has_split
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Int64
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

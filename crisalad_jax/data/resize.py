@@ -8,10 +8,10 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int64, UInt8
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float32, Int64, UInt8
 
 Pixels = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
 

@@ -18,11 +18,11 @@ from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.shapes import UInt8
 
 # OpenCV reads this as it opens its first video: our errors say what the user needs.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

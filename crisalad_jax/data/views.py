@@ -4,11 +4,11 @@ import re
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
 from crisalad_jax.data.metres import continuous, to_metres
 from crisalad_jax.data.places import Places
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Bool, Float64
 
 _NAME = re.compile(r".*?_\d{7,}_\d{4,}_\d{2,}_(\d{3,})_([^_]+)_([^_]+)_")
 """`data.places` writes a row's northdeg, latitude and longitude into its image's name."""

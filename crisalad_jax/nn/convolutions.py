@@ -1,7 +1,6 @@
 """What convolutional backbones are made of: convolutions with a batch norm, and maxima."""
 
 import dataclasses
-import functools
 import math
 from typing import Any
 
@@ -88,8 +87,7 @@ def max_pool(
     return y.reshape(*x.shape[:-3], *y.shape[1:])
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2, 3))
-def _max_pool(x: Array, size: int, stride: int, padding: int) -> Array:
+def _pool(x: Array, size: int, stride: int, padding: int) -> Array:
     """Pool a batch.
 
     The gradient is told to JAX because its own, a scatter of each window's maximum, takes four
@@ -100,9 +98,12 @@ def _max_pool(x: Array, size: int, stride: int, padding: int) -> Array:
     return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, window, strides, margins)
 
 
+_max_pool = jax.custom_vjp(_pool, nondiff_argnums=(1, 2, 3))
+
+
 def _max_pool_forward(x: Array, size: int, stride: int, padding: int) -> tuple[Array, Any]:
     """Keep which pixel of each window was its first maximum, and the images' height and width."""
-    y = _max_pool(x, size, stride, padding)
+    y = _pool(x, size, stride, padding)
     rows, columns = y.shape[1:3]
     margin = (padding, padding)
     padded = jnp.pad(x, ((0, 0), margin, margin, (0, 0)), constant_values=-jnp.inf)

@@ -5,7 +5,6 @@ import pathlib
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float32
 
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.resize import Pixels
@@ -18,6 +17,7 @@ from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.shapes import Float32
 
 
 def describe_alone(

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import ml_dtypes
 import numpy as np
-from jaxtyping import Float, Float32, Int
 
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float, Float32, Int
 
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 UNIT_TOLERANCE = 1e-2

@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int64
+
+from crisalad_jax.utils.shapes import Float32, Int64
 
 
 class Described(NamedTuple):

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from typing import IO, Any, Self
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.data.images import check_lines
@@ -30,6 +29,7 @@ from crisalad_jax.utils.files import (
     write_json,
     write_npy,
 )
+from crisalad_jax.utils.shapes import Float, Float32, Int
 
 Descriptors = Float[np.ndarray, "image descriptor"]
 _DIGESTS = "files"

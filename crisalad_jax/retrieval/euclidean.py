@@ -1,10 +1,10 @@
 """Rank descriptors of any length by their Euclidean distances, with the search for unit vectors."""
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from crisalad_jax.retrieval.chunks import as_sides
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float, Float32
 
 
 def to_unit_vectors(

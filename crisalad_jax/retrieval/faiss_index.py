@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple
 
 import faiss as _faiss
 import numpy as np
-from jaxtyping import Float, Float32, Int
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, check_rows, pieces, sample
@@ -24,6 +23,7 @@ from crisalad_jax.utils.checksums import append_checksum, check_appended
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.shapes import Float, Float32, Int
 
 faiss: Any = _faiss  # its classes are made when it is loaded
 Kind = Literal["hnsw", "ivf-pq"]

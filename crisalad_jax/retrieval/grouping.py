@@ -9,10 +9,10 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int64
 
 from crisalad_jax.config.checks import check_seed, choose
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Bool, Int64
 
 GROUPINGS = {
     "single": "every image alone",

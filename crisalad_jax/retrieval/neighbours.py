@@ -4,9 +4,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int64
 
 from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE
+from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 
 _PIECE = 2**17
 """Size of a piece that is multiplied in float64, in numbers: 1 MiB, which fits a core's cache."""

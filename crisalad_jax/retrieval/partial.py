@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import safetensors
-from jaxtyping import Bool, Int64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.io import to_plain
@@ -27,6 +26,7 @@ from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.locks import one_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.shapes import Bool, Int64
 from crisalad_jax.utils.temporaries import remove_temporaries
 
 FORMAT = "crisalad-jax tokens 1"

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import check_seed, check_types
@@ -19,6 +18,7 @@ from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import Bar, progress_bar
+from crisalad_jax.utils.shapes import Float, Float32, Float64
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.layers import Linear

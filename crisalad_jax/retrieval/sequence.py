@@ -10,10 +10,10 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
 
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float, Float64, Int64
 
 _PRIOR_FRAMES = 10
 """Number of frames that the map's own mean counts for in the mean of the frames so far."""

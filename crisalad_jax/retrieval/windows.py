@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float32
 
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.resize import Pixels
@@ -26,6 +25,7 @@ from crisalad_jax.retrieval.model import (
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float32
 
 
 def check_window(config: ModelConfig, window: int) -> None:

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from crisalad_jax.config.parts import Part, Registry, count_arguments
+from crisalad_jax.utils.shapes import UInt8
 
 Image = UInt8[np.ndarray, "h w 3"]
 

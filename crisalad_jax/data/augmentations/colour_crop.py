@@ -9,11 +9,11 @@ import math
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
 
 from crisalad_jax.config.checks import require, require_fraction
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.utils.shapes import Float32
 
 _LUMA = np.array([0.2989, 0.587, 0.114], np.float32)
 """Torchvision's weights of grey."""

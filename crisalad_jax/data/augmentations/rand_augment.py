@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int64, UInt8
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
+from crisalad_jax.utils.shapes import Bool, Int64, UInt8
 
 MAGNITUDE_BINS = 31
 

@@ -4,9 +4,9 @@ import dataclasses
 import pathlib
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Bool, Float64, Int64
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_split, list_part
@@ -15,6 +14,7 @@ from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radi
 from crisalad_jax.data.benchmarks.tables_of_positions import positions_beside
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
+from crisalad_jax.utils.shapes import Int64
 
 TRUTH = "ground_truth.csv"
 _HEADER = ["query", "database"]

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float64, Int64
 
 DEFAULT_RADIUS = 25.0
 """Radius in metres of the common rule (Arandjelovic et al. 2016)."""

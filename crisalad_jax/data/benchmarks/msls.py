@@ -12,13 +12,13 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, listing, shown
 from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
+from crisalad_jax.utils.shapes import Float, Float64, Int64
 
 MSLS_CITIES = {
     "val": ("cph", "sf"),

@@ -10,13 +10,13 @@ import pathlib
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
+from crisalad_jax.utils.shapes import Float64
 
 _FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
 _DATABASE_FOLDERS = (".", "images")

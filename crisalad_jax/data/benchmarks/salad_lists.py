@@ -9,7 +9,6 @@ import pathlib
 import re
 
 import numpy as np
-from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images, listing
@@ -18,6 +17,7 @@ from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.shapes import Int64
 
 _FILE = re.compile(r"(?P<prefix>(?:.*_)?)(?P<kind>dbImages|qImages|gt|qIdx|pIdx)\.npy")
 _MSLS_IMAGE = re.compile(r"train_val/([^/]+)/(?:database|query)/images/[^/]+")

@@ -4,11 +4,11 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64
 
 from crisalad_jax.data.metres import continuous, to_metres
 from crisalad_jax.data.positions import AXES, read_positions
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float64
 
 BOTH = "positions.csv"
 SIDES = ("database", "queries")

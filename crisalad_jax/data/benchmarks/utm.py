@@ -9,7 +9,6 @@ import pathlib
 import re
 
 import numpy as np
-from jaxtyping import Float64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import (
@@ -23,6 +22,7 @@ from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radi
 from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.positions import utm_position
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float64
 
 QUERIES = "queries"
 """Default folder of the queries."""

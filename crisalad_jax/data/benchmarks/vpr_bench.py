@@ -4,7 +4,6 @@ import os
 import pathlib
 
 import numpy as np
-from jaxtyping import Int64
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import list_part
@@ -13,6 +12,7 @@ from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.shapes import Int64
 
 TRUTH = "ground_truth_new.npy"
 

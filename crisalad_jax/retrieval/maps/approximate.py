@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import sample
@@ -20,6 +19,7 @@ from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.shapes import Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:

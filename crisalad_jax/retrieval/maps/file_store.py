@@ -5,13 +5,13 @@ import pathlib
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
 
 from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.ties import lower_first
 from crisalad_jax.retrieval.neighbours import Neighbours, exact_similarities, rounding
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, durable_path, npy_header, write_npy
+from crisalad_jax.utils.shapes import Float, Float32, Int64
 
 _SPARE = 16
 """Number of candidates beyond k, for products that float32 cannot tell apart."""

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
 
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.sequence import BayesFilter, SequenceState
+from crisalad_jax.utils.shapes import Float32, Float64, Int64
 
 _NUMBERS = 2**25
 """Similarities computed at a time: 128 MiB."""

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
@@ -55,6 +54,7 @@ from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.shapes import Float, Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:  # a map is searched without JAX

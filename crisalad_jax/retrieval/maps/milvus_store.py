@@ -10,11 +10,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from crisalad_jax.retrieval.maps.ties import lower_first
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float, Float32
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"
 """The environment variable that holds a server's token, or its user:password."""

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count
@@ -27,6 +26,7 @@ from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
 if TYPE_CHECKING:  # answers are searched without JAX
     from crisalad_jax.nn.model import Crisalad

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.shapes import Float, Float32
 
 DTYPES = ("float32", "float16")
 """Types that descriptors may be stored as."""

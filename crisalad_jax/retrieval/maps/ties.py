@@ -3,9 +3,9 @@
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32
 
 from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.utils.shapes import Float32
 
 Ask = Callable[[Float32[np.ndarray, "q d"], int], Neighbours]
 """Takes queries and k; returns the k most similar of each, equal ones in any order."""

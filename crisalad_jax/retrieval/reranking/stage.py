@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.data.loader import ImageBatch, ImageCache
@@ -21,6 +20,7 @@ from crisalad_jax.retrieval.reranking import patch_netvlad, selavpr, transvpr
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.shapes import Bool, Float, Int
 
 
 @dataclasses.dataclass(frozen=True)
