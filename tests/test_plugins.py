@@ -1,12 +1,14 @@
 """Plug-ins from --plugin to the tables, and what is said of those that are wrong."""
 
 import dataclasses
+import importlib.machinery
 import json
 import pathlib
 import pickle
 import shutil
 import subprocess
 import sys
+import types
 from typing import Any
 
 import jax
@@ -37,21 +39,42 @@ WITHOUT_ENCODER = dataclasses.replace(
 pytestmark = pytest.mark.usefixtures("own_parts")
 
 
-@pytest.mark.parametrize("kind", ["dist-info", "egg-info"])
+@pytest.mark.parametrize("kind", ["dist-info", "egg-info", "DIST-INFO"])
 def test_an_installed_packages_entry_points_are_plugins(kind, tmp_path, monkeypatch):
     part = "import crisalad_jax as cj\n@cj.register_aggregator('first-patch')\n"
     part += "def first_patch(features):\n    return features.patches[0]\n"
     (tmp_path / "installed_part.py").write_text(part)
     folder = tmp_path / f"installed_part-1.0.{kind}"
     folder.mkdir()
-    name = "METADATA" if kind == "dist-info" else "PKG-INFO"
+    name = "PKG-INFO" if kind == "egg-info" else "METADATA"
     (folder / name).write_text("Metadata-Version: 2.1\nName: installed-part\nVersion: 1.0\n")
     (folder / "entry_points.txt").write_text("[crisalad_jax.plugins]\nmine = installed_part\n")
-    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path)])
     monkeypatch.setattr(plugins, "_ENTERED", set())
+    monkeypatch.setattr(plugins, "_PLUGINS", {})
+    monkeypatch.setitem(sys.modules, "installed_part", None)  # so that it is gone again
+    del sys.modules["installed_part"]
     plugins.load_entry_points()
     assert "first-patch" in REGISTRIES["aggregator"]
-    sys.modules.pop("installed_part")
+
+
+def test_where_no_package_has_entry_points_importlib_metadata_is_not_asked(tmp_path, monkeypatch):
+    folder = tmp_path / "other-1.0.dist-info"
+    folder.mkdir()
+    (folder / "entry_points.txt").write_text("[console_scripts]\nother = other:main\n")
+    (tmp_path / "empty-1.0.dist-info").mkdir()
+    monkeypatch.setattr(sys, "meta_path", [importlib.machinery.PathFinder])
+    monkeypatch.setattr(sys, "path", [str(tmp_path), str(tmp_path / "none")])
+    assert not plugins._may_have_entry_points()
+    # What is not plain is left to it: archives, eggs, and finders that know packages elsewhere.
+    (tmp_path / "modules.zip").touch()
+    for more in ("modules.zip", "other.egg"):
+        monkeypatch.setattr(sys, "path", [str(tmp_path / more)])
+        assert plugins._may_have_entry_points()
+    monkeypatch.setattr(sys, "path", [])
+    finder = types.SimpleNamespace(find_distributions=lambda context: [])
+    monkeypatch.setattr(sys, "meta_path", [importlib.machinery.PathFinder, finder])
+    assert plugins._may_have_entry_points()
 
 
 # Bad input, in the library and through the command line

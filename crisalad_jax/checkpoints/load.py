@@ -6,7 +6,6 @@ import re
 from typing import TYPE_CHECKING, NamedTuple
 
 from crisalad_jax.checkpoints import starter
-from crisalad_jax.checkpoints.runtime import MANIFEST
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 
@@ -83,8 +82,7 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
     path = pathlib.Path(weights)
     name = os.fspath(weights)
     is_there = os.path.isfile(path)
-    # An exported folder, too, is taken without importing JAX: another engine has no need of it.
-    if (is_there and path.suffix) or os.path.isfile(path / MANIFEST):
+    if is_there and path.suffix:
         return path
     if name == starter.NAME and not is_there:
         return starter.FILE

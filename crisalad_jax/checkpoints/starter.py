@@ -26,6 +26,11 @@ def default_weights() -> pathlib.Path:
     return FILE
 
 
+def named(weights: str | os.PathLike[str]) -> str:
+    """Return the words for a file of weights in what people read: of this model its name."""
+    return NAME if pathlib.Path(weights) == FILE else os.fspath(weights)
+
+
 def recorded(weights: str | os.PathLike[str]) -> str:
     """Return what a map records of where its weights are: a path, or the name of this model.
 

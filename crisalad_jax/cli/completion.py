@@ -66,6 +66,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
 
 def _choices(command: str, action: argparse.Action) -> Any:
     """Return the values that a flag takes, or None where they are not a few names."""
+    from crisalad_jax.checkpoints import starter
     from crisalad_jax.checkpoints.published import PUBLISHED
     from crisalad_jax.nn.config import PRESETS
     from crisalad_jax.training.recipes import RECIPES
@@ -75,5 +76,5 @@ def _choices(command: str, action: argparse.Action) -> Any:
     if action.dest == "recipe":
         return tuple(RECIPES)
     if (command, action.dest) == ("models", "name"):
-        return tuple(PUBLISHED)
+        return (starter.NAME, *PUBLISHED)
     return action.choices and tuple(each for each in action.choices if each != "None")

@@ -71,7 +71,8 @@ def _facts(model: Published) -> dict[str, Any]:
 def _own_facts() -> dict[str, Any]:
     """Return what is known of the model in this package, in the words for published ones."""
     params, config = load_weights(starter.FILE)
-    return {
+    unsaid = dict.fromkeys(field.name for field in dataclasses.fields(Published))
+    return unsaid | {
         "name": starter.NAME,
         "descriptor": config.descriptor_dim,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(params)),

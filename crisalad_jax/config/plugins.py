@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import importlib
+import importlib.machinery
 import importlib.util
 import os
 import pathlib
@@ -164,7 +165,7 @@ def load_entry_points() -> None:
     """
     if not _may_have_entry_points():
         return
-    import importlib.metadata  # a twentieth of a short command's time
+    import importlib.metadata  # which a short command would wait for
 
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         if entry.module not in _ENTERED:
@@ -174,14 +175,21 @@ def load_entry_points() -> None:
 
 def _may_have_entry_points() -> bool:
     """Return whether an installed package names `ENTRY_POINTS`; True where that is not plain."""
-    for folder in sys.path:
-        if os.path.isfile(folder):
-            return True  # an archive of modules
-        with contextlib.suppress(OSError):  # no such folder, or none that can be read
-            for entry in os.scandir(folder or os.curdir):
-                if entry.name.endswith((".dist-info", ".egg-info")):
-                    with contextlib.suppress(OSError):  # most packages have no such file
-                        words = pathlib.Path(entry.path, "entry_points.txt").read_bytes()
-                        if ENTRY_POINTS.encode() in words:
-                            return True
-    return False
+    finders = [each for each in sys.meta_path if hasattr(each, "find_distributions")]
+    if finders != [importlib.machinery.PathFinder]:
+        return True  # packages may be where no folder of sys.path is
+    return any(map(_names_entry_points, sys.path))
+
+
+def _names_entry_points(folder: str) -> bool:
+    """Return whether a package in a folder of `sys.path` may name `ENTRY_POINTS`."""
+    if os.path.isfile(folder) or folder.lower().endswith(".egg"):
+        return True  # an archive of modules, or a package with its facts inside
+    with contextlib.suppress(OSError), os.scandir(folder or os.curdir) as entries:
+        for entry in entries:
+            if entry.name.lower().endswith((".dist-info", ".egg-info")):
+                with contextlib.suppress(OSError):  # most packages have no such file
+                    words = pathlib.Path(entry.path, "entry_points.txt").read_bytes()
+                    if ENTRY_POINTS.encode() in words:
+                        return True
+    return False  # also where there is no such folder, or it cannot be read

@@ -50,11 +50,7 @@ def evaluation_settings(
         The values by name.
     """
     files = {"weights": weights, "pca": pca, "rerank_weights": rerank_weights}
-    # Of the model in the package its name: a path says nothing on another machine.
-    words = {
-        name: None if file is None else starter.NAME if file == starter.FILE else str(file)
-        for name, file in files.items()
-    }
+    words = {name: None if file is None else starter.named(file) for name, file in files.items()}
     return {
         "weights": words["weights"],
         "benchmark": benchmark.name,

@@ -80,7 +80,7 @@ def max_pool(
 ) -> Float[Array, "*batch rows columns dim"]:
     """Return the maximum of each window of size x size pixels; padding never wins.
 
-    The gradient goes to the first of equal pixels, as torch's does.
+    The gradient goes to the first of equal pixels, as torch's does; forward mode has none.
     """
     images = x.reshape(-1, *x.shape[-3:])
     y = _max_pool(images, size, stride, padding)
@@ -90,8 +90,8 @@ def max_pool(
 def _pool(x: Array, size: int, stride: int, padding: int) -> Array:
     """Pool a batch.
 
-    The gradient is told to JAX because its own, a scatter of each window's maximum, takes four
-    times as long on a CPU, and keeps all pixels for it.
+    The gradient is told to JAX because its own keeps all pixels, and on a CPU takes longer: it
+    scatters each window's change to its maximum.
     """
     margins = ((0, 0), (padding, padding), (padding, padding), (0, 0))
     window, strides = (1, size, size, 1), (1, stride, stride, 1)
@@ -107,11 +107,12 @@ def _max_pool_forward(x: Array, size: int, stride: int, padding: int) -> tuple[A
     rows, columns = y.shape[1:3]
     margin = (padding, padding)
     padded = jnp.pad(x, ((0, 0), margin, margin, (0, 0)), constant_values=-jnp.inf)
-    winner = jnp.zeros(y.shape, jnp.uint8)
+    number_type = np.min_scalar_type(size * size)
+    winner = jnp.zeros(y.shape, number_type)
     for number, (top, left) in reversed(list(enumerate(np.ndindex(size, size)))):
         bottom, right = top + (rows - 1) * stride + 1, left + (columns - 1) * stride + 1
         pixels = padded[:, top:bottom:stride, left:right:stride]
-        winner = jnp.where(pixels == y, jnp.uint8(number), winner)
+        winner = jnp.where(pixels == y, jnp.asarray(number, number_type), winner)
     return y, (winner, x.shape[1:3])
 
 

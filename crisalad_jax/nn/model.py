@@ -249,9 +249,9 @@ def describe(
     to none attends to itself. See `self_mask` and `valid_mask`.
 
     It works under `jax.jit`, `jax.vmap` and reverse mode (`jax.grad`, `jax.jacrev`), once and
-    twice. Forward mode (`jax.jvp`, `jax.hessian`) does not work: the gradient of attention is
-    written out, for speed. Take `jax.jacrev` of `jax.grad` for a Hessian. On an accelerator, where
-    attention is fused, the gradient can be taken once.
+    twice. Forward mode (`jax.jvp`, `jax.hessian`) does not work: the gradients of attention and max
+    pooling are written out, for speed. Take `jax.jacrev` of `jax.grad` for a Hessian. On an
+    accelerator, where attention is fused, the gradient can be taken once.
 
     Args:
         params: from `init_crisalad` or a weight file.

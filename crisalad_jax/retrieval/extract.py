@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import check_lines
@@ -127,7 +128,7 @@ def extract(
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
     batch_size = useful_batch_size(batch_size, len(paths))
     record = {
-        "weights": None if weights is None else str(weights),
+        "weights": None if weights is None else starter.named(weights),
         "images": _source(images),
         "grouping": grouping,
         "batch_size": batch_size,

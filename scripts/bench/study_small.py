@@ -4,8 +4,9 @@
 
 Studies: transport and encoder (a small ViT with SALAD, five seeds) and world (a small ResNet with
 Conv-AP, from which the world leaves out one variation at a time). All train on rendered places
-alone, and are asked on other rendered places and on each SET. Runs that RUNS already holds are gone
-on with; two studies may run at once. Each run takes one to two minutes of a core.
+alone, and are asked on other rendered places and on each SET, by its folder's name. Runs that RUNS
+already holds are gone on with. A run takes about two minutes of a core; transport with encoder, and
+world, may run at once.
 """
 
 import collections
@@ -48,7 +49,13 @@ TRANSPORTS: dict[str, dict[str, Any]] = {
     "epsilon learnt": {"learn_epsilon": True},
     "softmax": {"step": "softmax"},
 }
-WATCHED = ("column_error", "dustbin_share", "patches_per_cluster")
+WATCHED = {
+    "column_error": "mass error",
+    "dustbin_share": "dustbin",
+    "patches_per_cluster": "patches",
+}
+"""Of the transport in the last step: the largest relative error of a cluster's mass, the dustbin's
+share of all mass, the effective number of patches in a cluster."""
 
 
 class Arm(NamedTuple):
@@ -128,9 +135,20 @@ def world() -> list[Arm]:
 STUDIES = {"transport": transport, "encoder": encoder, "world": world}
 
 
+def digest(value: Any) -> str:
+    """A short name for JSON values."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:12]
+
+
 def named(value: Any) -> str:
     """A short name for a configuration: runs and worlds of two studies are shared by it."""
-    return hashlib.sha256(json.dumps(to_plain(value), sort_keys=True).encode()).hexdigest()[:12]
+    return digest(to_plain(value))
+
+
+def contents(data: Benchmark) -> str:
+    """A short name for a set's images and which of them are right."""
+    files = [[path.name for path in side] for side in (data.queries, data.database)]
+    return digest([files, [list(map(int, each)) for each in data.ground_truth()]])
 
 
 def run(arm: Arm, seed: int, asked: Mapping[str, Benchmark], runs: pathlib.Path) -> dict[str, Any]:
@@ -140,16 +158,21 @@ def run(arm: Arm, seed: int, asked: Mapping[str, Benchmark], runs: pathlib.Path)
     folder = runs / "runs" / f"{named(config)}-{named(arm.world)}"
     result = folder / "recalls.json"
     found: dict[str, Any] = json.loads(result.read_text()) if result.exists() else {}
-    if set(asked) <= found.keys():
+    left = {
+        name: data
+        for name, data in asked.items()
+        if found.get(name, {}).get("contents") != contents(data)
+    }
+    if not left:
         return found
     write_world(root, arm.world)
     places = read_places(root / "train", min_images=config.min_images)
     params = fit(config, places, folder, quiet=True).params
     alone = config.model.cross_image.layers == 0
     groupings = ("single",) if alone else ("single", "shuffled", "sequential")
-    for name, data in asked.items():
+    for name, data in left.items():
         results = evaluate(params, config.model, data, groupings=groupings, quiet=True)
-        found[name] = {
+        found[name] = {"contents": contents(data)} | {
             grouping: {f"R@{k}": 100 * each.recalls[k] for k in (1, 5)}
             for grouping, each in zip(groupings, results, strict=True)
         }
@@ -173,10 +196,11 @@ def paired(values: Sequence[float], base: Sequence[float]) -> str:
 def study_of(name: str, results: Mapping[str, list[dict[str, Any]]], sets: Sequence[str]) -> Study:
     """A row an arm and grouping: recall, and how much it differs from the first arm's."""
     first = next(iter(results.values()))
+    watched = [key for key in WATCHED if key in first[0]]
     rows = []
     for label, runs in results.items():
         base = first[: len(runs)]
-        for grouping in runs[0][sets[0]]:
+        for grouping in [key for key in runs[0][sets[0]] if key != "contents"]:
             cells = [label, grouping, str(len(runs))]
             for data in sets:
                 values = [one[data][grouping]["R@1"] for one in runs]
@@ -186,13 +210,16 @@ def study_of(name: str, results: Mapping[str, list[dict[str, Any]]], sets: Seque
                 cells.append(
                     "" if is_base else paired(values, [one[data]["single"]["R@1"] for one in base])
                 )
+            cells += [f"{statistics.mean(one[key] for one in runs):.2f}" for key in watched]
             rows.append(tuple(cells))
     header = ["trained with", "images described", "seeds"]
     for data in sets:
         header += [f"{data}: R@1 / R@5", "R@1, difference"]
+    header += [WATCHED[key] for key in watched]
     caption = (
         "Mean recall in percent. A difference is to the first row, of runs with the same seeds, "
-        "with its 95 % interval by Student's t over seeds."
+        "with its 95 % interval by Student's t over seeds; of twenty such intervals one leaves out "
+        "0 by chance."
     )
     return Study(Table(tuple(header), rows, caption, 2), {"study": name, "runs": results})
 
@@ -206,7 +233,10 @@ def main() -> None:
     write_world(arguments.runs / "worlds" / named(WorldConfig()), WorldConfig())
     test = arguments.runs / "worlds" / named(WorldConfig()) / "test"
     asked = {"rendered": open_benchmark(test)}
-    asked |= {path.name: open_benchmark(path) for path in arguments.data}
+    for path in arguments.data:
+        if path.name in asked:
+            parser.error(f"--data: found two sets named {path.name}, expected other names")
+        asked[path.name] = open_benchmark(path)
     arms = {name: STUDIES[name]() for name in arguments.studies}
     results: dict[str, dict[str, list[dict[str, Any]]]] = collections.defaultdict(dict)
     total = sum(map(len, arms.values())) * len(arguments.seeds)

@@ -115,7 +115,7 @@ def nearest_names(name: str) -> str:
     """Return the published names most like this one, as the end of a message."""
     plain = re.sub(r"[^a-z0-9]+", "-", name.lower())
     near = [plain] if plain in PUBLISHED else []
-    # No published model, but one that --weights takes by its name.
+    # No published one, but --weights takes its name, too.
     near += difflib.get_close_matches(plain, (starter.NAME,), n=1, cutoff=0.75)
     # Of a family that is named alone the longest descriptors, which recall the most.
     near += sorted(

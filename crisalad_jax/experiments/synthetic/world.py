@@ -36,7 +36,10 @@ from crisalad_jax.utils.files import told_of, write_json
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 Variation = Literal["stand", "season", "time", "weather", "traffic", "exposure"]
-"""What changes from image to image of a place, besides paint; exposure has the noise with it."""
+"""What changes from image to image of a place, besides paint; exposure has the noise with it.
+
+The sun's place, the clouds and the white balance come of a picture's seed, which always changes.
+"""
 VARIATIONS: tuple[Variation, ...] = get_args(Variation)
 _FIELDS: dict[Variation, tuple[str, ...]] = {
     "season": ("season",),
@@ -70,8 +73,8 @@ class WorldConfig:
     repaint: float = 0.3
     """Largest `View.repaint`."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What changes between the training images of a place; the rest is as in a plain `View`. Test
-    images change in everything."""
+    """What changes between the training images of a place. The rest is as in a plain `View`, the
+    stand as the scene's camera. Test images change in everything."""
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -15,8 +15,8 @@ from crisalad_jax.training.recipes.convolutional import model_over
 def starter(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of `starter` (docs/starter.md), from random weights in one run.
 
-    The world is `crisalad render`'s. The weights in the package were trained by two runs of this
-    configuration, whose lengths differ.
+    The world is `crisalad render`'s. The weights in the package are of two runs instead: one with
+    the schedule of 26 epochs, stopped early, and a short one with a lower rate.
     """
     config = from_scratch(
         TrainConfig(
