@@ -1,12 +1,14 @@
 """What the model in the package recalls, beside HOG and the same network untrained.
 
-    python scripts/bench/study_starter.py --data SET... [--weights FILE] [--page docs/starter.md]
+    python scripts/bench/study_starter.py --data SET... [--weights FILE] [--others NAME=FILE...]
+        [--page docs/starter.md]
 
-Every image is described alone. An interval is the bootstrap's, of 95 %. With --page the table takes
-its place in the page.
+Every image is described alone. An interval is the bootstrap's, of 95 %. Others are models trained
+in another way. With --page the table takes its place in the page.
 """
 
 import argparse
+import itertools
 import pathlib
 from collections.abc import Iterator, Mapping
 
@@ -29,6 +31,7 @@ from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.utils.files import around
 
 KS = (1, 5, 10)
+Models = dict[str, tuple[Crisalad, ModelConfig]]
 
 
 def by_hog(data: Benchmark) -> tuple[Mapping[int, float], Interval]:
@@ -46,16 +49,11 @@ def by_model(
     return result.recalls, result.intervals[1]
 
 
-def rows(weights: pathlib.Path, sets: list[Benchmark]) -> Iterator[str]:
+def rows(models: Models, sets: list[Benchmark]) -> Iterator[str]:
     """The lines of the table."""
-    params, config = load_weights(weights)
-    untrained = init_crisalad(jax.random.key(0), config)
     for data in sets:
-        for name, (found, interval) in (
-            ("HOG", by_hog(data)),
-            ("untrained", by_model(untrained, config, data)),
-            ("**starter**", by_model(params, config, data)),
-        ):
+        described = ((name, by_model(*model, data)) for name, model in models.items())
+        for name, (found, interval) in itertools.chain([("HOG", by_hog(data))], described):
             first, *others = (f"{100 * found[k]:.1f}" for k in KS)
             low, high = (f"{100 * each:.1f}" for each in (interval.low, interval.high))
             cells = (data.name, str(len(data.queries)), name, f"{first} ({low} to {high})", *others)
@@ -66,12 +64,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=pathlib.Path, nargs="+", required=True)
     parser.add_argument("--weights", type=pathlib.Path, default=starter.FILE)
+    parser.add_argument("--others", nargs="*", default=[], help="NAME=FILE of weights")
     parser.add_argument("--page", type=pathlib.Path)
     given = parser.parse_args()
+    own, config = load_weights(given.weights)
+    models: Models = {"untrained": (init_crisalad(jax.random.key(0), config), config)}
+    for name, _, file in (each.partition("=") for each in given.others):
+        models[name] = load_weights(file)
+    models["**starter**"] = own, config
     sets = [open_benchmark(path) for path in given.data]
     heads = ["set", "queries", "descriptor", *(f"R@{k}" for k in KS)]
     lines = [f"| {' | '.join(heads)} |", "| --- | ---: | --- | ---: | ---: | ---: |"]
-    for line in rows(given.weights, sets):
+    for line in rows(models, sets):
         lines.append(line)
         print(line, flush=True)
     if given.page is not None:

@@ -33,7 +33,7 @@ def test_extract_takes_it(shared: pathlib.Path, tmp_path: pathlib.Path, capfd: C
     _, (note,) = said(capfd, *given, "--out", tmp_path / "default.npy")
     assert note.startswith(NOTE)
     # The name and no path: the package lies elsewhere on another machine.
-    assert json.loads((tmp_path / "default.json").read_text())["weights"] == "starter"
+    assert json.loads((tmp_path / "default.npy.json").read_text())["weights"] == "starter"
     assert note.endswith("for the best recall: --weights megaloc")
     _, notes = said(capfd, *given, "--out", tmp_path / "named.npy", "--weights", "starter")
     assert notes == []
