@@ -12,6 +12,7 @@ world, may run at once.
 import collections
 import dataclasses
 import hashlib
+import itertools
 import json
 import pathlib
 import statistics
@@ -202,19 +203,17 @@ def study_of(name: str, results: Mapping[str, list[dict[str, Any]]], sets: Seque
         base = first[: len(runs)]
         for grouping in [key for key in runs[0][sets[0]] if key != "contents"]:
             cells = [label, grouping, str(len(runs))]
-            for data in sets:
-                values = [one[data][grouping]["R@1"] for one in runs]
-                fives = [one[data][grouping]["R@5"] for one in runs]
-                cells.append(f"{statistics.mean(values):.1f} / {statistics.mean(fives):.1f}")
-                is_base = runs is first and grouping == "single"
-                cells.append(
-                    "" if is_base else paired(values, [one[data]["single"]["R@1"] for one in base])
-                )
+            is_base = runs is first and grouping == "single"
+            for data, recall in itertools.product(sets, ("R@1", "R@5")):
+                values = [one[data][grouping][recall] for one in runs]
+                cells.append(f"{statistics.mean(values):.1f}")
+                alone = [one[data]["single"][recall] for one in base]
+                cells.append("" if is_base else paired(values, alone))
             cells += [f"{statistics.mean(one[key] for one in runs):.2f}" for key in watched]
             rows.append(tuple(cells))
     header = ["trained with", "images described", "seeds"]
-    for data in sets:
-        header += [f"{data}: R@1 / R@5", "R@1, difference"]
+    for data, recall in itertools.product(sets, ("R@1", "R@5")):
+        header += [f"{data}, {recall}", "difference"]
     header += [WATCHED[key] for key in watched]
     caption = (
         "Mean recall in percent. A difference is to the first row, of runs with the same seeds, "
