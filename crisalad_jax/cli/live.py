@@ -91,7 +91,7 @@ def model_of(places: Map, arguments: "Query") -> "Crisalad | Runtime":
     if runtime == "jax":
         return places.load_params(weights)
     return places.load_runtime(
-        arguments.runtime,
+        runtime,
         weights,
         any_grouping=arguments.window > 1,
         verify=arguments.verify,
