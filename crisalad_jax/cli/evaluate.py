@@ -148,8 +148,9 @@ def run(arguments: Evaluate) -> None:
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
-    benchmark = open_set(arguments)
+    benchmark = None
     if arguments.weights is None and arguments.preset is None:
+        benchmark = open_set(arguments)  # what is wrong with it is told before the note
         arguments = dataclasses.replace(arguments, weights=find_weights(None))
     options: dict[str, Any] = {
         "image_size": arguments.image_size,
@@ -171,6 +172,7 @@ def run(arguments: Evaluate) -> None:
         )
     rerank = _reranking(arguments, config)
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
+    benchmark = open_set(arguments) if benchmark is None else benchmark
     say(model_name)
     say(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()

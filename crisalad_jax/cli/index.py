@@ -16,6 +16,27 @@ from crisalad_jax.retrieval.maps.head import has_images, read_head, weights_of
 from crisalad_jax.retrieval.maps.manifest import read_description
 from crisalad_jax.utils.output import counted
 
+COMMON = (
+    "images",
+    "out",
+    "weights",
+    "fps",
+    "positions",
+    "store",
+    "dtype",
+    "pca",
+    "search",
+    "share",
+    "image-size",
+    "resize",
+    "batch-size",
+    "runtime",
+    "compute-dtype",
+    "on-bad-image",
+    "json",
+    "plugin",
+    "quiet",
+)
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 
 
