@@ -19,11 +19,16 @@ BEST = "megaloc"
 
 def default_weights() -> pathlib.Path:
     """Return the file of the model in this package, and tell that it was taken."""
+    tell_taken()
+    return FILE
+
+
+def tell_taken() -> None:
+    """Tell that the model in this package was taken."""
     tell(
         f"no --weights: taking {NAME}, the small model in this package, trained on rendered "
         f"pictures alone (docs/{NAME}.md); for the best recall: --weights {BEST}"
     )
-    return FILE
 
 
 def named(weights: str | os.PathLike[str]) -> str:

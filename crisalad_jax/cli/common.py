@@ -87,9 +87,16 @@ def give_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
         write_or_print_json(file, value)
 
 
-def find_given(weights: pathlib.Path | None, *, quiet: bool = False) -> pathlib.Path | None:
-    """Return the file that an optional flag means, as `find_weights` does; None where not given."""
-    return None if weights is None else find_weights(weights, quiet=quiet)
+def find_given(
+    weights: pathlib.Path | None, *, runtime: RuntimeName = "jax", quiet: bool = False
+) -> pathlib.Path | None:
+    """Return the file that an optional flag means, as `find_weights` does; None where not given.
+
+    For another runtime a folder is an exported model: no name to look up, which would import JAX.
+    """
+    if weights is None or (runtime != "jax" and weights.is_dir()):
+        return weights
+    return find_weights(weights, quiet=quiet)
 
 
 def check_one_model(weights: pathlib.Path | None, preset: str | None) -> None:

@@ -5,6 +5,7 @@ import dataclasses
 import pathlib
 from typing import Any, Literal
 
+from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.checkpoints.weights import load_weights
@@ -148,10 +149,9 @@ def run(arguments: Evaluate) -> None:
     talk_beside(arguments.json)
     if arguments.rerank is not None:
         parse_reranking(arguments.rerank)
-    benchmark = None
-    if arguments.weights is None and arguments.preset is None:
-        benchmark = open_set(arguments)  # what is wrong with it is told before the note
-        arguments = dataclasses.replace(arguments, weights=find_weights(None))
+    is_default = arguments.weights is None and arguments.preset is None
+    if is_default:
+        arguments = dataclasses.replace(arguments, weights=starter.FILE)
     options: dict[str, Any] = {
         "image_size": arguments.image_size,
         "resize": arguments.resize,
@@ -172,7 +172,9 @@ def run(arguments: Evaluate) -> None:
         )
     rerank = _reranking(arguments, config)
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
-    benchmark = open_set(arguments) if benchmark is None else benchmark
+    benchmark = open_set(arguments)
+    if is_default:  # told once nothing else is wrong
+        starter.tell_taken()
     say(model_name)
     say(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()

@@ -4,8 +4,7 @@ import contextlib
 import sys
 from typing import TYPE_CHECKING
 
-from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import STDOUT
+from crisalad_jax.cli.common import STDOUT, find_given
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
@@ -84,10 +83,8 @@ def run(arguments: "Query") -> None:
 
 def model_of(places: Map, arguments: "Query") -> "Crisalad | Runtime":
     """Load the map's model, or open it in the engine that the flags ask for."""
-    weights, runtime = arguments.weights, arguments.runtime
-    # An exported folder is no name to look up, for which published models and JAX are imported.
-    if weights is not None and (runtime == "jax" or not weights.is_dir()):
-        weights = find_weights(weights, quiet=arguments.quiet)
+    runtime = arguments.runtime
+    weights = find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet)
     if runtime == "jax":
         return places.load_params(weights)
     return places.load_runtime(

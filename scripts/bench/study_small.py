@@ -20,11 +20,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import scipy.stats
-from study_transport import with_transport
+from study_transport import VARIANTS, WATCHED, with_transport
 from tables import Study, Table, flags, leave, read_some
 
 from crisalad_jax.config.io import read_config, to_plain
-from crisalad_jax.data.augmentations.camera import CameraAugmentConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
@@ -41,22 +40,20 @@ from crisalad_jax.utils.progress import progress_bar
 
 STARTER = pathlib.Path(__file__).parents[2] / "docs" / "starter" / "config.json"
 BATCH = {"places_per_batch": 24, "images_per_place": 2, "min_images": 2}
+DUSTBINS = ("dustbin a token", "dustbin's mass learnt")
 TRANSPORTS: dict[str, dict[str, Any]] = {
-    "published, k = 3": {},
-    "converged, implicit": {"tolerance": 1e-3, "iterations": 200, "gradient": "implicit"},
-    "dustbin a token": {"dustbin": "token"},
-    "dustbin's mass learnt": {"dustbin": "mass"},
-    "column tau 0.9, k = 20": {"column_tau": 0.9, "iterations": 20},
+    **{label: VARIANTS[label] for label in ("published, k = 3", "converged, implicit", *DUSTBINS)},
+    "column tau 0.9, k = 20": VARIANTS["column tau 0.9, k = 20"],
     "epsilon learnt": {"learn_epsilon": True},
-    "softmax": {"step": "softmax"},
+    "softmax": VARIANTS["softmax"],
 }
-WATCHED = {
-    "column_error": "mass error",
-    "dustbin_share": "dustbin",
-    "patches_per_cluster": "patches",
-}
-"""Of the transport in the last step: the largest relative error of a cluster's mass, the dustbin's
-share of all mass, the effective number of patches in a cluster."""
+
+
+class Asked(NamedTuple):
+    """A set that is asked, with a short name for its images and which of them are right."""
+
+    data: Benchmark
+    contents: str
 
 
 class Arm(NamedTuple):
@@ -127,7 +124,6 @@ def world() -> list[Arm]:
     light = {
         field.name: getattr(camera, field.name) for field in dataclasses.fields(LightAugmentConfig)
     }
-    assert isinstance(camera, CameraAugmentConfig)
     plain = dataclasses.replace(config, augmentation=LightAugmentConfig(**light))
     arms.append(Arm("no camera's faults", plain, whole))
     return arms
@@ -146,24 +142,21 @@ def named(value: Any) -> str:
     return digest(to_plain(value))
 
 
-def contents(data: Benchmark) -> str:
-    """A short name for a set's images and which of them are right."""
+def open_asked(path: pathlib.Path) -> Asked:
+    data = open_benchmark(path)
     files = [[path.name for path in side] for side in (data.queries, data.database)]
-    return digest([files, [list(map(int, each)) for each in data.ground_truth()]])
+    return Asked(data, digest([files, [list(map(int, each)) for each in data.ground_truth()]]))
 
 
-def run(arm: Arm, seed: int, asked: Mapping[str, Benchmark], runs: pathlib.Path) -> dict[str, Any]:
+def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> dict[str, Any]:
     """Recalls of one trained model by set and grouping, and its transport's statistics."""
     config = dataclasses.replace(arm.config, seed=seed)
     root = runs / "worlds" / named(arm.world)
     folder = runs / "runs" / f"{named(config)}-{named(arm.world)}"
     result = folder / "recalls.json"
-    found: dict[str, Any] = json.loads(result.read_text()) if result.exists() else {}
-    left = {
-        name: data
-        for name, data in asked.items()
-        if found.get(name, {}).get("contents") != contents(data)
-    }
+    found: dict[str, Any] = json.loads(result.read_text()) if result.exists() else {"contents": {}}
+    there = found["contents"]
+    left = {name: one for name, one in asked.items() if there.get(name) != one.contents}
     if not left:
         return found
     write_world(root, arm.world)
@@ -171,9 +164,10 @@ def run(arm: Arm, seed: int, asked: Mapping[str, Benchmark], runs: pathlib.Path)
     params = fit(config, places, folder, quiet=True).params
     alone = config.model.cross_image.layers == 0
     groupings = ("single",) if alone else ("single", "shuffled", "sequential")
-    for name, data in left.items():
-        results = evaluate(params, config.model, data, groupings=groupings, quiet=True)
-        found[name] = {"contents": contents(data)} | {
+    for name, one in left.items():
+        results = evaluate(params, config.model, one.data, groupings=groupings, quiet=True)
+        there[name] = one.contents
+        found[name] = {
             grouping: {f"R@{k}": 100 * each.recalls[k] for k in (1, 5)}
             for grouping, each in zip(groupings, results, strict=True)
         }
@@ -200,14 +194,13 @@ def study_of(name: str, results: Mapping[str, list[dict[str, Any]]], sets: Seque
     watched = [key for key in WATCHED if key in first[0]]
     rows = []
     for label, runs in results.items():
-        base = first[: len(runs)]
-        for grouping in [key for key in runs[0][sets[0]] if key != "contents"]:
+        for grouping in runs[0][sets[0]]:
             cells = [label, grouping, str(len(runs))]
             is_base = runs is first and grouping == "single"
             for data, recall in itertools.product(sets, ("R@1", "R@5")):
                 values = [one[data][grouping][recall] for one in runs]
                 cells.append(f"{statistics.mean(values):.1f}")
-                alone = [one[data]["single"][recall] for one in base]
+                alone = [one[data]["single"][recall] for one in first]
                 cells.append("" if is_base else paired(values, alone))
             cells += [f"{statistics.mean(one[key] for one in runs):.2f}" for key in watched]
             rows.append(tuple(cells))
@@ -229,13 +222,13 @@ def main() -> None:
     parser.add_argument("--data", type=pathlib.Path, nargs="*", default=[], help="also asked")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     arguments = read_some(parser, STUDIES)
-    write_world(arguments.runs / "worlds" / named(WorldConfig()), WorldConfig())
-    test = arguments.runs / "worlds" / named(WorldConfig()) / "test"
-    asked = {"rendered": open_benchmark(test)}
+    whole = arguments.runs / "worlds" / named(WorldConfig())
+    write_world(whole, WorldConfig())
+    asked = {"rendered": open_asked(whole / "test")}
     for path in arguments.data:
         if path.name in asked:
             parser.error(f"--data: found two sets named {path.name}, expected other names")
-        asked[path.name] = open_benchmark(path)
+        asked[path.name] = open_asked(path)
     arms = {name: STUDIES[name]() for name in arguments.studies}
     results: dict[str, dict[str, list[dict[str, Any]]]] = collections.defaultdict(dict)
     total = sum(map(len, arms.values())) * len(arguments.seeds)

@@ -103,6 +103,12 @@ def test_a_map_of_one_runtime_answers_another(
     assert answers[0] == answers[1] == answers[2]
 
 
+def printed_by(program: str) -> str:
+    """What a program prints in a process of its own, whose imports are its alone."""
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
 def test_a_kept_export_describes_without_jax(
     shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
 ):
@@ -123,10 +129,7 @@ def test_a_kept_export_describes_without_jax(
         "assert model.describe(np.zeros((1, 42, 56, 3), np.uint8)).shape == (1, 48)\n"
         "print('jax' in sys.modules)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "False\n"
+    assert printed_by(program) == "False\n"
 
 
 @pytest.fixture
@@ -151,10 +154,7 @@ def test_a_query_by_an_exported_folder_starts_without_jax(
         "slow = {'jax', 'jaxtyping', 'typeguard', 'importlib.metadata', 'unittest.mock'}\n"
         "print(slow & sys.modules.keys())\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.endswith("\nset()\n")
+    assert printed_by(program).endswith("\nset()\n")
 
 
 def test_an_exported_folder_is_a_model(

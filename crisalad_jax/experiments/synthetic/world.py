@@ -42,13 +42,14 @@ The sun's place, the clouds and the white balance come of a picture's seed, whic
 """
 VARIATIONS: tuple[Variation, ...] = get_args(Variation)
 _FIELDS: dict[Variation, tuple[str, ...]] = {
+    "stand": ("lateral", "forward", "heading", "height", "pitch", "field"),
     "season": ("season",),
     "time": ("time",),
     "weather": ("weather",),
     "traffic": ("occluders",),
     "exposure": ("exposure", "noise"),
 }
-"""Fields of `View` that are one variation; the stand has the camera's, which a scene chooses."""
+"""Fields of `View` that are one variation."""
 RENDERER = 1
 """Version of the world: increase it if pictures change."""
 SCENES_PER_CITY = 12
@@ -262,11 +263,6 @@ def _view(
         noise=float(rng.uniform(1, 5) + 2 * (time == "night")),
         seed=int(rng.integers(2**31)),
     )
-    still = {
-        name for one in VARIATIONS if one not in config.varied for name in _FIELDS.get(one, ())
-    }
-    plain = {name: getattr(View(), name) for name in still}
-    if "stand" not in config.varied:
-        stand = {"lateral": 0.0, "forward": along, "heading": 0.0}
-        plain |= stand | {"height": height, "pitch": pitch, "field": field}
-    return dataclasses.replace(view, **plain)
+    plain = View(forward=along, height=height, pitch=pitch, field=field)
+    still = [name for one in _FIELDS if one not in config.varied for name in _FIELDS[one]]
+    return dataclasses.replace(view, **{name: getattr(plain, name) for name in still})
