@@ -8,6 +8,7 @@ case "${1:-}" in -h | --help) echo "$usage"; exit ;; esac
 [ $# -le 2 ] || stop "found $# arguments, expected at most 2"
 [ $# -lt 1 ] || [ -d "$1" ] || stop "$1: found no such folder"
 [ $# -lt 2 ] || [ -e "$2" ] || stop "$2: found no such photograph"
+photograph=""
 [ $# -lt 1 ] || images="$(realpath -- "$1")"
 [ $# -lt 2 ] || photograph="$(realpath -- "$2")"
 cd "$(dirname "$0")/.."
@@ -17,13 +18,15 @@ if [ $# -eq 0 ]; then
   crisalad render --out found/world --scenes 1 --test-scenes 24
   images="$PWD/found/world/test/images/test/database"
   photograph="$PWD/found/world/test/images/test/queries"
-elif [ $# -eq 1 ]; then
+fi
+# A map for each folder, of two with the same name, too, and for each version of the model.
+key="$(cat crisalad_jax/checkpoints/starter.safetensors - <<<"$images" | cksum | cut -d " " -f 1)"
+map="$PWD/found/$(basename -- "$images")-$key.map"
+crisalad index --images "$images" --out "$map" --on-bad-image skip
+if [ -z "$photograph" ]; then
   echo "No photograph given: asking about the folder's first, which will find itself first." >&2
   photograph="$(python -c 'import sys
 from crisalad_jax.data.images import list_images
 print(list_images(sys.argv[1])[0])' "$images")"
 fi
-# A map for each folder: of two with the same name, too.
-map="$PWD/found/$(basename -- "$images")-$(cksum <<<"$images" | cut -d " " -f 1).map"
-crisalad index --images "$images" --out "$map" --on-bad-image skip
 crisalad query "$photograph" --map "$map" --gallery "$PWD/found/answers.png"

@@ -252,7 +252,7 @@ def _check_files(arguments: Evaluate) -> None:
                 )
     if arguments.rerank is None and arguments.rerank_weights is not None:
         raise InputError(
-            "rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"
+            "--rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"
         )
 
 
@@ -263,7 +263,7 @@ def _reranking(arguments: Evaluate, config: ModelConfig) -> Reranking | None:
     rerank = parse_reranking(arguments.rerank)
     if arguments.rerank_weights is not None:
         own = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
-        own_params, own_config = load_weights(own)
+        own_params, own_config = load_weights(own, verify=arguments.verify)
         rerank = dataclasses.replace(rerank, params=own_params, config=own_config)
     rerank.check(config)
     return rerank

@@ -24,7 +24,7 @@ class Render:
     stations: int = WorldConfig.stations
     """Places of a scene, one behind the other: they look alike."""
     images_per_place: int = WorldConfig.images_per_place
-    """Images of a place, by other weather, light, season, traffic and cameras."""
+    """Images of a place, by other weather, light, season, traffic and stands."""
     test_scenes: int = WorldConfig.test_scenes
     """Other scenes, to test on."""
     image_size: tuple[int, int] = WorldConfig.image_size
@@ -34,8 +34,8 @@ class Render:
     repaint: float = WorldConfig.repaint
     """Largest deviation of the log colour of things from image to image."""
     varied: tuple[Variation, ...] = VARIATIONS
-    """What changes between the training images of a place, besides paint; test images change in
-    everything."""
+    """What changes between the training images of a place, besides paint. Test images change in all
+    of these."""
     seed: int = WorldConfig.seed
     """Draws the world."""
     json: pathlib.Path | None = None
@@ -52,13 +52,15 @@ def run(arguments: Render) -> None:
     config = WorldConfig(**given)
     places = config.scenes * config.stations
     total = places + config.test_scenes * config.stations
-    has_world(arguments.out, config)  # a wrong folder is told before there is a bar
-    with progress_bar("rendering the world", total, "places", quiet=arguments.quiet) as bar:
-        write_world(arguments.out, config, progress=lambda done, total: bar.advance(1))
+    is_there = has_world(arguments.out, config)  # a wrong folder is told before there is a bar
+    if not is_there:
+        with progress_bar("rendering the world", total, "places", quiet=arguments.quiet) as bar:
+            write_world(arguments.out, config, progress=lambda done, total: bar.advance(1))
     tests = config.test_scenes * config.stations
     say(
-        f"{arguments.out}: {counted(places, 'place')} with {config.images_per_place} images each "
-        f"in {arguments.out / 'train'}; {tests} others in {arguments.out / 'test'}"
+        f"{arguments.out}: {'there already, ' * is_there}{counted(places, 'place')} with "
+        f"{counted(config.images_per_place, 'image')} each in {arguments.out / 'train'}; "
+        f"{counted(tests, 'other')} in {arguments.out / 'test'}"
     )
     give_json(
         arguments.json,

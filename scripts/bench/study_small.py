@@ -38,7 +38,7 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.progress import progress_bar
 
-STARTER = pathlib.Path(__file__).parents[2] / "docs" / "starter" / "config.json"
+WORLD_BASE = pathlib.Path(__file__).parents[2] / "docs" / "small" / "world_base.json"
 BATCH = {"places_per_batch": 24, "images_per_place": 2, "min_images": 2}
 DUSTBINS = ("dustbin a token", "dustbin's mass learnt")
 TRANSPORTS: dict[str, dict[str, Any]] = {
@@ -85,8 +85,8 @@ def with_encoder(config: TrainConfig) -> TrainConfig:
 
 
 def small_resnet() -> TrainConfig:
-    """The recipe of the model in the package with half its width and fewer pixels."""
-    start = read_config(TrainConfig, STARTER, quiet=True)
+    """A training of the model in the package with half its width and fewer pixels."""
+    start = read_config(TrainConfig, WORLD_BASE, quiet=True)
     backbone: Any = start.model.backbone
     model = dataclasses.replace(
         start.model, image_size=(96, 96), backbone=dataclasses.replace(backbone, width=16)

@@ -441,7 +441,8 @@ VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("index", "--dtype", ("int8",)),
     ("render", "--scenes", ("0", "-1", "x")),
     ("render", "--sceneries", ("x",)),
-    ("render", "--repaint", ("-1", "nan")),
+    ("render", "--repaint", ("-1", "nan", "inf", "1e6")),
+    ("render", "--varied", ("sun",)),
 )
 
 

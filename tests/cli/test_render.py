@@ -23,12 +23,29 @@ def test_it_says_what_it_wrote(tmp_path: pathlib.Path, capfd: Capture) -> None:
     assert (told["places"], told["test_places"], told["seed"]) == (6, 4, 0)
 
 
+def test_a_world_that_is_there_stays_and_another_is_refused_by_what_differs(
+    tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    given = ("render", "--out", tmp_path / "world", *SMALL)
+    assert main([*map(str, given)]) == 0
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    capfd.readouterr()
+    assert main([*map(str, given)]) == 0
+    assert "there already, 6 places with 4 images each" in " ".join(capfd.readouterr().out.split())
+    fails(
+        capfd, *given, "--repaint", "0.2", words=("another configuration (repaint 0.3, not 0.2)",)
+    )
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == written
+
+
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: pathlib.Path, capfd: Capture) -> None:
     out = tmp_path / "world"
     for flag, value, words in (
         ("--scenes", "0", "WorldConfig.scenes: found 0, expected at least 1"),
-        ("--repaint", "-1", "WorldConfig.repaint: found -1.0, expected at least 0"),
+        ("--repaint", "-1", "WorldConfig.repaint: found -1.0, expected 0 to 3"),
+        ("--repaint", "inf", "WorldConfig.repaint: found inf, expected 0 to 3"),
         ("--sceneries", "sea", "sea"),
+        ("--varied", "sun", "sun"),
         ("--seed", "-1", "WorldConfig.seed: found -1"),
     ):
         fails(capfd, "render", "--out", out, *SMALL, flag, value, words=(words,))

@@ -334,7 +334,8 @@ def test_refuses_another_configuration_a_foreign_folder_and_a_file(tmp_path, cit
         (lambda: SyntheticCityConfig(seed=-1), "seed: found -1, expected at least 0"),
         (lambda: SyntheticCityConfig(image_size=(8, 56)), r"image_size: found \(8, 56\)"),
         (lambda: View(season="monsoon"), "season: found 'monsoon', expected one of spring, summer"),  # type: ignore[arg-type]
-        (lambda: View(noise=math.nan), "noise: found nan, expected at least 0"),
+        (lambda: View(noise=math.nan), "View.noise: found nan, expected 0 to 255 grey levels"),
+        (lambda: View(repaint=math.inf), "View.repaint: found inf, expected 0 to 3"),
         (lambda: render(-1, View()), "place_seed: found -1"),
     ],
 )

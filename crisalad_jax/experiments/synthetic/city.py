@@ -148,8 +148,16 @@ def holds(root: pathlib.Path, identity: dict, file: str, what: str) -> bool:
         existing = None
     if existing == identity:
         return True
-    found = f"{what} of another configuration" if existing else "a folder with other content"
-    raise InputError(f"{root}: found {found}, expected a new or empty folder")
+    if not isinstance(existing, dict):
+        raise InputError(
+            f"{root}: found a folder with other content, expected a new or empty folder"
+        )
+    names = {**identity, **existing}
+    name = next(name for name in names if existing.get(name) != identity.get(name))
+    raise InputError(
+        f"{root}: found {what} of another configuration ({name} {existing.get(name)}, not "
+        f"{identity.get(name)}), expected a new or empty folder"
+    )
 
 
 def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -> Iterator[None]:

@@ -62,12 +62,21 @@ class View:
                 raise InputError(
                     f"View.{name}: found {value!r}, expected one of {', '.join(choices)}"
                 )
-        for name in ("noise", "repaint"):
-            value = getattr(self, name)
-            if not value >= 0:
-                raise InputError(f"View.{name}: found {value}, expected at least 0")
+        if not 0 <= self.noise <= 255:
+            raise InputError(f"View.noise: found {self.noise}, expected 0 to 255 grey levels")
+        check_repaint("View.repaint", self.repaint)
         if not 10 <= self.field <= 150:
             raise InputError(f"View.field: found {self.field}, expected 10 to 150 degrees")
+
+
+def check_repaint(what: str, deviation: float) -> None:
+    """Check a deviation of log colours, of which 3 leaves little of a picture.
+
+    Raises:
+        InputError: it is out of range; the message names the argument `what`.
+    """
+    if not 0 <= deviation <= 3:
+        raise InputError(f"{what}: found {deviation}, expected 0 to 3")
 
 
 def check_size(what: str, size: tuple[int, int]) -> None:

@@ -29,6 +29,7 @@ from crisalad_jax.experiments.synthetic.view import (
     WEATHERS,
     Scenery,
     View,
+    check_repaint,
     check_size,
 )
 from crisalad_jax.utils.errors import InputError
@@ -75,7 +76,7 @@ class WorldConfig:
     """Largest `View.repaint`."""
     varied: tuple[Variation, ...] = VARIATIONS
     """What changes between the training images of a place. The rest is as in a plain `View`, the
-    stand as the scene's camera. Test images change in everything."""
+    stand as the scene's camera. Test images change in all of these."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -85,8 +86,7 @@ class WorldConfig:
             value = getattr(self, name)
             if value < 1:
                 raise InputError(f"WorldConfig.{name}: found {value}, expected at least 1")
-        if not self.repaint >= 0:
-            raise InputError(f"WorldConfig.repaint: found {self.repaint}, expected at least 0")
+        check_repaint("WorldConfig.repaint", self.repaint)
         if not self.sceneries:
             raise InputError("WorldConfig.sceneries: found (), expected at least one scenery")
         check_seed("WorldConfig.seed", self.seed)
