@@ -18,7 +18,7 @@ import torch  # isort: skip
 from crisalad_jax.nn.convolutions import max_pool
 
 MAPS = {"96 of 48 x 64 x 32": (96, 48, 64, 32), "16 of 112 x 112 x 64": (16, 112, 112, 64)}
-"""Images of rows x columns x dims: of `starter` in training, and of a ResNet at 224 x 224."""
+"""Images of rows x columns x dims: of `starter`'s first training, and of a ResNet at 224 x 224."""
 OURS, XLAS, TORCHS = "ours", "XLA's own gradient", "torch eager"
 
 

@@ -151,7 +151,7 @@ def test_evaluate_takes_it_and_a_preset_is_still_untrained(
     given = ("evaluate", "--data", shared / "town", "--quiet")
     words, (note,) = said(capfd, *given, "--json", tmp_path / "said.json")
     assert note.startswith(NOTE)
-    assert "starter images at 96 x 128" in words
+    assert "starter images at 192 x 256" in words
     assert json.loads((tmp_path / "said.json").read_text())["weights"] == "starter"
     # What is wrong is told by itself, and no note before it.
     fails(capfd, "evaluate", "--data", tmp_path / "none", words=(f"{tmp_path / 'none'}",))

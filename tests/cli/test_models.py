@@ -125,7 +125,7 @@ def test_the_model_in_the_package_is_told_of_in_the_same_words(capfd):
     facts = dict(line.split(maxsplit=1) for line in out.splitlines())
     known = {"descriptor": "2,304", "parameters": "709,664", "licence": "Apache-2.0"}
     assert facts.items() >= known.items()  # docs/starter.md
-    assert facts["images"].startswith("96 x 128")
+    assert facts["images"].startswith("192 x 256")
     assert pathlib.Path(facts["file"]).is_file()
 
 

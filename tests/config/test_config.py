@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.export import ExportConfig
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.io import from_plain, read_config
@@ -341,13 +342,25 @@ def test_every_recipe_fits_every_preset(preset: str, name: str):
         assert (found.model == recipe("b14", name).model) == (preset != "tiny")
 
 
-def test_the_recipe_of_starter_is_that_of_its_first_run_in_another_number_of_epochs():
-    """Its fields but those of an encoder of no layers, which says nothing."""
+def test_the_recipe_of_starter_is_that_of_its_last_run():
+    """But for an encoder of no layers, whose fields say nothing."""
     run = read_config(TrainConfig, ROOT / "docs" / "starter" / "config.json", quiet=True)
     found = recipe("b14", "starter")
     assert found.model.cross_image.layers == run.model.cross_image.layers == 0
     model = dataclasses.replace(found.model, cross_image=run.model.cross_image)
-    assert dataclasses.replace(found, model=model, epochs=run.epochs) == run
+    assert dataclasses.replace(found, model=model) == run
+    # The file in the package is for larger images than it was trained on.
+    shipped = load("starter").config
+    assert dataclasses.replace(shipped, image_size=run.model.image_size) == run.model
+
+
+def test_the_run_without_the_cameras_faults_is_an_epoch_of_starters_but_for_them():
+    docs = ROOT / "docs"
+    run = read_config(TrainConfig, docs / "starter" / "first.json", quiet=True)
+    without = read_config(TrainConfig, docs / "small" / "no_faults.json", quiet=True)
+    names = [field.name for field in dataclasses.fields(LightAugmentConfig)]
+    light = LightAugmentConfig(**{name: getattr(run.augmentation, name) for name in names})
+    assert without == dataclasses.replace(run, augmentation=light, epochs=1)
 
 
 def test_augmentation_is_the_one_named():
