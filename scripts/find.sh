@@ -26,7 +26,8 @@ crisalad index --images "$images" --out "$map" --on-bad-image skip
 if [ -z "$photograph" ]; then
   echo "No photograph given: asking about the folder's first, which will find itself first." >&2
   photograph="$(python -c 'import sys
-from crisalad_jax.data.images import list_images
-print(list_images(sys.argv[1])[0])' "$images")"
+from crisalad_jax.retrieval.maps.map import Map
+with Map.open(sys.argv[2]) as places:
+    print(sys.argv[1], places.images[0].name, sep="/")' "$images" "$map")"
 fi
 crisalad query "$photograph" --map "$map" --gallery "$PWD/found/answers.png"

@@ -9,6 +9,7 @@ import pathlib
 
 import numpy as np
 
+from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.experiments.synthetic import View, render
 from crisalad_jax.nn.model import describe
@@ -19,7 +20,7 @@ GOLDEN = pathlib.Path(__file__).parents[1] / "parity" / "goldens" / "starter.npz
 
 def main() -> None:
     images = [render(7, View(), (60, 80), scenery) for scenery in ("street", "corridor")]
-    params, config = load("starter")
+    params, config = load(starter.FILE)
     prepared = np.stack([prepare_image(image, config) for image in images])
     descriptors = np.asarray(describe(params, prepared, config))
     np.savez_compressed(GOLDEN, images=np.stack(images), descriptors=descriptors)

@@ -71,9 +71,9 @@ class Train:
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
     vlad-buff, selavpr (preset l14); over ResNet boq-resnet50, conv-ap, cosplace, mixvpr; over
     VGG netvlad, patch-netvlad. In part as published: eigenplaces-turns, netvlad-gsv, cosplace-vit,
-    eigenplaces-vit. From random weights: scratch (the default of tiny), and starter, the last run
-    of the model in this package (docs/starter.md). RECIPE+PART is a recipe with a registered part
-    in place, such as crisalad+gem."""
+    eigenplaces-vit. From random weights: scratch, the default of tiny. starter: the last run of the
+    model in this package, whose --weights are its first run's (docs/starter.md). RECIPE+PART is a
+    recipe with a registered part in place, such as crisalad+gem."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28

@@ -20,7 +20,7 @@ from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.notes import Note
 
 GOLDEN = pathlib.Path(__file__).parents[2] / "parity" / "goldens" / "starter.npz"
-"""Two pictures, and their descriptors on the machine that trained the model."""
+"""Two pictures, and their descriptors where `scripts/starter_golden.py` was run."""
 # Another processor adds up in another order; the descriptors are unit vectors.
 TOLERANCE = 1e-5
 

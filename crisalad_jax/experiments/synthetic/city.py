@@ -148,15 +148,15 @@ def holds(root: pathlib.Path, identity: dict, file: str, what: str) -> bool:
         existing = None
     if existing == identity:
         return True
-    if not isinstance(existing, dict):
+    if not isinstance(existing, dict) or not existing:
         raise InputError(
             f"{root}: found a folder with other content, expected a new or empty folder"
         )
     names = {**identity, **existing}
     name = next(name for name in names if existing.get(name) != identity.get(name))
     raise InputError(
-        f"{root}: found {what} of another configuration ({name} {existing.get(name)}, not "
-        f"{identity.get(name)}), expected a new or empty folder"
+        f"{root}: found {what} of another configuration ({name}: {existing.get(name, 'default')}, "
+        f"not {identity.get(name, 'default')}), expected a new or empty folder"
     )
 
 
