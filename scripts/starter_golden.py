@@ -14,6 +14,7 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.experiments.synthetic import View, render
 from crisalad_jax.nn.model import describe
 from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.utils.files import atomic_path
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "parity" / "goldens" / "starter.npz"
 
@@ -23,7 +24,8 @@ def main() -> None:
     params, config = load(starter.FILE)
     prepared = np.stack([prepare_image(image, config) for image in images])
     descriptors = np.asarray(describe(params, prepared, config))
-    np.savez_compressed(GOLDEN, images=np.stack(images), descriptors=descriptors)
+    with atomic_path(GOLDEN) as path:
+        np.savez_compressed(path, images=np.stack(images), descriptors=descriptors)
     print(f"{GOLDEN}: {' x '.join(map(str, descriptors.shape))} numbers")
 
 

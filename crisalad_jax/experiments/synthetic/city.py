@@ -148,16 +148,14 @@ def holds(root: pathlib.Path, identity: dict, file: str, what: str) -> bool:
         existing = None
     if existing == identity:
         return True
-    if not isinstance(existing, dict) or not existing:
-        raise InputError(
-            f"{root}: found a folder with other content, expected a new or empty folder"
+    found = "a folder with other content"
+    if existing and isinstance(existing, dict):
+        name = next(
+            name for name in identity | existing if existing.get(name) != identity.get(name)
         )
-    names = {**identity, **existing}
-    name = next(name for name in names if existing.get(name) != identity.get(name))
-    raise InputError(
-        f"{root}: found {what} of another configuration ({name}: {existing.get(name, 'default')}, "
-        f"not {identity.get(name, 'default')}), expected a new or empty folder"
-    )
+        values = (each.get(name, "default") for each in (existing, identity))
+        found = f"{what} of another configuration ({name}: {', not '.join(map(str, values))})"
+    raise InputError(f"{root}: found {found}, expected a new or empty folder")
 
 
 def _write_train(folder: pathlib.Path, config: SyntheticCityConfig, city: int) -> Iterator[None]:
