@@ -33,7 +33,8 @@ EXAMPLE = "crisalad compile-check --targets h100 --preset b14"
 class CompileCheck:
     """Compile describing and training for GPUs and TPUs that need not be here; run nothing.
 
-    The extra `accelerators` installs XLA's compilers, which take minutes on a CPU.
+    `jax[tpu]` and `jax-cuda12-plugin`, of the installed version of JAX, bring XLA's compilers. They
+    take minutes on a CPU.
     """
 
     settings: Any

@@ -14,10 +14,11 @@ from jax.extend.core import get_opaque_trace_state
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.kept import kept, remembered
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
-_LIBRARIES: dict[str, dict[str, bool | str]] = {
+LIBRARIES: dict[str, dict[str, bool | str]] = {
     # Half as fast as the others where a row of the result is a multiple of 4,096 bytes, as `b14`'s
     # widest is: the rows that it writes at once then share one place of the first cache.
     "Eigen": {_FUSIONS: ""},
@@ -33,7 +34,7 @@ _LIBRARIES: dict[str, dict[str, bool | str]] = {
     # single products.
     "YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"},
 }
-_BRIEF: dict[str, bool | str] = {
+BRIEF: dict[str, bool | str] = {
     # By default XLA copies all weights of a layer out of their stack before the layer runs, which
     # takes up to a third more memory.
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
@@ -46,6 +47,22 @@ _SMALL = 2**23
 """Number of parameters of a large model: `tiny` has an eighth of it, `s14` three times as many."""
 _AT_REST = get_opaque_trace_state()
 """What JAX traces while it traces nothing."""
+_TESTED = ((0, 10), (0, 12))
+"""Versions of JAX that the tests run with: those that pyproject.toml requires."""
+
+
+def warn_if_untested() -> None:
+    """Warn in one line if the tests do not run with this version of JAX."""
+    if jax.__version_info__[:2] not in _TESTED:
+        tested = " and ".join(".".join(map(str, version)) for version in _TESTED)
+        tell(
+            f"found jax {jax.__version__}, tested are {tested}: results are not checked, and 0.11 "
+            "crashes on several devices; pip install --upgrade 'jax>=0.12,<0.13'"
+        )
+
+
+# Where the first program is made: before a crash, whichever way the package is used.
+warn_if_untested()
 
 
 def compiler_options(library: str, *, brief: bool = False) -> dict[str, bool | str]:
@@ -60,7 +77,7 @@ def compiler_options(library: str, *, brief: bool = False) -> dict[str, bool | s
 
 @functools.cache
 def _known_options(library: str, brief: bool) -> dict[str, bool | str]:
-    wanted = _LIBRARIES[library] | (_BRIEF if brief else {})
+    wanted = LIBRARIES[library] | (BRIEF if brief else {})
     return {name: value for name, value in wanted.items() if _is_known(name, value)}
 
 

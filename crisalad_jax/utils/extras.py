@@ -13,7 +13,6 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
-    "accelerators": ("libtpu", "jax_cuda12_plugin", *_CLI),
 }
 """Modules of each extra, by its name; of two with a module the smaller is first."""
 
@@ -28,7 +27,7 @@ def missing_extra(error: ModuleNotFoundError, what: str) -> str:
     extra = next((extra for extra, modules in EXTRAS.items() if name in modules), None)
     if extra is None:
         raise error
-    others = "" if extra in ("milvus", "convert", "accelerators") else " (or [all])"
+    others = "" if extra in ("milvus", "convert") else " (or [all])"
     return (
         f"{what}: found no module {name}, expected it with the extra {extra}: "
         f"pip install 'crisalad-jax[{extra}]'{others}"

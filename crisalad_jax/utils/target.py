@@ -51,7 +51,7 @@ TARGETS = {"cpu": CPU, "gpu": GPU, "tpu": TPU, "portable": PORTABLE}
 # JAX keeps traces apart by it: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
 _mesh = jax.make_user_context(None)
-_ONE_DEVICE = AbstractMesh((1,), ("image",))
+_ONE_DEVICE = AbstractMesh((1,), ("image",), axis_types=(AxisType.Auto,))
 
 
 def target() -> Target:

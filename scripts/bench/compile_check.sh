@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Compiles b14 for accelerators that are not here, which takes two cores an hour or so, and puts the
-# figures into docs/accelerators/ and its page. It needs the extra `accelerators`.
+# figures into docs/accelerators/ and its page. In an environment of its own: `pip install -e .[train]
+# -r scripts/bench/compile_check.txt`.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 export JAX_PLATFORMS=cpu

@@ -5,6 +5,7 @@ import importlib
 import json
 import pathlib
 
+import jax
 import pytest
 
 from crisalad_jax.experiments.compile_check import (
@@ -42,7 +43,7 @@ CHECK = CompileCheck(recipe("tiny"), (ONE,))
 
 @pytest.fixture
 def without_compilers(monkeypatch: pytest.MonkeyPatch):
-    """An installation without the extra `accelerators`."""
+    """An installation without compilers for accelerators."""
     original = importlib.import_module
 
     def missing(name: str, *rest):
@@ -53,14 +54,19 @@ def without_compilers(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(importlib, "import_module", missing)
 
 
-@pytest.mark.parametrize(("target", "module"), [("v5e-1", "libtpu"), ("h100", "jax_cuda12_plugin")])
-def test_a_compiler_that_is_not_installed_is_named(without_compilers, capfd, target, module):
+@pytest.mark.parametrize(
+    ("target", "module", "package"),
+    [("v5e-1", "libtpu", "jax[tpu]"), ("h100", "jax_plugins.xla_cuda12", "jax-cuda12-plugin")],
+)
+def test_a_compiler_that_is_not_installed_is_named(
+    without_compilers, capfd, target, module, package
+):
     fails(
         capfd,
         *("compile-check", "--preset", "tiny", "--targets", target),
         words=(
             f"target {target}: found no module {module}",
-            "pip install 'crisalad-jax[accelerators]'",
+            f"pip install '{package}=={jax.__version__}'",
         ),
     )
 

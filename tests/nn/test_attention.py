@@ -273,7 +273,9 @@ def test_a_tpus_kernel_multiplies_in_float32_and_sums_in_it(dtype: str) -> None:
 
 
 def test_a_tpus_kernel_runs_on_the_device_of_its_sequences() -> None:
-    mesh = jax.sharding.AbstractMesh((8,), ("image",))
+    # Automatic, as `Devices` makes its meshes: the default changed in jax 0.12.
+    automatic = (jax.sharding.AxisType.Auto,)
+    mesh = jax.sharding.AbstractMesh((8,), ("image",), axis_types=automatic)
     qkv = jax.ShapeDtypeStruct((16, 9, 384), jnp.float32)
     program = jax.make_jaxpr(lambda qkv: attention_pallas.attend(qkv, 2, 9, "highest", mesh))(qkv)
     assert "shard_map" in str(program)

@@ -35,6 +35,29 @@ def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment
     return done.stdout
 
 
+START = """
+import sys, jax
+jax.__version__, jax.__version_info__ = sys.argv[1], tuple(map(int, sys.argv[1].split(".")))
+from crisalad_jax.cli import main
+sys.stderr = sys.stdout
+main(["info", "--preset", "tiny", "--json", "-"])
+"""
+
+
+@pytest.mark.parametrize(
+    ("version", "warned"),
+    [("0.10.2", 0), ("0.11.2", 1), ("0.12.0.1", 0), ("0.13.0", 1), ("1.0.0", 1)],
+)
+def test_an_untested_jax_is_said_in_one_line(
+    tmp_path: pathlib.Path, version: str, warned: int
+) -> None:
+    printed = in_a_program(START, tmp_path, version).splitlines()
+    lines = [line for line in printed if "jax" in line]
+    assert len(lines) == warned
+    for line in lines:
+        assert line.startswith(f"crisalad: note: found jax {version}, tested are 0.10 and 0.12: ")
+
+
 @pytest.fixture
 def _options_anew() -> Any:
     options = compiler._known_options
@@ -47,7 +70,7 @@ def _options_anew() -> Any:
 def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         compiler,
-        "_LIBRARIES",
+        "LIBRARIES",
         {"some": {"xla_of_another_version": True, "xla_cpu_enable_fast_math": True}},
     )
     assert compiler.compiler_options("some") == {"xla_cpu_enable_fast_math": True}

@@ -1,5 +1,6 @@
 """Walk through a traced program, and convert it equation by equation."""
 
+import operator
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -96,8 +97,12 @@ def _folded(inputs: list[Value], eqn: Any) -> list[Value]:
 def _unrolled(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
     """Convert a loop of so many turns, turn by turn: its slices of weights are then constants."""
     params, length = eqn.params, eqn.params["length"]
-    body, count = params["jaxpr"], params["num_carry"]
-    fixed, carry, rows = _parts(inputs, params["num_consts"], count)
+    body = params["jaxpr"]
+    # By ranks, because the parameters that count them differ between versions of JAX: what a turn
+    # passes on comes first, and what it stacks has a side less inside.
+    count = sum(map(operator.eq, _ranks(eqn.outvars), _ranks(body.jaxpr.outvars)))
+    stacked = sum(map(operator.gt, _ranks(eqn.invars), _ranks(body.jaxpr.invars)))
+    fixed, carry, rows = _parts(inputs, len(inputs) - count - stacked, count)
     if not is_known(length):
         return [
             Value(var.aval.shape, np.dtype(np.float32), missing="scan over the images")
@@ -114,6 +119,10 @@ def _unrolled(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
         results.reverse()
     stacks = [_stack(graph, each) for each in zip(*results, strict=True)]
     return [*carry, *stacks]
+
+
+def _ranks(variables: Sequence[Any]) -> list[int]:
+    return [each.aval.ndim for each in variables]
 
 
 def _parts(values: list[Value], *ends: int) -> Iterator[list[Value]]:

@@ -105,8 +105,8 @@ def compile_check(
 ) -> CompileCheck:
     """Compile describing and training for machines that need not be here.
 
-    Nothing is executed. XLA's compilers for TPUs and GPUs run on a CPU, with the packages of the
-    extra `accelerators`. They take minutes and some 3 GB of memory.
+    Nothing is executed. XLA's compilers for TPUs and GPUs run on a CPU, with the
+    packages `jax[tpu]` and `jax-cuda12-plugin`. They take minutes and some 3 GB of memory.
 
     Args:
         config: the model, and how it trains.

@@ -16,7 +16,6 @@ import jax
 from crisalad_jax.config.checks import require
 from crisalad_jax.experiments.compile_check.kernels import dump_folder
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.extras import missing_extra
 
 _TPU_ENVIRONMENT = {
     "TPU_SKIP_MDS_QUERY": "1",  # else libtpu asks the cloud which machine this is
@@ -126,7 +125,8 @@ COMPILER_OPTIONS: Mapping[str, dict[str, Any]] = {
 }
 """XLA's options by platform."""
 _COMPILERS = {"tpu": ("libtpu",), "cuda": ("jax_plugins.xla_cuda12", "jax_plugins.xla_cuda13")}
-_PACKAGES = {"tpu": "libtpu", "cuda": "jax_cuda12_plugin"}
+_PACKAGES = {"tpu": f"jax[tpu]=={jax.__version__}", "cuda": f"jax-cuda12-plugin=={jax.__version__}"}
+"""What brings them, of the version of JAX that they belong to. On Linux alone."""
 
 
 def compile_on_cpu() -> None:
@@ -142,7 +142,7 @@ def check_compiler(machine: Machine, name: str) -> None:
     """Check that XLA's compiler for a machine is installed.
 
     Raises:
-        InputError: it is not; the message names the package and the extra.
+        InputError: it is not installed; the message names the package that brings it.
     """
     for module in _COMPILERS[machine.platform]:
         try:
@@ -150,8 +150,11 @@ def check_compiler(machine: Machine, name: str) -> None:
             return
         except ModuleNotFoundError:
             continue
-    package = _PACKAGES[machine.platform]
-    raise InputError(missing_extra(ModuleNotFoundError(name=package), f"target {name}"))
+    modules = " or ".join(_COMPILERS[machine.platform])
+    raise InputError(
+        f"target {name}: found no module {modules}, expected XLA's compiler: "
+        f"pip install '{_PACKAGES[machine.platform]}'"
+    )
 
 
 def devices_of(machine: Machine) -> Sequence[Any]:
@@ -176,7 +179,7 @@ def devices_of(machine: Machine) -> Sequence[Any]:
     except Exception as error:  # jaxlib's own class, which differs by version
         raise InputError(
             f"{machine.card.name}: found that the installed compiler has no topology "
-            f"{machine.topology} ({error}), expected the versions of crisalad-jax[accelerators], "
+            f"{machine.topology} ({error}), expected that of {_PACKAGES[machine.platform]}, "
             "and JAX_PLATFORMS=cpu or not set"
         ) from error
     return topology.devices[: machine.devices]

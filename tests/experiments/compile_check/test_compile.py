@@ -25,7 +25,7 @@ def compile_check(target: str, *arguments: object) -> subprocess.CompletedProces
     except ModuleNotFoundError:
         found = None
     if found is None:
-        pytest.skip(f"no {module}: pip install 'crisalad-jax[accelerators]'")
+        pytest.skip(f"no {module}: pip install -r scripts/bench/compile_check.txt")
     command = [sys.executable, "-m", "crisalad_jax", "compile-check", "--targets", target]
     return subprocess.run(
         [*command, *map(str, arguments), "--model.compute-dtype", "bfloat16", "--quiet"],
