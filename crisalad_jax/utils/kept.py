@@ -107,29 +107,6 @@ def kept(
     return functools.partial(program, *traced, **by_name)
 
 
-def remembered(question: str, answer: Callable[[], bool]) -> bool:
-    """Answer a question about the compiler as the last process of the same surroundings did.
-
-    Args:
-        question: its words.
-        answer: finds the answer the first time, and always where no programs are kept.
-
-    Returns:
-        The answer.
-    """
-    if _Folder.path is None:
-        return answer()
-    digest = hashlib.sha256(_surroundings() + question.encode()).hexdigest()
-    known = {told: _Folder.path / f"{digest}.{told}" for told in (True, False)}
-    for told, path in known.items():
-        if path.exists():
-            return told
-    told = answer()
-    with contextlib.suppress(OSError):
-        known[told].touch()
-    return told
-
-
 @contextlib.contextmanager
 def _without_jaxs_cache() -> Iterator[None]:
     """Compile anew: what comes from JAX's own cache lacks its functions once it is kept again."""

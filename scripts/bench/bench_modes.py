@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from libraries import LIBRARIES
 from tables import Study, Table, bars, count, flags, leave, read
 from timing import measured, race, ratio, times
 
@@ -32,14 +33,13 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Crisalad, describe
 from crisalad_jax.retrieval.describe import group, read_tokens
-from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from parity.cases.case import build, convert, random
 
 TYPES = {"float32": "float32", "bfloat16": "float32", "int8": "int32"}
 """What is multiplied, and in what it is added up."""
 DEFAULT = "jaxlib's choice"
-LIBRARIES = (DEFAULT, "Eigen", "oneDNN", "YNN")
+CHOICES = {DEFAULT: {}, **LIBRARIES}
 ROWS, WIDTH, HIDDEN = 2056, 768, 3072
 """Tokens of eight images through `b14`'s first feed-forward layer."""
 
@@ -51,13 +51,12 @@ def product(dtype: str, library: str) -> Callable[[], Any]:
         for shape in ((ROWS, WIDTH), (WIDTH, HIDDEN))
     )
     multiply = functools.partial(jnp.matmul, preferred_element_type=TYPES[dtype])
-    chosen = {} if library == DEFAULT else compiler.compiler_options(library)
-    compiled = jax.jit(multiply, compiler_options=chosen)
+    compiled = jax.jit(multiply, compiler_options=CHOICES[library])
     return lambda: jax.block_until_ready(compiled(a, b))
 
 
 def products(arguments: argparse.Namespace) -> Study:
-    libraries = LIBRARIES if jax.default_backend() == "cpu" else (DEFAULT,)
+    libraries = tuple(CHOICES) if jax.default_backend() == "cpu" else (DEFAULT,)
     calls = {
         f"{dtype}, {library}": product(dtype, library) for dtype in TYPES for library in libraries
     }

@@ -1,14 +1,15 @@
-"""Time one program of this package under given options of XLA: a child of `study_compiler.py`.
+"""Time one program of this package under several options of XLA: a child of `study_compiler.py`.
 
     python scripts/bench/compiled_by.py '{"work": "describe", "preset": "tiny", "dtype": "float32",
-        "batch": 8, "devices": 2, "options": {}}'
+        "batch": 8, "devices": 2, "rounds": 3, "choices": {"defaults": {}}}'
 
-A process of its own, because devices are counted once and because options may end it. It prints a
-line of JSON: images a second (median of the calls), seconds of the first call, and megabytes that
-the program needs beyond parameters and images. Without options (null) it has the package's own.
+A process of its own, because devices are counted once and because options may end it. The options
+take turns. It prints a line of JSON: for each choice images a second (the median of each round),
+seconds of the first call, and megabytes that the program needs beyond parameters and images.
 """
 
 import dataclasses
+import functools
 import json
 import statistics
 import sys
@@ -67,22 +68,30 @@ def timed(call: Callable[[], Any]) -> float:
 
 def main(asked: dict[str, Any]) -> None:
     jax.config.update("jax_num_cpu_devices", asked["devices"])
-    if asked["options"] is not None:  # else the package's own
-        compiler.compiler_options = lambda library, brief=False: asked["options"]
     make = {"describe": describing, "train": training}[asked["work"]]
     devices = devices_for(asked["batch"] if asked["devices"] > 1 else 1)
-    call, compiled = make(asked["batch"], devices, asked["preset"], asked["dtype"])
-    first = timed(call)
-    times, end = [], time.perf_counter() + SECONDS
-    while len(times) < CALLS or time.perf_counter() < end:
-        times.append(timed(call))
-    found = {
-        "jax": jax.__version__,
-        "rate": asked["batch"] / statistics.median(times),
-        "first": first,
-        "megabytes": devices.mesh.size * compiled().memory_analysis().temp_size_in_bytes / 1e6,
-    }
+    found, calls = {}, {}
+    for name, options in asked["choices"].items():
+        chosen = functools.partial(given, options)
+        compiler.compiler_options = chosen
+        call, compiled = make(asked["batch"], devices, asked["preset"], asked["dtype"])
+        first = timed(call)
+        needed = compiled().memory_analysis().temp_size_in_bytes
+        found[name] = {"first": first, "megabytes": devices.mesh.size * needed / 1e6, "rates": []}
+        calls[name] = call, chosen
+    for _ in range(asked["rounds"]):
+        for name, (call, chosen) in calls.items():
+            compiler.compiler_options = chosen
+            times, end = [], time.perf_counter() + SECONDS
+            while len(times) < CALLS or time.perf_counter() < end:
+                times.append(timed(call))
+            found[name]["rates"].append(asked["batch"] / statistics.median(times))
     print(json.dumps(found))
+
+
+def given(options: dict[str, Any], *, runs_long: bool) -> dict[str, Any]:
+    """In the place of `compiler.compiler_options`."""
+    return options
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
+from libraries import LIBRARIES
 from timing import race, wait
 from usual import widened
 
@@ -26,7 +27,6 @@ import jax.numpy as jnp  # isort: skip
 import torch  # isort: skip
 
 from crisalad_jax.checkpoints.engines import import_openvino
-from crisalad_jax.utils.compiler import compiler_options
 from crisalad_jax.utils.host import usable_cores
 from parity.reference.model import Crisalad
 
@@ -34,7 +34,6 @@ ORT, OPENVINO = "ONNX Runtime", "OpenVINO"
 Run = Callable[[], np.ndarray]
 PRODUCTS = ((2048, 2048, 2048), (2056, 768, 3072))
 """Rows, width and columns of what tells the machine's rate: square, and `b14`'s widest product."""
-LIBRARIES = ("Eigen", "oneDNN", "YNN")
 logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells what torchvision would add
 
 
@@ -146,7 +145,7 @@ def _products(rows: int, width: int, columns: int, dtype: str) -> dict[str, Call
     def by_jax(library: str) -> Run:
         product = jax.jit(
             lambda a, b: jnp.matmul(a, b, preferred_element_type=jnp.float32),
-            compiler_options=compiler_options(library),
+            compiler_options=LIBRARIES[library],
         )
         return lambda: jax.block_until_ready(product(*ours))
 

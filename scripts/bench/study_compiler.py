@@ -1,15 +1,15 @@
 """What XLA's options are worth on each supported version of JAX: which exist, help, or crash.
 
     python scripts/bench/study_compiler.py [--out docs/performance] [--page docs/performance.md]
-        [--python OTHER/bin/python ...] [--rounds 2] [--cases "describe b14 float32 8 2" ...]
+        [--python OTHER/bin/python ...] [--rounds 3] [--cases "describe b14 float32 8 2" ...]
 
 Each program is compiled and timed in a process of its own (`compiled_by.py`) with each library's
-matrix products, with and without the other options that `utils/compiler.py` has, and as the package
-chooses. The versions of JAX are those of the interpreters given, which take turns with this one.
-A process that ends by a signal is tabled as that signal; an option that a version lacks, as absent.
+matrix products, and with other options that helped some program or version. The package takes the
+defaults, and to describe the order of the least memory. The versions of JAX are those of the
+interpreters given, one after the other. Where options end the process, each is tried by itself, and
+tabled as the signal that ended it; an option that a version lacks is tabled as absent.
 """
 
-import itertools
 import json
 import os
 import pathlib
@@ -19,14 +19,21 @@ import subprocess
 import sys
 from typing import Any, NamedTuple
 
+from libraries import LIBRARIES
 from tables import Study, Table, count, flags, leave, read
 
-from crisalad_jax.utils import compiler
 from crisalad_jax.utils.host import usable_cores
 
 HERE = pathlib.Path(__file__).parent
-PACKAGE = "the package's choice"
 DEFAULT = "jaxlib's defaults"
+CHOICES: dict[str, dict[str, Any]] = {
+    DEFAULT: {},
+    **LIBRARIES,
+    "defaults, ordered for the least memory": {
+        "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"
+    },
+    "defaults, sums not in windows": {"xla_disable_hlo_passes": "tree_reduction_rewriter"},
+}
 
 
 class Program(NamedTuple):
@@ -47,26 +54,17 @@ CASES = [
     f"describe b14 float32 8 {CORES}",
     "describe b14 float32 1 1",
     f"describe b14 bfloat16 8 {CORES}",
+    f"describe s14 float32 8 {CORES}",
     f"describe tiny float32 8 {CORES}",
     "train b14 float32 8 1",
-    "train b14 bfloat16 8 1",
+    "train s14 float32 8 1",
     "train tiny float32 16 1",
 ]
 
 
-def choices(work: str) -> dict[str, dict[str, Any] | None]:
-    """The options to try, by the name that the table has for them."""
-    libraries = compiler.LIBRARIES
-    found: dict[str, dict[str, Any] | None] = {DEFAULT: {}, **libraries}
-    if work == "describe":
-        for name, value in compiler.BRIEF.items():
-            found[f"YNN, {name.removeprefix('xla_')}"] = libraries["YNN"] | {name: value}
-    return {**found, PACKAGE: None}
-
-
-def run(python: str, case: Program, options: dict[str, Any] | None) -> dict[str, Any]:
-    """What `compiled_by.py` prints; `failed` instead, where it did not come to that."""
-    asked = json.dumps(case._asdict() | {"options": options})
+def run(python: str, case: Program, choices: dict[str, Any], rounds: int) -> dict[str, Any]:
+    """What `compiled_by.py` found of each choice; `failed` instead of what ended its process."""
+    asked = json.dumps(case._asdict() | {"choices": choices, "rounds": rounds})
     path = os.pathsep.join([str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [python, str(HERE / "compiled_by.py"), asked],
@@ -77,10 +75,16 @@ def run(python: str, case: Program, options: dict[str, Any] | None) -> dict[str,
     )
     if done.returncode == 0:
         return json.loads(done.stdout.splitlines()[-1])
+    if len(choices) > 1:
+        each = [run(python, case, {name: value}, rounds) for name, value in choices.items()]
+        return {name: found for one in each for name, found in one.items()}
     if done.returncode < 0:
-        return {"failed": signal.Signals(-done.returncode).name}
-    absent = "No such compile option" in done.stderr
-    return {"failed": "absent" if absent else done.stderr.strip().splitlines()[-1]}
+        failed = signal.Signals(-done.returncode).name
+    elif "No such compile option" in done.stderr:
+        failed = "absent"
+    else:
+        failed = done.stderr.strip().splitlines()[-1]
+    return {name: {"failed": failed} for name in choices}
 
 
 def version(python: str) -> str:
@@ -94,27 +98,27 @@ def main() -> None:
     parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--python", nargs="+", default=[], help="interpreters with other versions")
     parser.add_argument("--cases", nargs="+", type=program, default=[program(c) for c in CASES])
-    parser.add_argument("--rounds", type=count, default=2)
+    parser.add_argument("--rounds", type=count, default=3)
     arguments = read(parser, "study_compiler")
     versions = {version(python): python for python in (sys.executable, *arguments.python)}
     values, rows = [], []
     for case in arguments.cases:
-        tried = list(itertools.product(choices(case.work).items(), versions.items()))
-        found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-        for _ in range(arguments.rounds):
-            for (name, options), (jax, python) in tried:
-                print(*case, name, jax, file=sys.stderr, flush=True)
-                found.setdefault((name, jax), []).append(run(python, case, options))
-        best = max(rate(runs) for runs in found.values())
+        found = {}
+        for jax, python in versions.items():
+            print(*case, jax, file=sys.stderr, flush=True)
+            found[jax] = run(python, case, CHOICES, arguments.rounds)
+        best = {jax: max(map(rate, runs.values())) for jax, runs in found.items()}
         words = f"{case.work} {case.preset} {case.dtype}, {case.batch} on {case.devices}"
-        for name in choices(case.work):
-            runs = {jax: found[name, jax] for jax in versions}
-            values.append({**case._asdict(), "options": name, "runs": runs})
-            rows.append((words, name, *(cell(each, best) for each in runs.values())))
+        for name in CHOICES:
+            values.append({**case._asdict(), "options": name, **{v: found[v][name] for v in found}})
+            cells = (cell(runs[name], best[jax]) for jax, runs in found.items())
+            rows.append((words, name, *cells))
+        rows.append(
+            (words, "images a second, of the fastest", *(f"{b:.3g}" for b in best.values()))
+        )
     caption = (
-        "Programs by options of XLA and version of JAX: speed over the program's fastest, "
-        f"seconds of the first call, MB. {processor()}, {CORES} cores; medians of "
-        f"{arguments.rounds} rounds, taking turns."
+        "Programs by options of XLA and version of JAX: speed over the fastest options, seconds of "
+        f"the first call, MB. {processor()}, {CORES} cores; medians of {arguments.rounds} rounds."
     )
     table = Table(("program", "options", *(f"jax {v}" for v in versions)), rows, caption, 2)
     leave("study_compiler", Study(table, values), arguments)
@@ -125,16 +129,14 @@ def processor() -> str:
     return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
 
 
-def rate(runs: list[dict[str, Any]]) -> float:
-    return statistics.median(each.get("rate", 0.0) for each in runs)
+def rate(found: dict[str, Any]) -> float:
+    return statistics.median(found.get("rates", [0.0]))
 
 
-def cell(runs: list[dict[str, Any]], best: float) -> str:
-    failed = [each["failed"] for each in runs if "failed" in each]
-    if failed:
-        return failed[0]
-    first, memory = (statistics.median(e[key] for e in runs) for key in ("first", "megabytes"))
-    return f"{rate(runs) / best:.2f}, {first:.1f} s, {memory:.0f} MB"
+def cell(found: dict[str, Any], best: float) -> str:
+    if "failed" in found:
+        return found["failed"]
+    return f"{rate(found) / best:.2f}, {found['first']:.1f} s, {found['megabytes']:.0f} MB"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Compiler options, virtual devices, the compile cache: what is asked of JAX, and what it does."""
 
-import dataclasses
 import os
 import pathlib
 import subprocess
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.utils import compiler
-from crisalad_jax.utils.target import GPU, PORTABLE, TPU, Target, lowering_for
+from crisalad_jax.utils.target import CPU, GPU, PORTABLE, TPU, Target, lowering_for
 
 
 def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment: str) -> str:
@@ -58,30 +57,17 @@ def test_an_untested_jax_is_said_in_one_line(
         assert line.startswith(f"crisalad: note: found jax {version}, tested are 0.10 and 0.12: ")
 
 
-@pytest.fixture
-def _options_anew() -> Any:
-    options = compiler._known_options
-    options.cache_clear()
-    yield
-    options.cache_clear()
-
-
-@pytest.mark.usefixtures("_options_anew")
-def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        compiler,
-        "LIBRARIES",
-        {"some": {"xla_of_another_version": True, "xla_cpu_enable_fast_math": True}},
-    )
-    assert compiler.compiler_options("some") == {"xla_cpu_enable_fast_math": True}
-
-
-@pytest.mark.usefixtures("_options_anew")
-@pytest.mark.parametrize("chosen", [GPU, TPU, PORTABLE], ids=lambda chosen: chosen.platform)
-def test_an_accelerator_has_no_options(chosen: Target) -> None:
-    for library in ("Eigen", "oneDNN", "YNN"):
-        with lowering_for(chosen):
-            assert compiler.compiler_options(library, brief=True) == {}
+@pytest.mark.parametrize("chosen", [CPU, GPU, TPU, PORTABLE], ids=lambda chosen: chosen.platform)
+@pytest.mark.parametrize("version", [(0, 10, 2), (0, 11, 2), (0, 12, 0, 1), (0, 13, 0)])
+@pytest.mark.parametrize("runs_long", [False, True])
+def test_only_a_cpu_with_a_tested_jax_has_options(
+    monkeypatch: pytest.MonkeyPatch, chosen: Target, version: tuple[int, ...], runs_long: bool
+) -> None:
+    monkeypatch.setattr(jax, "__version_info__", version)
+    with lowering_for(chosen):
+        options = compiler.compiler_options(runs_long=runs_long)
+    expected = chosen == CPU and version[1] in (10, 12) and not runs_long
+    assert bool(options) == expected
 
 
 def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,54 +78,6 @@ def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None
         function(jnp.ones(3))
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
         function.lower(jnp.ones(3)).compile()  # pyright: ignore[reportFunctionMemberAccess]
-
-
-@dataclasses.dataclass(frozen=True)
-class Configured:
-    """As much of a configuration as is looked at."""
-
-    compute_dtype: str
-
-
-@pytest.mark.parametrize("caches", [False, True], ids=("no cache", "a cache"))
-@pytest.mark.parametrize(
-    ("runs_long", "size", "dtype", "asked"),
-    [
-        (False, compiler._SMALL, "float32", "YNN"),
-        (True, compiler._SMALL, "float32", "oneDNN"),
-        (True, compiler._SMALL - 1, "float32", "Eigen"),
-        (True, compiler._SMALL, "bfloat16", "YNN"),
-        (False, compiler._SMALL - 1, "bfloat16", "YNN"),
-    ],
-)
-def test_whose_products_a_program_has(
-    monkeypatch: pytest.MonkeyPatch,
-    runs_long: bool,
-    size: int,
-    dtype: str,
-    asked: str,
-    caches: bool,
-) -> None:
-    """A folder of compiled programs has no say: a notebook gives the command line's bits."""
-    seen = []
-
-    def options(library: str, *, brief: bool) -> dict[str, bool]:
-        seen.append((library, brief))
-        return {}
-
-    monkeypatch.setattr(compiler, "compiler_options", options)
-    function = compiler.jit(
-        lambda x, y, config: x + y, runs_long=runs_long, static_argnames="config"
-    )
-    before = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    try:
-        jax.config.update("jax_compilation_cache_dir", "/dev/null/nowhere" if caches else None)
-        x = jax.ShapeDtypeStruct((size,), jnp.float32)
-        images = jax.ShapeDtypeStruct((size,), jnp.uint8)
-        function.lower(x, images, Configured(dtype))  # pyright: ignore[reportFunctionMemberAccess]
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-    assert seen == [(asked, not runs_long)]
 
 
 WAYS: dict[str, Callable[[Any], Any]] = {

@@ -145,19 +145,6 @@ def test_only_the_latest_are_kept(folder, monkeypatch):
     assert len(programs(folder)) == 2
 
 
-def test_answers_are_remembered(folder):
-    asked = []
-
-    def answer():
-        asked.append(True)
-        return False
-
-    assert not kept.remembered("is it so?", answer)
-    assert not kept.remembered("is it so?", answer)
-    assert asked == [True]
-    assert kept.remembered("and this?", lambda: True)
-
-
 def test_nothing_is_kept_unasked(tmp_path, monkeypatch):
     monkeypatch.setattr(kept._Folder, "path", None)
     function, traces = counting()

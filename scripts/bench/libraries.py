@@ -1,0 +1,14 @@
+"""Options of XLA that choose the library of a CPU's matrix products, on jax 0.10 and 0.12."""
+
+_FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
+LIBRARIES: dict[str, dict[str, bool | str]] = {
+    "Eigen": {_FUSIONS: ""},
+    # Its programs cannot be stored in the compile cache.
+    "oneDNN": {
+        _FUSIONS: "",
+        "xla_cpu_use_onednn": True,
+        "xla_cpu_experimental_onednn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT",
+    },
+    # Single products, where jaxlib's defaults give YNN whole attentions too.
+    "YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"},
+}
