@@ -4,12 +4,15 @@ import os
 import pathlib
 import subprocess
 import sys
+import tomllib
 import venv
 import zipfile
 
 import pytest
+from packaging.requirements import Requirement
 
 from crisalad_jax.cli import _COMMANDS
+from crisalad_jax.utils import compiler
 from crisalad_jax.utils.extras import EXTRAS
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -34,6 +37,29 @@ def without_extras(program: str, *arguments: str) -> subprocess.CompletedProcess
         capture_output=True,
         text=True,
     )
+
+
+@pytest.mark.parametrize(
+    ("version", "taken"),
+    [
+        ("0.10.1", False),
+        ("0.10.2", True),
+        ("0.11.0", False),
+        ("0.11.2", False),
+        ("0.12.0.1", True),
+        ("0.12.3", True),
+        ("0.13.0", False),
+    ],
+)
+def test_pip_takes_the_versions_of_jax_that_are_tested(version, taken):
+    """0.11 crashes while it compiles for several CPU devices; newer ones nobody has tried."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    requirements = [Requirement(each) for each in project["dependencies"]]
+    (jax,) = (each for each in requirements if each.name == "jax")
+    assert jax.specifier.contains(version) == taken
+    # What is installed without complaint starts without a warning.
+    minor = tuple(map(int, version.split(".")[:2]))
+    assert not taken or minor in compiler._TESTED
 
 
 def test_research_needs_the_core_alone():
