@@ -74,9 +74,9 @@ def _day_and_time(seconds: float) -> str:
 
 def _extent(
     images: Sequence["MapImage"], axes: tuple[str, str] | None
-) -> dict[str, tuple[float, float]] | None:
+) -> dict[str, list[float]] | None:
     known = [image.position for image in images if image.position is not None]
     if axes is None or not known:
         return None
     columns = zip(*known, strict=True)
-    return {axis: (min(each), max(each)) for axis, each in zip(axes, columns, strict=True)}
+    return {axis: [min(each), max(each)] for axis, each in zip(axes, columns, strict=True)}

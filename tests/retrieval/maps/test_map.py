@@ -114,7 +114,7 @@ def test_a_map_lists_its_folders_additions_and_extent(tmp_path, monkeypatch):
         {"folder": "walk.mp4", "images": 2, "first": 0.5, "last": 12.25},
         {"folder": ".", "images": 2},
     ]
-    assert summary["extent"] == {"east": (1.0, 3.0), "north": (4.0, 5.0)}
+    assert summary["extent"] == {"east": [1.0, 3.0], "north": [4.0, 5.0]}
 
 
 # Killed
