@@ -45,7 +45,8 @@ class Export:
     resizes."""
     int8: pathlib.Path | None = None
     """Photographs to quantise products with, of onnx or openvino: a folder or another source of
-    some dozens like those to be described. Costs recall (docs/export.md)."""
+    some dozens like those to be described, of a video a frame a second. Costs recall
+    (docs/export.md)."""
     platforms: str | None = None
     """Of stablehlo, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
@@ -125,6 +126,6 @@ def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray
             f"int8: found images of size rule {config.preprocessing.size_rule}, expected fixed "
             "(--resize fixed)"
         )
-    paths = open_source(images).paths
+    paths = open_source(images, fps=1.0).paths
     chosen = paths[:: -(-len(paths) // _MOST)]
     return np.stack([prepare_image(read_image(path), config) for path in chosen])

@@ -45,7 +45,7 @@ class Extract:
     """By default starter, the small model in this package; or a .safetensors file, or a published
     model's name (`crisalad models`)."""
     fps: float | None = None
-    """Frames a second taken of a video."""
+    """Frames a second taken of a video, by default 1."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()

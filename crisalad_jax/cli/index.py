@@ -53,7 +53,7 @@ class Index:
     """By default starter, the small model in this package, and of a map that is there the model
     that made it; or a .safetensors file, or a published model's name (`crisalad models`)."""
     fps: float | None = None
-    """Frames a second taken of a video."""
+    """Frames a second taken of a video, by default 1."""
     positions: pathlib.Path | None = None
     """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for images that are new; by
     default what a table as --images says, or @UTM names, or EXIF data."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 from crisalad_jax.checkpoints.load import find_weights
@@ -23,6 +24,7 @@ from crisalad_jax.training.summary import (
     summary_lines,
 )
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import counted
 
 EXAMPLE = "crisalad info --preset b14"
 
@@ -92,13 +94,51 @@ def _map(folder: pathlib.Path, arguments: Info) -> dict[str, Any]:
             )
     with Map.open(folder, verify=False) as places:
         summary = places.summary(verify=arguments.verify)
-    width = max(map(len, summary))
-    say("\n".join(f"{name:<{width}}  {_words(value)}" for name, value in summary.items()))
+    before = ""
+    for name, line in _map_lines(summary):
+        say(f"{name if name != before else '':<{_WIDTH}}{line}")
+        before = name
     return summary
 
 
-def _words(value: Any) -> str:
-    """Write a value of a map's summary in one line; what a map remembers is an object."""
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {each}" for name, each in value.items())
-    return str(value)
+_WIDTH = 13
+"""Characters for the names of a map's values."""
+_MOST = 10
+"""Number of folders, and of additions, that are listed."""
+
+
+def _map_lines(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Write what is in a map: a name and a line each; what it does not have takes none."""
+    yield "images", f"{summary['images']}, at {summary['resize']}"
+    for name in ("folders", "additions"):
+        rows = summary[name]
+        for each in rows[:_MOST]:
+            yield name, _folder_line(**each) if name == "folders" else _addition_line(**each)
+        if len(rows) > _MOST:
+            yield name, f"and {len(rows) - _MOST} more"
+    if (extent := summary["extent"]) is not None:
+        ends = (f"{axis} {low:.9g} to {high:.9g}" for axis, (low, high) in extent.items())
+        yield "positions", f"{summary['positions']}, {', '.join(ends)}"
+    yield "descriptors", f"{summary['descriptor']}; store {summary['store']}"
+    stale = summary["stale_search"]
+    yield "search", summary["search"] + ("" if stale == "none" else f"; {stale} lacks images")
+    if summary["components"] != "none":
+        yield "components", summary["components"][:12]
+    yield "model", f"{summary['weights']} ({summary['model'][:12]})"
+    if (measured := summary["calibration"]) is not None:
+        yield "calibration", ", ".join(f"{name} {value}" for name, value in measured.items())
+    yield "created", summary["created"]
+    if summary.get("verified"):
+        yield "verified", "no descriptor has changed"
+
+
+def _addition_line(day: str | None, root: str, images: int) -> str:
+    return f"{day or 'day unknown'}: {counted(images, 'image')} of {root}"
+
+
+def _folder_line(
+    folder: str, images: int, first: float | str | None = None, last: float | str | None = None
+) -> str:
+    unit = " s" if isinstance(first, float) else ""
+    times = "" if first is None else f", {first} to {last}{unit}"
+    return f"{'top folder' if folder == '.' else folder}: {counted(images, 'image')}{times}"

@@ -77,8 +77,9 @@ class Query:
     sequence: Literal["bayes"] | None = None
     """The queries are consecutive frames of one camera: bayes weighs those so far, by a filter over
     the map's images in their order (docs/maps.md)."""
-    sequence_reach: int | None = None
-    """Images of the map that the camera moves between two frames, at most; by default 2."""
+    sequence_reach: float | None = None
+    """How many times as fast as the map's camera this one moves, at most; by default 2. Where names
+    say no times or positions, images of the map a frame."""
     exact: bool = False
     """Search exactly, although the map has an approximate search."""
     json: pathlib.Path | None = None

@@ -53,7 +53,7 @@ class Vocabulary:
     out: pathlib.Path
     """A .safetensors file."""
     fps: float | None = None
-    """Frames a second taken of a video."""
+    """Frames a second taken of a video, by default 1."""
     weights: pathlib.Path | None = None
     """A model of AnyLoc, NetVLAD or a part of yours with a vocabulary, for another one; a file, or
     a published model's name."""
@@ -107,9 +107,8 @@ def run(arguments: Vocabulary) -> None:
     built = build_vocabulary(
         params,
         config,
-        arguments.images,
+        source.paths,
         arguments.out,
-        fps=arguments.fps,
         max_images=arguments.max_images,
         seed=arguments.seed,
         batch_size=arguments.batch_size,

@@ -11,6 +11,7 @@ from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, names_in
 from crisalad_jax.data.positions import Positions, read_image_table
 from crisalad_jax.data.video import (
     check_rate,
+    count_frames,
     file_of,
     frame_time,
     is_video,
@@ -19,6 +20,7 @@ from crisalad_jax.data.video import (
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, read_text
+from crisalad_jax.utils.notes import tell
 
 _FORMS = (
     "a folder of images, an image, a video, a pattern such as 'frames/*.jpg', a list (.txt) or a "
@@ -48,7 +50,7 @@ def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> 
         images: a folder, searched with its subfolders; an image; a video; a pattern, where ** is
             any folders; a list, .txt, of a path a line; or a table, .csv, with a column `name`
             (see `read_image_table`). Paths in lists and tables are relative to their folder.
-        fps: frames a second taken of videos; None is one.
+        fps: frames a second taken of videos; None is one, and a note says so.
 
     Returns:
         The images. Names are relative to the folder; to that of the file; to the part of a pattern
@@ -59,8 +61,34 @@ def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> 
         InputError: no such source, no image in it, a path twice, or a file that is missing or that
             no line of text can name.
     """
-    fps = 1.0 if fps is None else fps
-    check_rate(fps)
+    frames = _Frames(1.0 if fps is None else fps)
+    source = _opened(images, frames)
+    if fps is None and frames.taken < frames.there:
+        tell(f"{images}: {frames.taken} of {frames.there} frames, 1 per second: --fps")
+    return source
+
+
+class _Frames:
+    """Put a video's frames in its place, and count them."""
+
+    def __init__(self, fps: float) -> None:
+        check_rate(fps)
+        self.fps, self.taken, self.there = fps, 0, 0
+
+    def of(self, paths: Sequence[pathlib.Path]) -> list[pathlib.Path]:
+        """List images, of a video its frames; single frames are named by their own times."""
+        return [each for path in paths for each in self._of_one(path)]
+
+    def _of_one(self, path: pathlib.Path) -> list[pathlib.Path]:
+        if not is_video(path):
+            return [name_frame(path)]
+        chosen = list_frames(path, self.fps)
+        self.taken += len(chosen)
+        self.there += count_frames(path)
+        return chosen
+
+
+def _opened(images: str | os.PathLike[str], frames: _Frames) -> ImageSource:
     if not os.fspath(images):
         raise InputError(f"images: found an empty name, expected {_FORMS}")
     path = pathlib.Path(images)
@@ -69,18 +97,18 @@ def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> 
     if not path.exists() and frame_time(path) is None:
         if _PATTERN.search(str(path)):
             root, found = _matching(path)
-            return _source(root, _with_frames(found, fps), path)
+            return _source(root, frames.of(found), path)
         if path.suffix.lower() not in IMAGE_SUFFIXES:
             raise InputError(f"{path}: found nothing, expected {_FORMS}")
     suffix = path.suffix.lower()
     if suffix == ".txt":
         lines = enumerate(read_text(path, "a list of images, a path a line").splitlines(), 1)
-        return _listed(path, [(number, line.strip()) for number, line in lines], None, fps)
+        return _listed(path, [(number, line.strip()) for number, line in lines], None, frames)
     if suffix == ".csv":
         table = read_image_table(path)
-        return _listed(path, table.rows, table.positions, fps)
+        return _listed(path, table.rows, table.positions, frames)
     check_source(file_of(path), _AN_IMAGE)
-    return _source(path.parent, _with_frames([path], fps), path)
+    return _source(path.parent, frames.of([path]), path)
 
 
 def check_rate_used(fps: float | None, paths: Iterable[pathlib.Path]) -> None:
@@ -114,15 +142,6 @@ def _source(
     return ImageSource(root, paths, names, positions)
 
 
-def _with_frames(paths: Sequence[pathlib.Path], fps: float) -> list[pathlib.Path]:
-    """Put a video's frames in its place, and name single frames by their own times."""
-    return [
-        each
-        for path in paths
-        for each in (list_frames(path, fps) if is_video(path) else [name_frame(path)])
-    ]
-
-
 def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:
     """Find the images and videos of a pattern, and the folder before its first wildcard."""
     parts = pattern.parts
@@ -147,7 +166,7 @@ def _listed(
     source: pathlib.Path,
     rows: Sequence[tuple[int, str]],
     positions: Positions | None,
-    fps: float,
+    frames: _Frames,
 ) -> ImageSource:
     """List the images that a text or table names, with the positions by the source's own names."""
     folder = source.parent
@@ -172,7 +191,7 @@ def _listed(
                     f"{path}: found a video, expected {_AN_IMAGE}, or a frame such as "
                     f"{path.name}#t=12.500"
                 )
-            paths += _with_frames([path], fps)
+            paths += frames.of([path])
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
     if not paths:

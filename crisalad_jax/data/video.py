@@ -117,6 +117,15 @@ def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib
     return [pathlib.Path(frame_name(video, time)) for time in chosen]
 
 
+def count_frames(video: str | os.PathLike[str]) -> int:
+    """Count all frames of a video.
+
+    Raises:
+        InputError: no file, or no video.
+    """
+    return len(_frame_times(video))
+
+
 def name_frame(path: pathlib.Path) -> pathlib.Path:
     """Name a frame by its own time: of a time between two, the frame that `read_frame` reads.
 

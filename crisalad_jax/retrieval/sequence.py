@@ -2,8 +2,10 @@
 
 The state is the number of the image at which the camera is. Frames of a query come one after the
 other; each moves the belief by a model of motion, and weighs it by the similarities of the frame
-to all images. The idea is of Xu, Suenderhauf and Milford 2021, "Probabilistic Visual Place
-Recognition for Hierarchical Localization" (RA-L); the likelihood here is another one.
+to all images. Where it is known when or where images and frames were taken, motion is in seconds or
+metres, so that the two may have any frame rates. The idea is of Xu, Suenderhauf and Milford 2021,
+"Probabilistic Visual Place Recognition for Hierarchical Localization" (RA-L); the likelihood here
+is another one.
 """
 
 import dataclasses
@@ -17,6 +19,8 @@ from crisalad_jax.utils.shapes import Float, Float64, Int64
 
 _PRIOR_FRAMES = 10
 """Number of frames that the map's own mean counts for in the mean of the frames so far."""
+_ROUNDING = 5e-4
+"""Seconds or metres that rounding may hide: videos' times are in whole milliseconds."""
 
 
 class SequenceState(NamedTuple):
@@ -30,14 +34,18 @@ class SequenceState(NamedTuple):
     """Sum of the similarities of the frames so far to each image."""
     frames: int
     """Number of frames so far."""
+    along: Float64[np.ndarray, " place"]
+    """How far along the map each image is: its number, or seconds or metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BayesFilter:
     """A discrete Bayes filter over the images of a map, for consecutive frames of one camera.
 
-    Motion: from one frame to the next the camera moves by at most `reach` images of the map,
-    either way, each step as likely; with probability `jump` it may be anywhere. Evidence: the
+    Motion: the camera moves along the map at most `reach` times as fast as the map's own camera
+    did, either way, to each image as likely, and always as far as the next image; with probability
+    `jump` it may be anywhere. By default a frame counts as an image of the map; where times or
+    distances are known, `reach` is seconds of the map a second, or metres a metre. Evidence: the
     likelihood of an image is exp(`sharpness` * z), where z is its similarity to the frame in
     standard deviations from the mean over the map. So it does not depend on how close together a
     model's similarities lie.
@@ -49,7 +57,8 @@ class BayesFilter:
     map's mean counts for ten frames in the second mean, until more are there.
 
     Args:
-        reach: images of the map between two frames, at most.
+        reach: how far the camera moves at most: images of the map a frame, or seconds a second, or
+            metres a metre.
         jump: probability that a frame is anywhere, above 0 and below 1.
         sharpness: weight of a frame against the frames before it.
         adapt: whether the mean of each side is taken away.
@@ -66,7 +75,7 @@ class BayesFilter:
         array([1, 2, 3])
     """
 
-    reach: int = 2
+    reach: float = 2.0
     jump: float = 0.01
     sharpness: float = 2.0
     adapt: bool = True
@@ -75,7 +84,7 @@ class BayesFilter:
         """Check the types and ranges."""
         check_types(self)
         for name, fits, expected in (
-            ("reach", self.reach >= 1, "at least 1"),
+            ("reach", 1 <= self.reach < np.inf, "at least 1"),
             ("jump", 0 < self.jump < 1, "above 0 and below 1"),
             ("sharpness", 0 < self.sharpness < np.inf, "above 0"),
         ):
@@ -83,37 +92,75 @@ class BayesFilter:
                 value = getattr(self, name)
                 raise InputError(f"BayesFilter.{name}: found {value}, expected {expected}")
 
-    def start(self, common: Float[np.ndarray, " place"]) -> SequenceState:
+    def start(
+        self,
+        common: Float[np.ndarray, " place"],
+        along: Float[np.ndarray, " place"] | None = None,
+    ) -> SequenceState:
         """Begin a sequence anywhere in a map.
 
         Args:
             common: similarity of each image to the mean descriptor of the map.
+            along: how far along the map each image is, in seconds or metres, never less than the
+                image before; None counts images.
 
         Returns:
             The state before the first frame.
+
+        Raises:
+            InputError: `along` of another length, or that decreases.
         """
         common = common.astype(np.float64)
         count = len(common)
-        return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0)
+        along = np.arange(count, dtype=np.float64) if along is None else along.astype(np.float64)
+        if along.shape != common.shape or not (np.diff(along) >= 0).all():
+            raise InputError(
+                f"along: found shape {along.shape}, expected {common.shape}, in ascending order"
+            )
+        return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0, along)
 
-    def predict(self, belief: Float64[np.ndarray, " place"]) -> Float64[np.ndarray, " place"]:
-        """Move a belief from one frame to the next, by the model of motion."""
+    def predict(self, state: SequenceState, moved: float = 1.0) -> Float64[np.ndarray, " place"]:
+        """Move a belief from one frame to the next, by the model of motion.
+
+        Args:
+            state: after the frame before.
+            moved: as in `step`.
+
+        Returns:
+            The probability that the camera is at each image, before the next frame is looked at.
+        """
+        along, far = state.along, self.reach * moved + _ROUNDING
+        numbers = np.arange(len(along))
+        # The next image is in reach however far it is, or a camera could never leave a gap.
+        first = np.minimum(np.searchsorted(along, along - far), numbers - 1).clip(0)
+        end = np.maximum(np.searchsorted(along, along + far, "right"), numbers + 2)
+        end = end.clip(max=len(along))
         # At the ends of the map fewer images are in reach, which share what leaves an image.
-        spread = belief / self._window(np.ones(len(belief)))
-        return (1 - self.jump) * self._window(spread) + self.jump / len(belief)
+        total = np.concatenate([[0.0], np.cumsum(state.belief / (end - first))])
+        return (1 - self.jump) * (total[end] - total[first]) + self.jump / len(along)
 
     def step(
-        self, state: SequenceState, similarities: Float[np.ndarray, " place"]
+        self,
+        state: SequenceState,
+        similarities: Float[np.ndarray, " place"],
+        moved: float = 1.0,
     ) -> SequenceState:
         """Take the next frame into account.
 
         Args:
             state: after the frame before.
             similarities: of the frame to every image of the map: cosines of descriptors.
+            moved: seconds or metres since the frame before, as the map's `along` is in; infinity
+                where that is unknown. Of a map that counts images, frames.
 
         Returns:
             The state after this frame.
+
+        Raises:
+            InputError: `moved` below 0.
         """
+        if not moved >= 0:
+            raise InputError(f"moved: found {moved}, expected at least 0")
         row = similarities.astype(np.float64)
         seen, frames = state.seen + row, state.frames + 1
         if self.adapt:
@@ -121,34 +168,37 @@ class BayesFilter:
             row = _without_means(row, mean, state.common)
         deviation = row.std()
         evidence = self.sharpness * (row - row.max()) / (deviation if deviation > 0 else 1)
-        belief = self.predict(state.belief) * np.exp(evidence)
-        return SequenceState(belief / belief.sum(), state.common, seen, frames)
+        belief = self.predict(state, moved) * np.exp(evidence)
+        return state._replace(belief=belief / belief.sum(), seen=seen, frames=frames)
 
     def follow(
         self,
         similarities: Float[np.ndarray, "frame place"],
         common: Float[np.ndarray, " place"],
+        along: Float[np.ndarray, " place"] | None = None,
+        moved: Float[np.ndarray, " frame"] | None = None,
     ) -> "Followed":
         """Follow a camera through all frames of a sequence.
 
         Args:
             similarities: of every frame, in order, to every image of the map.
             common: as in `start`.
+            along: as in `start`.
+            moved: of every frame, as in `step`; None is a frame each.
 
         Returns:
             The best place at each frame, from this frame and those before it.
+
+        Raises:
+            InputError: what `start` and `step` raise.
         """
-        state, places, probabilities = self.start(common), [], []
-        for row in similarities:
-            state = self.step(state, row)
+        state, places, probabilities = self.start(common, along), [], []
+        steps = np.ones(len(similarities)) if moved is None else moved
+        for row, step in zip(similarities, steps, strict=True):
+            state = self.step(state, row, float(step))
             places.append(int(state.belief.argmax()))
             probabilities.append(state.belief.max())
         return Followed(np.array(places, np.int64), np.array(probabilities))
-
-    def _window(self, values: Float64[np.ndarray, " place"]) -> Float64[np.ndarray, " place"]:
-        """Sum values within `reach` of each place."""
-        reach = min(self.reach, len(values) - 1)
-        return np.convolve(values, np.ones(2 * reach + 1))[reach : reach + len(values)]
 
 
 class Followed(NamedTuple):

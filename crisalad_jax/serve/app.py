@@ -134,11 +134,12 @@ _BODY = {
     }
 }
 _OF_ALL: dict[int | str, dict[str, Any]] = {
+    400: {"model": Problem, "description": "An unknown parameter"},
     401: {"model": Problem, "description": "No token, or another one"},
     421: {"model": Problem, "description": "A Host of another machine, where there is no token"},
 }
 _PROBLEMS = _OF_ALL | {
-    400: {"model": Problem, "description": "No picture, or an argument out of range"},
+    400: {"model": Problem, "description": "No picture, or an argument unknown or out of range"},
     403: {"model": Problem, "description": "A page of another site, or a map that is only read"},
     408: {"model": Problem, "description": "A picture that takes too long to arrive"},
     413: {"model": Problem, "description": "More bytes than the service takes"},
@@ -180,7 +181,9 @@ def make_app(
         version=VERSION,
         docs_url=None,  # FastAPI's page loads scripts from another server
         redoc_url=None,
+        openapi_url=None,  # FastAPI's route takes any parameters
         default_response_class=_Json,
+        dependencies=[fastapi.Depends(_refuse_unknown)],
     )
     room = _Room(most_waiting)
     # Apart, so that clients who stop in the middle of a picture keep no whole ones waiting.
@@ -192,7 +195,11 @@ def make_app(
     async def show_page() -> Response:
         return HTMLResponse(page)
 
-    @app.get("/health", responses={421: _OF_ALL[421]})
+    @app.get("/openapi.json", include_in_schema=False)
+    async def describe_interface() -> Response:
+        return JSONResponse(app.openapi())
+
+    @app.get("/health", responses={status: _OF_ALL[status] for status in (400, 421)})
     async def health() -> Health:
         """Tell that the service runs, of which model, how it searches, and since when."""
         return Health(**service.health())
@@ -208,7 +215,7 @@ def make_app(
         responses=_OF_ALL
         | {
             200: {"content": {"image/jpeg": {}}, "description": "A small JPEG"},
-            400: {"model": Problem, "description": "No number"},
+            400: {"model": Problem, "description": "No number, or an unknown parameter"},
             404: {"model": Problem, "description": "No such image, or its file is gone"},
         },
     )
@@ -274,6 +281,20 @@ def _leave_out_unused(app: fastapi.FastAPI) -> None:
         described["components"]["schemas"].pop(name, None)
 
 
+async def _refuse_unknown(request: fastapi.Request) -> None:
+    """Refuse a request with a parameter that its route does not have."""
+    known = _parameters(request)
+    for name in request.query_params:
+        if name not in known:
+            expected = ", ".join(known) or "none"
+            raise RefusedError(400, f"{name}: found an unknown parameter, expected {expected}")
+
+
+def _parameters(request: fastapi.Request) -> list[str]:
+    """Return the names of the parameters in the URL that a request's route has."""
+    return [field.alias for field in request.scope["route"].dependant.query_params]
+
+
 class _Room:
     """Room for a number of requests; more are refused."""
 
@@ -317,6 +338,14 @@ async def _picture(request: fastapi.Request, limit: int) -> tuple[bytes, str]:
             for _, each in form.multi_items()
             if isinstance(each, starlette.datastructures.UploadFile)
         ]
+        unknown = next((name for name in form if name != "image"), None)
+        if unknown is not None:
+            in_url = ", ".join(_parameters(request))
+            raise RefusedError(
+                400,
+                f"{unknown}: found an unknown field of the form, expected image (in the URL "
+                f"{in_url})",
+            )
         image = form.get("image")
         if not isinstance(image, starlette.datastructures.UploadFile):
             raise RefusedError(400, "image: found no such file in the form, expected one")

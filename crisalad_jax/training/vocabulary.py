@@ -175,7 +175,7 @@ def start_vocabulary(
 def build_vocabulary(
     params: Crisalad,
     config: ModelConfig,
-    images: str | os.PathLike[str],
+    images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     *,
     fps: float | None = None,
@@ -191,7 +191,7 @@ def build_vocabulary(
         params: a model's parameters; its backbone is as it will be used.
         config: the model, whose aggregator starts from centroids.
         images: the folder, searched with its subfolders, or another source of images
-            (docs/how-to/image-sources.md); not of images that are evaluated on.
+            (docs/how-to/image-sources.md), or a list of files; not of images that are evaluated on.
         out: the .safetensors file to write.
         fps: frames a second taken of a video, which is then expected; None is one.
         max_images: number of images that are read at most, drawn at random.
@@ -218,7 +218,8 @@ def build_vocabulary(
         True
     """
     check_target(out, ".safetensors")
-    paths = open_source(images, fps=fps).paths
+    one = isinstance(images, str | os.PathLike)
+    paths = open_source(images, fps=fps).paths if one else [pathlib.Path(each) for each in images]
     check_rate_used(fps, paths)
     params = with_vocabulary(
         params,

@@ -1158,6 +1158,7 @@ def maps() -> Iterator[Case]:
         "a number for the axes": _setting("axes", 3),
         "a root of a number": _setting("root", 3),
         "a root of nothing": _setting("root", None),
+        "a day of a number": _setting("added", 3),
         "a digest of nothing": _setting("sha256", None),
     }  # fmt: skip
     descriptions: dict[str, Callable[[Any], Any]] = {

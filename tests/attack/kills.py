@@ -396,8 +396,12 @@ def write_images(folder: pathlib.Path, first: int, count: int) -> None:
 
 
 def map_files(folder: pathlib.Path) -> dict[str, bytes]:
-    """Return the bytes of a map's additions, and its description but for its time and its name."""
+    """Return the bytes of a map's descriptors, and its JSON but for times and its name."""
     found = {p.name: p.read_bytes() for p in sorted((folder / "segments").iterdir())}
+    for name in found:
+        if name.endswith(".json"):
+            record = without_times(json.loads(found[name]))
+            found[name] = json.dumps(record | {"added": None}).encode()
     description = without_times(json.loads((folder / "map.json").read_text()))
     del description["created"], description["collection"]
     return found | {"map.json": json.dumps(description).encode()}

@@ -11,15 +11,17 @@ import time
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.maps.map import Map
 from tests.cli.test_cli import fails, succeeds
 from tests.cli.test_index import index, query
-from tests.conftest import BATCH, write_video
+from tests.conftest import BATCH, random_params, write_video
 from tests.data.test_sources import write_jpeg
 from tests.retrieval.maps.test_stores import ROUNDING
+from tests.training.test_vocabulary import ANYLOC
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +149,40 @@ def test_a_pattern_and_a_window_of_queries(shared, folder, tmp_path, capfd):
     )
     assert similar[0] == pytest.approx(alone[0], abs=ROUNDING + 1e-6)  # nothing is before it
     assert np.abs(np.subtract(similar, alone))[1:].max() > 1000 * ROUNDING
+    # As a shell writes out a pattern: one file after the other.
+    out = tmp_path / "answers.jsonl"
+    files = list_images(queries)
+    succeeds(capfd, *query(folder, *files, "--k", 1, "--json", out, "--window", 3))
+    assert [json.loads(line) for line in out.read_text().splitlines()] == together
+
+
+def test_the_default_rate_of_a_video_is_said(shared, folder, tmp_path, capfd):
+    """Of 21 frames in 2.1 seconds three are taken: at 0, 1 and 2 s."""
+    video = write_video(tmp_path / "walk.avi", 21)
+    said = f"crisalad: note: {video}: 3 of 21 frames, 1 per second: --fps\n"
+    weights = ("--weights", shared / "weights.safetensors")
+    save_weights(tmp_path / "start.safetensors", random_params(ANYLOC), ANYLOC)
+    out = ("--out", tmp_path / "d.npy")
+    verbs = (
+        ("extract", *weights, "--images", video, *out, "--quiet"),
+        index(shared, video, tmp_path / "map"),
+        query(folder, video),
+        (
+            *("vocabulary", "--images", video, "--weights", tmp_path / "start.safetensors"),
+            *("--out", tmp_path / "v.safetensors", "--quiet"),
+        ),
+    )
+    for verb in verbs:
+        assert main(list(map(str, verb))) == 0
+        assert capfd.readouterr().err == said
+    # Of two videos in a list, together; nothing where a rate is given, or all are taken.
+    write_video(tmp_path / "slow.avi", 3, rate=1)
+    (tmp_path / "list.txt").write_text("walk.avi\nslow.avi\n")
+    assert main(list(map(str, query(folder, tmp_path / "list.txt")))) == 0
+    assert "list.txt: 6 of 24 frames, 1 per second: --fps\n" in capfd.readouterr().err
+    succeeds(capfd, *query(folder, video, "--fps", 1))
+    succeeds(capfd, *query(folder, tmp_path / "slow.avi"))
+    succeeds(capfd, *query(folder, f"{video}#t=0.5"))
 
 
 def test_a_camera_of_a_video(folder, tmp_path, capfd):

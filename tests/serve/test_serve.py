@@ -130,6 +130,18 @@ def test_a_form_is_as_good_as_a_body(service, pictures, expected):
         ("GET", "/images/-1", None, 404, "number: found -1"),
         ("GET", "/images/..%2f..%2fmap.json", None, 404, "not found"),
         ("GET", "/docs", None, 404, "not found"),
+        # Of every route; a wrong name is told before the picture is looked at.
+        ("POST", "/locate?top=3", b"hello", 400, "top: found an unknown parameter, expected k"),
+        ("POST", "/locate?k=3&K=4", b"", 400, "K: found an unknown parameter, expected k"),
+        (
+            *("POST", "/images?name=a.jpg&latitude=1", b"", 400),
+            "latitude: found an unknown parameter, expected name, lat, lon, east, north, x, y",
+        ),
+        ("GET", "/?k=3", None, 400, "k: found an unknown parameter, expected none"),
+        ("GET", "/health?x", None, 400, "x: found an unknown parameter, expected none"),
+        ("GET", "/map?x=", None, 400, "x: found an unknown parameter, expected none"),
+        ("GET", "/images/2?size=9", None, 400, "size: found an unknown parameter, expected none"),
+        ("GET", "/openapi.json?x=1", None, 400, "x: found an unknown parameter, expected none"),
     ],
 )
 def test_what_is_not_answered_is_told_in_one_line(service, method, path, body, status, words):
@@ -144,6 +156,15 @@ def test_what_is_not_answered_is_told_in_one_line(service, method, path, body, s
 def test_a_form_without_a_picture(service, pictures):
     data, headers = form(pictures[0].read_bytes(), field="other")
     reply = service.ask("POST", "/locate", data, **headers)
+    expected = "other: found an unknown field of the form, expected image (in the URL k)"
+    assert (reply.status, reply.json["error"]) == (400, expected)
+    # As of `curl -F k=3 -F image=@a.jpg`.
+    data = b'--b\r\nContent-Disposition: form-data; name="k"\r\n\r\n3\r\n' + form(b"x")[0]
+    reply = service.ask("POST", "/locate", data, **headers)
+    expected = "k: found an unknown field of the form, expected image (in the URL k)"
+    assert (reply.status, reply.json["error"]) == (400, expected)
+    empty = b'--b\r\nContent-Disposition: form-data; name="image"\r\n\r\nx\r\n--b--\r\n'
+    reply = service.ask("POST", "/locate", empty, **headers)
     assert (reply.status, reply.json["error"][:5]) == (400, "image")
     data, headers = form(b"hello")
     reply = service.ask("POST", "/locate", data, **headers)
@@ -179,8 +200,8 @@ def test_the_interface_lists_what_is_answered(service):
     }
     posted = {400, 401, 403, 408, 413, 421, 500, 503}
     assert answered == {
-        ("get", "/health"): {200, 421},
-        ("get", "/map"): {200, 401, 421},
+        ("get", "/health"): {200, 400, 421},
+        ("get", "/map"): {200, 400, 401, 421},
         ("get", "/images/{number}"): {200, 400, 401, 404, 421},
         ("post", "/locate"): {200} | posted,
         ("post", "/images"): {201, 409} | posted,

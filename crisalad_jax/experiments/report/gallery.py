@@ -28,7 +28,11 @@ from crisalad_jax.experiments.report.style import (
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import staged_folder
+from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import counted
 
+_BOX = 0xC4
+"""Grey of a picture that is not there."""
 _NAME = 28
 """Largest number of characters of a name: at 7 points they are as wide as a picture."""
 
@@ -50,6 +54,7 @@ def retrieval_figure(
     chosen: Sequence[int] | None = None,
     title: str = "",
     names: tuple[Sequence[str], Sequence[str]] | None = None,
+    elsewhere: str | None = None,
 ) -> Picture:
     """Draw queries, one a row, with what was retrieved for them, best first.
 
@@ -69,13 +74,15 @@ def retrieval_figure(
         chosen: the queries shown, in their order.
         title: stands above the picture.
         names: of the queries and of the database, to stand below each, shortened in the middle.
+        elsewhere: what says where else the database's images may be. With it, one that cannot be
+            read is a grey box, and a note says so.
 
     Returns:
         The figure.
 
     Raises:
         InputError: no queries or retrievals, numbers of rows that differ, an index beyond the
-            database, rows or columns below 1, or an image that cannot be read.
+            database, rows or columns below 1, or another image that cannot be read.
     """
     _check_gallery(queries, database, indices, similarities, positives)
     for name, value in (("rows", rows), ("columns", columns)):
@@ -94,13 +101,25 @@ def retrieval_figure(
     width, gap, margin = 1.7, 0.16, 0.25
     between = 0.34 if names is None else 0.48
     head = 0.85 if title else 0.55
-    thumbnails = {
-        file: thumbnail(read_image(file), round(width * DPI))
-        for query in chosen
-        for file in (queries[query], *(database[index] for index in shown[query]))
-    }
+    side = round(width * DPI)
+    thumbnails = {queries[i]: thumbnail(read_image(queries[i]), side) for i in chosen}
+    lost: dict[Path, InputError] = {}
+    for file in dict.fromkeys(database[index] for query in chosen for index in shown[query]):
+        try:
+            thumbnails[file] = thumbnail(read_image(file), side)
+        except InputError as error:
+            if elsewhere is None:
+                raise
+            lost[file] = error
     aspect = float(np.median([image.shape[0] / image.shape[1] for image in thumbnails.values()]))
     height = width * min(max(aspect, 0.5), 1.5)
+    if lost:
+        box = np.full((round(height * DPI), side, 3), _BOX, np.uint8)
+        thumbnails |= dict.fromkeys(lost, box)
+        tell(
+            f"{counted(len(lost), 'picture')} shown as a grey box, as of "
+            f"{next(iter(lost.values()))}; {elsewhere} says where else"
+        )
     count = 1 + shown.shape[1]
     # One more gap sets the queries apart.
     size = (
@@ -215,7 +234,8 @@ def answers_figure(
 
     Args:
         answers: what `retrieval.maps.query.query` returned.
-        root: folder of the map's images; None is where they were.
+        root: folder of the map's images; None is where they were. One that is not there is a grey
+            box, and a note says so.
         rows: number of queries shown, at most.
         columns: number of answers to each, at most.
         chosen: the queries shown, in their order.
@@ -225,7 +245,7 @@ def answers_figure(
         The figure.
 
     Raises:
-        InputError: rows or columns below 1, or an image that cannot be read.
+        InputError: rows or columns below 1, or a query that cannot be read.
     """
     indices, similarities = (part[:, :columns] for part in answers.neighbours)
     used, places = np.unique(indices, return_inverse=True)
@@ -245,6 +265,7 @@ def answers_figure(
         chosen=chosen,
         names=(asked, [image.name for image in images]),
         title=title,
+        elsewhere="--map-images (root=)",
     )
 
 

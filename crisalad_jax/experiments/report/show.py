@@ -125,6 +125,7 @@ def show_retrievals(
     queries: Sequence[int] | None = None,
     rows: int = 4,
     columns: int = 4,
+    root: str | os.PathLike[str] | None = None,
 ) -> Figure:
     """Draw queries, one a row, beside what was found for them, best first.
 
@@ -138,6 +139,8 @@ def show_retrievals(
             half wrong where that is known, spread evenly.
         rows: number of queries shown, at most, where none are named.
         columns: number of retrievals shown for each, at most.
+        root: folder of a map's images; None is where they were. One that is not there is a grey
+            box, and a note says so.
 
     Returns:
         A figure that a notebook shows; `figure.savefig(path)` writes it.
@@ -179,7 +182,7 @@ def show_retrievals(
         raise InputError(f"queries: found {which}, expected numbers from 0 to {count - 1}")
     if benchmark is None:
         assert isinstance(found, Answers)
-        return answers_figure(found, rows=rows, columns=columns, chosen=queries)
+        return answers_figure(found, root=root, rows=rows, columns=columns, chosen=queries)
     assert isinstance(found, GroupingResult)
     return retrieval_figure(
         benchmark.queries,

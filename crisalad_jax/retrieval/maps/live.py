@@ -122,7 +122,8 @@ def query_live(
             if follower is None:
                 neighbours, filtered = places.search(described, k), ()
             else:
-                numbers, similarities, *filtered = follower.answer(described, k)
+                name = pathlib.Path(frame.name)
+                numbers, similarities, *filtered = follower.answer(described, k, [name])
                 neighbours = Neighbours(numbers, similarities)
             found = Answers(
                 [pathlib.Path(frame.name)],

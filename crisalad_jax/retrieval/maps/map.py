@@ -6,6 +6,7 @@ is as it was before the addition or after it. docs/maps.md has the format.
 """
 
 import contextlib
+import datetime
 import functools
 import hashlib
 import os
@@ -32,6 +33,7 @@ from crisalad_jax.retrieval.maps.approximate import (
     tell_stale,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
+from crisalad_jax.retrieval.maps.contents import MapAddition, contents, with_addition
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.head import (
     COMPONENTS,
@@ -117,6 +119,8 @@ class Map:
         """All of map.json but the model's configuration."""
         self.images: list[MapImage] = []
         """The images by number."""
+        self.additions: list[MapAddition] = []
+        """What was appended, in order: from which folder, on which day, and how many images."""
         self._numbers: dict[str, int] = {}
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
@@ -268,16 +272,24 @@ class Map:
             if not isinstance(record["root"], str):
                 raise ValueError(f"found root {record['root']!r}, expected text")
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
+            added = record.get("added")  # older records have none
+            if not isinstance(added, str | None):
+                raise ValueError(f"found added {added!r}, expected a time")
             segment = _Segment(len(self), len(images), str(record["sha256"]))
             if not images:
                 raise ValueError("no images")
         except (ValueError, LookupError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: not a whole record of images: {error!r}") from error
-        self._take(images, axes, segment)
+        self._take(images, axes, segment, added)
 
     def _take(
-        self, images: list[MapImage], axes: tuple[str, str] | None, segment: _Segment
+        self,
+        images: list[MapImage],
+        axes: tuple[str, str] | None,
+        segment: _Segment,
+        added: str | None,
     ) -> None:
+        self.additions = with_addition(self.additions, added, images[0].root, len(images))
         self._numbers |= {image.name: segment.first + i for i, image in enumerate(images)}
         self.images += images
         self.axes = self.axes or axes
@@ -478,6 +490,7 @@ class Map:
         self._store.add(segment.first, rows)
         record = {
             "root": root,
+            "added": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "axes": axes,
             "sha256": segment.sha256,
             "names": list(names),
@@ -485,7 +498,7 @@ class Map:
             "positions": [image.position for image in images],
         }
         write_record(self._record(segment.first), record)
-        self._take(images, axes, segment)
+        self._take(images, axes, segment, record["added"])
 
     @property
     def descriptors(self) -> Iterator[Float[np.ndarray, "n d"]]:
@@ -514,7 +527,8 @@ class Map:
             verify: whether to read all descriptors, as `verify` does.
 
         Returns:
-            Numbers of images and positions, the model, its settings, and where descriptors are.
+            Numbers of images and positions, its folders, additions and extent, the model, its
+            settings, and where descriptors are.
 
         Raises:
             InputError: what `verify` raises.
@@ -526,6 +540,7 @@ class Map:
             "images": len(self),
             "positions": sum(image.position is not None for image in self.images),
             "axes": self.axes,
+            **contents(self),
             "descriptor": f"{description.descriptor_length} numbers, {description.dtype}",
             "image_size": list(description.config.image_size),
             "resize": description.config.images_in_words,
@@ -538,7 +553,7 @@ class Map:
             "weights": description.weights,
             "created": description.created,
             "calibration": None if self.calibration is None else to_plain(self.calibration),
-            "verified": verify,
+            **({"verified": True} if verify else {}),
         }
 
     def load_params(self, weights: str | os.PathLike[str] | None = None) -> "Crisalad":

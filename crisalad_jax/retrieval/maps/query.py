@@ -110,7 +110,8 @@ def query(
         k: number of answers to each query.
         fps: frames a second taken of a video, which is then expected; None is one.
         window: frames that are described together: each with those just before it in its source,
-            as a moving camera has them. 1 describes each alone, as a map's images are.
+            as a moving camera has them. Files listed one after the other are one source. 1
+            describes each alone, as a map's images are.
         exact: whether to search exactly although the map has an approximate search.
         batch_size: number of queries described at once, each as if it were alone.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
@@ -152,25 +153,26 @@ def query(
     )
     follower = None if sequence is None else Follower(places, sequence)
     parts: list[Neighbours | Followed] = []
-    waiting: list[np.ndarray] = []
+    waiting: list[Described] = []
     unreadable: list[pathlib.Path] = []
     described = 0
     with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
         for part in descriptions:
-            waiting.append(part.descriptors)
+            waiting.append(part)
             unreadable += (paths[index] for index in part.unreadable)
             tried = len(part.indices) + len(part.unreadable)
             described += tried
             bar.advance(tried)
             if len(unreadable) == len(paths):
                 raise InputError(f"images: found {len(paths)}, none of them readable")
-            count = sum(map(len, waiting))
+            count = sum(len(each.indices) for each in waiting)
             if count >= AT_ONCE or (count and described == len(paths)):
-                found = np.concatenate(waiting)
+                found = np.concatenate([each.descriptors for each in waiting])
+                asked = [paths[index] for each in waiting for index in each.indices]
                 parts.append(
                     places.search(found, k, exact=exact)
                     if follower is None
-                    else follower.answer(found, k)
+                    else follower.answer(found, k, asked)
                 )
                 waiting.clear()
     indices, similarities, *filtered = map(np.concatenate, zip(*parts, strict=True))
@@ -242,7 +244,17 @@ def _listed(images: Any, fps: float | None) -> list[list[pathlib.Path]]:
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
-    return [open_source(each, fps=fps).paths for each in given]
+    sources: list[list[pathlib.Path]] = []
+    is_one = False
+    for each in given:
+        paths = open_source(each, fps=fps).paths
+        # Images named one after the other are one source: a shell writes a pattern out so.
+        if is_one and len(paths) == 1:
+            sources[-1] += paths
+        else:
+            sources.append(paths)
+        is_one = len(paths) == 1
+    return sources
 
 
 def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, float] | None:

@@ -1,12 +1,19 @@
 """Galleries by their frames and the pictures in them."""
 
+import shutil
+import warnings
+
 import cv2
 import numpy as np
 import pytest
 
 from crisalad_jax.experiments import report
 from crisalad_jax.experiments.report.gallery import _choose_queries, shortened
+from crisalad_jax.retrieval.maps.map import MapImage
+from crisalad_jax.retrieval.maps.query import Answers
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 from tests.experiments.report.pictures import (
     GREEN,
     RED,
@@ -123,6 +130,28 @@ def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
     with pytest.raises(InputError, match=r"database.1\.png: found an empty file"):
         _gallery(photographs, path, [[0, 1]], [[0]])
     assert not path.exists()
+
+
+def test_a_picture_of_a_map_that_is_gone_is_a_grey_box_and_a_note(photographs, tmp_path):
+    """The first of two answers; it is found where --map-images says."""
+    images = [MapImage(path.name, 1, None, str(path.parent)) for path in photographs["database"]]
+    near = Neighbours(np.array([[4, 1]]), np.array([[0.9, 0.8]], np.float32))
+    answers = Answers(photographs["queries"][:1], near, images, None)
+    photographs["database"][4].rename(tmp_path / photographs["database"][4].name)
+    path = tmp_path / "gallery.png"
+    words = r"1 picture shown as a grey box, as of .*4\.png: found no such .*; --map-images"
+    with pytest.warns(Note, match=words):
+        report.answers_gallery(path, answers)
+    grey, there = (is_colour(read_picture(path), c) for c in ((196, 196, 196), (60, 80, 90)))
+    # As large as the picture of the other answer, but for edges that are drawn softly.
+    assert grey.sum() == pytest.approx(there.sum(), rel=0.02)
+    for each in photographs["database"][:4]:
+        shutil.copy(each, tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)
+        report.answers_gallery(path, answers, root=tmp_path)
+    # The soft edges of letters have any grey.
+    assert is_colour(read_picture(path), (196, 196, 196)).sum() < 0.01 * grey.sum()
 
 
 def test_names_stand_below_the_captions_as_they_are(photographs, tmp_path):

@@ -278,7 +278,8 @@ def test_a_similarity_equal_to_the_least_is_known():
 
 @pytest.mark.parametrize("numbers", [14, 2**25])
 def test_a_followed_camera_is_that_of_the_filter(made, params, queries, monkeypatch, numbers):
-    """In portions of two frames, and at once; the map has two segments."""
+    """In portions of two frames, and at once; the map has two segments. Names say @UTM positions,
+    so that it moves in metres."""
     monkeypatch.setattr(crisalad_jax.retrieval.maps.follow, "_NUMBERS", numbers)
     settings = BayesFilter(reach=1)
     found = ask(made, params, queries, k=3, sequence=settings)
@@ -289,7 +290,13 @@ def test_a_followed_camera_is_that_of_the_filter(made, params, queries, monkeypa
     )
     asked = np.concatenate([part.descriptors for part in described]).astype(np.float64)
     similarities = asked @ rows.T
-    expected = settings.follow(similarities, rows @ rows.mean(axis=0))
+    spots = [
+        np.array([path.name.split("@")[1:3] for path in list_images(side)], float)
+        for side in (queries.parent / "database", queries)
+    ]
+    steps = [np.hypot(*np.diff(side, axis=0).T) for side in spots]
+    along, moved = np.append(0, np.cumsum(steps[0])), np.append(np.inf, steps[1])
+    expected = settings.follow(similarities, rows @ rows.mean(axis=0), along, moved)
     np.testing.assert_array_equal(found.neighbours.indices[:, 0], expected.places)
     assert found.probabilities is not None
     # The map multiplies in float32: errors of 1e-7 over deviations of about 1e-1, in an exponent.

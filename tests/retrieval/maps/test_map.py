@@ -1,6 +1,7 @@
 """Maps: what they say of themselves, what they refuse, and that a kill leaves them whole."""
 
 import dataclasses
+import datetime
 import hashlib
 import json
 import math
@@ -14,8 +15,9 @@ import numpy as np
 import pymilvus
 import pytest
 
+import crisalad_jax.retrieval.maps.map
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.positions import Positions
+from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.head import check_model, write_record
 from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, read_description
@@ -67,6 +69,52 @@ def spoil_rows(path: pathlib.Path, row: int, factor: float) -> None:
     spoilt[row] *= factor
     np.save(path, spoilt)
     reseal(path.with_suffix(".json"), sha256=hashlib.sha256(spoilt.tobytes()).hexdigest())
+
+
+# What is in it
+
+
+def test_a_map_lists_its_folders_additions_and_extent(tmp_path, monkeypatch):
+    """By hand; additions that follow each other on a day, from one folder, are one."""
+    days = iter(["2025-06-11", "2025-06-12", "2025-06-12", "2025-06-12", "2025-06-13"])
+
+    class Clock(datetime.datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls.fromisoformat(f"{next(days)}T10:00:00+00:00")
+
+    monkeypatch.setattr(crisalad_jax.retrieval.maps.map.datetime, "datetime", Clock)
+    # 2014-12-12 10:56:38 UTC, by `date -u -d @1418381798`.
+    parts = [
+        ("/days", ["monday/1418381798.png", "monday/1418381861.png"]),
+        ("/days", ["tuesday/0.png", "tuesday/1418381798.png"]),
+        ("/days", ["tuesday/2.png"]),
+        ("/videos", ["walk.mp4#t=0.500", "walk.mp4#t=12.250"]),
+        ("/videos", ["@3@4@32@N@.jpg", "@1@5@32@N@.jpg"]),
+    ]
+    with open_for_appending(tmp_path / "map", description("files")) as target:
+        for root, new in parts:
+            first = len(target)
+            where = utm_positions(new)
+            target.append(new, [1] * len(new), rows(first, len(new)), root=root, positions=where)
+        grown = target.additions
+    with Map.open(tmp_path / "map") as found:
+        assert found.additions == grown
+        assert grown == [
+            ("2025-06-11", "/days", 2),
+            ("2025-06-12", "/days", 3),
+            ("2025-06-12", "/videos", 2),
+            ("2025-06-13", "/videos", 2),
+        ]
+        summary = found.summary()
+    utc = ("2014-12-12T10:56:38Z", "2014-12-12T10:57:41Z")
+    assert summary["folders"] == [
+        {"folder": "monday", "images": 2, "first": utc[0], "last": utc[1]},
+        {"folder": "tuesday", "images": 3},  # not all of its names say times
+        {"folder": "walk.mp4", "images": 2, "first": 0.5, "last": 12.25},
+        {"folder": ".", "images": 2},
+    ]
+    assert summary["extent"] == {"east": [1.0, 3.0], "north": [4.0, 5.0]}
 
 
 # Killed
@@ -224,7 +272,7 @@ def test_a_map_that_is_not_verified_is_opened_without_reading_descriptors(folder
     )
     with Map.open(folder, verify=False) as found:
         assert read == []
-        assert not found.summary()["verified"]
+        assert "verified" not in found.summary()
     with Map.open(folder):
         assert read == [(0, 1), (1, 2), (3, 4)]
 
