@@ -113,7 +113,7 @@ def utm_zones(names: Sequence[str]) -> list[Zone | None]:
     numbers = {number for number, _ in fields if number is not None}
     halves = {south for _, south in fields if south is not None}
     if len(numbers) <= 1 and len(halves) <= 1:
-        common = Zone(*numbers, *halves) if numbers and halves else None
+        common = Zone(numbers.pop(), halves.pop()) if numbers and halves else None
         return [common] * len(fields)
     zones = []
     for name, (number, south) in zip(names, fields, strict=True):
@@ -138,7 +138,7 @@ def _zone_fields(name: str) -> tuple[int | None, bool | None]:
         except ValueError:
             return int(number), None
     if letter == "S":
-        return int(number), not _BAND_S[0] <= float(north) <= _BAND_S[1]
+        return int(number), float(north) < _BAND_S[0] or float(north) > _BAND_S[1]
     return int(number), letter < "N"
 
 
