@@ -17,7 +17,10 @@ def answers_table(answers: Answers, title: str = "") -> Table:
     table.add_column("similarity", justify="right", no_wrap=True)
     if followed:
         table.add_column("probability", justify="right", no_wrap=True)
-    table.add_column(", ".join(answers.axes or ("position",)), justify="right", overflow="fold")
+    position = ", ".join(answers.axes or ("position",))
+    if answers.zone is not None:
+        position += f" (zone {answers.zone})"
+    table.add_column(position, justify="right", overflow="fold")
     for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
         shown = ranked if known else ranked[:1]
         for answer in shown:

@@ -42,6 +42,8 @@ class Calibrate:
     """Folder of the images that a .mat file or .npy lists name; by default beside them."""
     queries: str | None = None
     """Folder of the queries, where @UTM sets have several; by default queries."""
+    ignore_zones: bool = False
+    """Compare @UTM numbers of all zones as if of one plane, as the public tools do."""
     radius: float | None = None
     """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
     max_heading_difference: float | None = None

@@ -124,6 +124,7 @@ def open_set(arguments: Any) -> "Benchmark":
         max_heading_difference=arguments.max_heading_difference,
         frames=arguments.frames,
         queries=arguments.queries,
+        ignore_zones=arguments.ignore_zones,
         layout=arguments.layout,
     )
     say(

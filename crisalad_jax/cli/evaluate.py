@@ -90,6 +90,8 @@ class Evaluate:
     queries: str | None = None
     """Folder of the queries, where @UTM sets have several: queries_night of SVOX; by default
     queries."""
+    ignore_zones: bool = False
+    """Compare @UTM numbers of all zones as if of one plane, as the public tools do."""
     radius: float | None = None
     """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
     max_heading_difference: float | None = None

@@ -1,4 +1,11 @@
-"""Project latitudes and longitudes to metres east and north of one zone of UTM."""
+"""Convert between degrees, metres of a zone of UTM, and points on the ellipsoid.
+
+The projection is Krueger's series (1912) of third order in the third flattening, as in Karney,
+Transverse Mercator with an accuracy of a few nanometers (J. Geodesy 2011), eqs. 35 and 36. It is
+exact to a millimetre in a zone and its neighbours.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -6,7 +13,41 @@ from crisalad_jax.utils.shapes import Float64
 
 _EQUATOR, _FLATTENING = 6_378_137.0, 1 / 298.257223563
 """Ellipsoid of WGS84, in metres."""
-_SCALE, _FALSE_EAST = 0.9996, 500_000.0
+_SQUARE = _FLATTENING * (2 - _FLATTENING)
+"""Its first eccentricity, squared."""
+_THIRD = _FLATTENING / (2 - _FLATTENING)
+_RADIUS = 0.9996 * (_EQUATOR / (1 + _THIRD) * (1 + _THIRD**2 / 4 + _THIRD**4 / 64))
+"""Metres of a meridian's arc of one radian on the mean, times UTM's scale."""
+_FALSE_EAST, _FALSE_NORTH = 500_000.0, 10_000_000.0
+
+_Points = Float64[np.ndarray, " point"]
+
+
+class Zone(NamedTuple):
+    """A zone of UTM and a hemisphere, which share one plane of metres."""
+
+    number: int
+    south: bool
+
+    def __str__(self) -> str:
+        """Return words for a message, such as 32 north."""
+        return f"{self.number} {'south' if self.south else 'north'}"
+
+    @property
+    def central(self) -> float:
+        """Longitude of the central meridian in degrees."""
+        return 6.0 * self.number - 183
+
+    def to_degrees(self, east: _Points, north: _Points) -> tuple[_Points, _Points]:
+        """Compute latitude and longitude, -180 to 180, of east and north in metres."""
+        latitude, turn = _inverse(east, north - _FALSE_NORTH * self.south)
+        return latitude, (self.central + turn + 180) % 360 - 180
+
+    def to_metres(self, latitude: _Points, longitude: _Points) -> tuple[_Points, _Points]:
+        """Compute east and north in metres in this plane, also of places outside of the zone."""
+        turn = (longitude - self.central + 180) % 360 - 180
+        east, north = transverse_mercator(latitude, turn)
+        return east, north + _FALSE_NORTH * self.south
 
 
 def continuous(longitude: Float64[np.ndarray, " point"]) -> Float64[np.ndarray, " point"]:
@@ -27,22 +68,17 @@ def transverse_mercator(
 ) -> tuple[Float64[np.ndarray, " point"], Float64[np.ndarray, " point"]]:
     """Compute UTM's east and north in metres; north is negative in the south.
 
-    The formula is Krueger's series (1912) of third order in the third flattening, as in Karney,
-    Transverse Mercator with an accuracy of a few nanometers (J. Geodesy 2011). It is exact to a
-    millimetre in a zone and its neighbours.
-
     Args:
         latitude: degrees on WGS84.
         longitude: degrees from the zone's central meridian.
     """
-    n = _FLATTENING / (2 - _FLATTENING)
-    eccentricity = np.sqrt(_FLATTENING * (2 - _FLATTENING))
-    radius = _EQUATOR / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    n = _THIRD
     series = (
         n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16,
         13 * n**2 / 48 - 3 * n**3 / 5,
         61 * n**3 / 240,
     )
+    eccentricity = np.sqrt(_SQUARE)
     sine, turn = np.sin(np.deg2rad(latitude)), np.deg2rad(longitude)
     conformal = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
     along = np.arctan2(conformal, np.cos(turn))
@@ -51,4 +87,59 @@ def transverse_mercator(
     for order, weight in enumerate(series, start=1):
         north += weight * np.sin(2 * order * along) * np.cosh(2 * order * across)
         east += weight * np.cos(2 * order * along) * np.sinh(2 * order * across)
-    return _FALSE_EAST + _SCALE * radius * east, _SCALE * radius * north
+    return _FALSE_EAST + _RADIUS * east, _RADIUS * north
+
+
+def _inverse(east: _Points, north: _Points) -> tuple[_Points, _Points]:
+    """Compute latitude, and longitude from the central meridian, in degrees."""
+    n = _THIRD
+    series = (
+        n / 2 - 2 * n**2 / 3 + 37 * n**3 / 96,
+        n**2 / 48 + n**3 / 15,
+        17 * n**3 / 480,
+    )
+    along, across = north / _RADIUS, (east - _FALSE_EAST) / _RADIUS
+    angle, away = along.copy(), across.copy()
+    for order, weight in enumerate(series, start=1):
+        angle -= weight * np.sin(2 * order * along) * np.cosh(2 * order * across)
+        away -= weight * np.cos(2 * order * along) * np.sinh(2 * order * across)
+    conformal = np.arcsinh(np.sin(angle) / np.hypot(np.sinh(away), np.cos(angle)))
+    eccentricity = np.sqrt(_SQUARE)
+    sine = np.tanh(conformal)
+    for _ in range(8):  # each step leaves at most a 150th of the error
+        sine = np.tanh(conformal + eccentricity * np.arctanh(eccentricity * sine))
+    return np.rad2deg(np.arcsin(sine)), np.rad2deg(np.arctan2(np.sinh(away), np.cos(angle)))
+
+
+def comparable(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "point axis"]:
+    """Make points in metres whose straight distances are those on the ground.
+
+    They are east and north where all are of one zone of UTM, else `on_ellipsoid`.
+    """
+    longitude = continuous(longitude)
+    if len(np.unique(np.floor(longitude / 6))) == 1:
+        return np.stack(to_metres(latitude, longitude), axis=1)
+    return on_ellipsoid(latitude, longitude)
+
+
+def on_ellipsoid(latitude: _Points, longitude: _Points) -> Float64[np.ndarray, "point 3"]:
+    """Compute points in metres from the Earth's centre: a chord is their distance anywhere.
+
+    A chord of 1 km is 1 micrometre shorter than the way on the ground, one of 1000 km 1 km.
+    """
+    phi, turn = np.deg2rad(latitude), np.deg2rad(longitude)
+    radius = _EQUATOR / np.sqrt(1 - _SQUARE * np.sin(phi) ** 2)
+    flat = radius * np.cos(phi)
+    return np.stack(
+        [flat * np.cos(turn), flat * np.sin(turn), (1 - _SQUARE) * radius * np.sin(phi)], axis=1
+    )
+
+
+def flattened(points: Float64[np.ndarray, "point axis"]) -> Float64[np.ndarray, "point 2"]:
+    """Return points as a map draws them: east and north as they are, others equirectangular."""
+    if points.shape[1] == 2:
+        return points
+    x, y, z = points.T
+    latitude = np.arctan2(z, (1 - _SQUARE) * np.hypot(x, y))
+    longitude = np.deg2rad(continuous(np.rad2deg(np.arctan2(y, x))))
+    return _EQUATOR * np.stack([np.cos(np.median(latitude)) * longitude, latitude], axis=1)

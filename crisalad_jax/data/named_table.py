@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from crisalad_jax.data.names import plain
 from crisalad_jax.data.video import spelled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
@@ -36,7 +37,7 @@ class NamedRow(NamedTuple):
 def named_rows(
     table: pathlib.Path, check_header: Callable[[Sequence[str]], None]
 ) -> Iterator[NamedRow]:
-    """Yield the rows of a table, whose names are there, each once.
+    """Yield the rows of a table, whose names are there, each once however it is spelled.
 
     The separator is a comma or, where the header has more of them, a semicolon. Spaces around
     texts are dropped, and so is a spreadsheet's byte order mark.
@@ -76,12 +77,10 @@ def named_rows(
                 name = spelled(fields["name"])
                 if not name:
                     raise InputError(f"{where}: found no name, expected an image's")
-                if name in lines:
+                if (before := lines.setdefault(plain(name), reader.line_num)) < reader.line_num:
                     raise InputError(
-                        f"{where}: found {name!r} twice, on line {lines[name]} too, expected it "
-                        "once"
+                        f"{where}: found {name!r} twice, on line {before} too, expected it once"
                     )
-                lines[name] = reader.line_num
                 yield NamedRow(reader.line_num, where, name, fields, separator == ";")
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error

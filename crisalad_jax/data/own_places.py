@@ -72,20 +72,23 @@ def _read_folders(root: pathlib.Path) -> OwnPlaces:
 
 
 def _read_table(table: pathlib.Path) -> OwnPlaces:
-    places: dict[str, list[str]] = {}
-    views: dict[str, tuple[float, float, float]] = {}
-    names: list[str] = []
+    rows: list[tuple[str, str, tuple[float, float, float] | None]] = []
     for row in named_rows(table, lambda header: _check_header(table, header)):
         place = row.fields["place"]
         if not place:
             raise InputError(f"{row.where}: found no place, expected {_COLUMNS}")
-        names.append(row.name)
-        places.setdefault(place, []).append(row.name)
-        if "lat" in row.fields:
-            views[row.name] = _view(row)
-    if not places:
+        rows.append((row.name, place, _view(row) if "lat" in row.fields else None))
+    if not rows:
         raise InputError(f"{table}: found no row below the header, expected {_COLUMNS}")
-    find_images(table, table.parent, names)
+    places: dict[str, list[str]] = {}
+    views: dict[str, tuple[float, float, float]] = {}
+    paths = find_images(table, table.parent, [name for name, _, _ in rows])
+    depth = len(table.parent.parts)
+    for path, (name, place, view) in zip(paths, rows, strict=True):
+        file = "/".join(path.parts[depth:]) if path.is_relative_to(table.parent) else name
+        places.setdefault(place, []).append(file)
+        if view is not None:
+            views[file] = view
     return OwnPlaces(table.parent, places, views or None)
 
 

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from crisalad_jax.data.names import Disk, plain
 from crisalad_jax.data.own_places import read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
@@ -25,6 +26,9 @@ COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "pa
 IDS_PER_CITY = 10**5
 
 Order = Literal["within-city", "shuffled"]
+
+_Listings = dict[str, tuple[str, dict[str, str]]]
+"""Folder below Images/, as a table names it -> its name on disk, and the names in it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,7 +102,7 @@ def read_places(
     if not (root / "Dataframes").is_dir():
         return _own_places(root, cities, min_images)
     tables = _find_tables(root, cities)
-    listings: dict[str, frozenset[str]] = {}
+    listings: _Listings = {}
     files: list[str] = []
     counts: list[int] = []
     place_city: list[int] = []
@@ -173,13 +177,14 @@ def _find_tables(root: pathlib.Path, cities: Sequence[str] | None) -> list[pathl
     unknown = [name for name in cities if name not in tables]
     if unknown:
         raise InputError(
-            f"cities: found {', '.join(unknown)}, expected some of {', '.join(sorted(tables))}"
+            f"cities (--cities): found {', '.join(unknown)}, expected some of those in {folder}: "
+            f"{', '.join(sorted(tables))}"
         )
     return [tables[name] for name in cities]
 
 
 def _read_city(
-    root: pathlib.Path, table: pathlib.Path, listings: dict[str, frozenset[str]]
+    root: pathlib.Path, table: pathlib.Path, listings: _Listings
 ) -> list[tuple[int, list[str]]]:
     """Read one city's places, ascending by id, with the images of each."""
     # The inner dict serves as an ordered set.
@@ -201,10 +206,7 @@ def _read_city(
         )
         image = _find_image(root, (city_id, name), stem, listings)
         if image is None:
-            raise InputError(
-                f"{table}: line {line}: found no file Images/{city_id}/{stem}.jpg "
-                f"(nor .JPG, nor under Images/{name}/), expected every row to have its image"
-            )
+            raise _no_image(root, table, line, (city_id, name), stem)
         places.setdefault(place, {})[image] = None
     ids = {place % IDS_PER_CITY: place for place in places}
     if len(ids) < len(places):
@@ -261,26 +263,37 @@ def _not_a_number(table: pathlib.Path, line: int, row: Sequence[str]) -> InputEr
 
 
 def _find_image(
-    root: pathlib.Path,
-    folders: tuple[str, ...],
-    stem: str,
-    listings: dict[str, frozenset[str]],
+    root: pathlib.Path, folders: tuple[str, ...], stem: str, listings: _Listings
 ) -> str | None:
     for folder in folders:
         if folder not in listings:
-            listings[folder] = _list_names(root / "Images" / folder)
+            disk, images = Disk(), root / "Images"
+            path = disk.find(images, folder)
+            listings[folder] = ("", {}) if path is None else (path.name, disk.names(path))
+        there, names = listings[folder]
         for name in (f"{stem}.jpg", f"{stem}.JPG"):
-            if name in listings[folder]:
-                return f"Images/{folder}/{name}"
+            if (file := names.get(name) or names.get(plain(name))) is not None:
+                return f"Images/{there}/{file}"
     return None
 
 
-def _list_names(folder: pathlib.Path) -> frozenset[str]:
-    try:
-        with os.scandir(folder) as entries:
-            return frozenset(entry.name for entry in entries)
-    except OSError:
-        return frozenset()
+def _no_image(
+    root: pathlib.Path, table: pathlib.Path, line: int, folders: tuple[str, ...], stem: str
+) -> InputError:
+    """Make the error of a row without an image; where a city has none, it says what to read."""
+    images = root / "Images"
+    if not any((images / folder).is_dir() for folder in folders):
+        there = {path.name for path in images.glob("*") if path.is_dir()}
+        cities = [path.stem for path in sorted(table.parent.glob("*.csv")) if path.stem in there]
+        return InputError(
+            f"{table}: found no folder {' nor '.join(dict.fromkeys(folders))} in {images}, "
+            "expected the images of all cities, or the names of some as --cities: there are "
+            f"{', '.join(cities) or 'none'}"
+        )
+    return InputError(
+        f"{table}: line {line}: found no file Images/{folders[0]}/{stem}.jpg (nor .JPG, nor under "
+        f"Images/{folders[1]}/), expected every row to have its image"
+    )
 
 
 def epoch_batches(

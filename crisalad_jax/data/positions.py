@@ -3,14 +3,29 @@
 import math
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
+from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float64
 
 AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
 """Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
+
+
+MOST_METRES = 1e8
+"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+_BANDS = "CDEFGHJKLMNPQRSTUVWX"
+"""Letters of UTM's bands of latitude, from south to north; N is the first of the north."""
+_BAND_S = (3.4e6, 4.6e6)
+"""Northings of band S, 32 to 40 degrees, with a margin; elsewhere S stands for the south."""
+_NEAR = 9.0
+"""Degrees from a zone's central meridian, its neighbours included, within which its plane has
+distances right to about one percent."""
 
 
 class Positions(NamedTuple):
@@ -18,10 +33,58 @@ class Positions(NamedTuple):
 
     axes: tuple[str, str]
     of: dict[str, tuple[float, float]]
+    zone: Zone | None = None
+    """The zone of east and north; None where it is unknown, and of other axes."""
+
+    def fitted(
+        self, source: object, axes: tuple[str, str] | None, zone: Zone | None
+    ) -> "Positions":
+        """Return the positions in the axes and zone of a map.
+
+        Metres of another zone, or degrees, become metres of the map's zone, and metres become
+        degrees in a map of degrees, all to a tenth of a millimetre.
+
+        Args:
+            source: the map, for messages.
+            axes: the map's; None where it has no position yet.
+            zone: the map's; None where it is unknown.
+
+        Raises:
+            InputError: other axes without a known zone, or a place far from the map's zone.
+        """
+        metres, degrees, _ = AXES
+        if axes in (None, self.axes) and (
+            axes != metres or zone == self.zone or None in (zone, self.zone)
+        ):
+            return self
+        known = self.axes == degrees or self.zone is not None
+        if not known or (axes != degrees and (axes != metres or zone is None)):
+            raise InputError(
+                f"{source}: found positions in {', '.join(self.axes)}, expected "
+                f"{', '.join(axes or ())} as in the map"
+            )
+        points = np.array(list(self.of.values()), np.float64).reshape(-1, 2).T
+        latitude, longitude = points if self.zone is None else self.zone.to_degrees(*points)
+        if zone is None:
+            fitted = np.round([latitude, longitude], 9)
+        else:
+            away = np.abs((longitude - zone.central + 180) % 360 - 180)
+            if (away > _NEAR).any():
+                name = list(self.of)[int(away.argmax())]
+                raise InputError(
+                    f"{source}: found {name!r} {away.max():.0f} degrees of longitude from the "
+                    f"middle of zone {zone}, whose metres the map has, expected at most {_NEAR:g}; "
+                    "a new map of all images can have lat, lon"
+                )
+            fitted = np.round(zone.to_metres(latitude, longitude), 4)
+        return Positions(axes or metres, _by_name(self.of, fitted.T), zone)
 
 
-MOST_METRES = 1e8
-"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+def _by_name(
+    names: Iterable[str], points: Float64[np.ndarray, "image 2"]
+) -> dict[str, tuple[float, float]]:
+    rows = zip(names, points.tolist(), strict=True)
+    return {name: (first, second) for name, (first, second) in rows}
 
 
 def utm_position(name: str) -> tuple[float, float] | None:
@@ -34,14 +97,87 @@ def utm_position(name: str) -> tuple[float, float] | None:
     return (east, north) if math.isfinite(east) and math.isfinite(north) else None
 
 
+def utm_zones(names: Sequence[str]) -> list[Zone | None]:
+    """Read the zone of each `@UTM_east@UTM_north@zone@letter@...` name.
+
+    The letter is that of the band of latitude, or else N or S for the hemisphere. Where no two
+    names contradict each other, all have the same zone; None where it is unknown.
+
+    Args:
+        names: of images with a `utm_position`; paths too.
+
+    Raises:
+        InputError: several zones or hemispheres, and a name without one.
+    """
+    fields = [_zone_fields(name.rpartition("/")[2]) for name in names]
+    numbers = {number for number, _ in fields if number is not None}
+    halves = {south for _, south in fields if south is not None}
+    if len(numbers) <= 1 and len(halves) <= 1:
+        common = Zone(numbers.pop(), halves.pop()) if numbers and halves else None
+        return [common] * len(fields)
+    zones = []
+    for name, (number, south) in zip(names, fields, strict=True):
+        if number is None or south is None:
+            raise InputError(
+                f"{name}: found no zone with a letter, expected @east@north@zone@letter@...: the "
+                "images are of several zones of UTM"
+            )
+        zones.append(Zone(number, south))
+    return zones
+
+
+def _zone_fields(name: str) -> tuple[int | None, bool | None]:
+    """Read the number of the zone, and whether it is south of the equator; None where unknown."""
+    _, _, north, number, letter, latitude, *_ = [*name.split("@"), *[""] * 6]
+    letter = letter.upper()
+    if not (number.isdecimal() and 1 <= int(number) <= 60 and letter in ("", *_BANDS)):
+        return None, None
+    if not letter:
+        try:
+            return int(number), float(latitude) < 0
+        except ValueError:
+            return int(number), None
+    if letter == "S":
+        return int(number), float(north) < _BAND_S[0] or float(north) > _BAND_S[1]
+    return int(number), letter < "N"
+
+
+def utm_degrees(
+    names: Sequence[str], zones: Sequence[Zone | None], metres: Float64[np.ndarray, "image 2"]
+) -> Float64[np.ndarray, "image 2"]:
+    """Compute latitude and longitude of images whose zones are all known.
+
+    Raises:
+        InputError: metres that no place has.
+    """
+    degrees = np.empty_like(metres)
+    off = (np.abs(metres - [5e5, 5e6]) > [1e6, 5.1e6]).any(axis=1)
+    if off.any():
+        first = int(off.argmax())
+        raise InputError(f"{names[first]}: found {metres[first].tolist()}, expected metres of UTM")
+    for zone in set(zones):
+        assert zone is not None
+        of = [number for number, each in enumerate(zones) if each == zone]
+        degrees[of] = np.stack(zone.to_degrees(*metres[of].T), axis=1)
+    return degrees
+
+
 def utm_positions(names: Sequence[str]) -> Positions:
-    """Read east and north in metres of the images with names `@UTM_east@UTM_north@...`."""
-    positions = {}
-    for name in names:
-        position = utm_position(pathlib.PurePosixPath(name).name)
-        if position is not None:
-            positions[name] = position
-    return Positions(AXES[0], positions)
+    """Read the positions of the images with names `@UTM_east@UTM_north@zone@letter@...`.
+
+    They are east and north in metres or, where the images are of several zones, degrees.
+
+    Raises:
+        InputError: several zones, and a name without its zone or with metres that no place has.
+    """
+    found = {name: utm_position(name.rpartition("/")[2]) for name in names}
+    of = {name: position for name, position in found.items() if position is not None}
+    there = list(of)
+    zones = utm_zones(there)
+    if len(set(zones)) <= 1:
+        return Positions(AXES[0], of, zones[0] if zones else None)
+    degrees = utm_degrees(there, zones, np.array(list(of.values()), np.float64))
+    return Positions(AXES[1], _by_name(there, np.round(degrees, 9)))
 
 
 class ImageTable(NamedTuple):

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, names_in
+from crisalad_jax.data.names import Disk
 from crisalad_jax.data.positions import Positions, read_image_table
 from crisalad_jax.data.video import (
     check_rate,
@@ -169,14 +170,17 @@ def _listed(
     frames: _Frames,
 ) -> ImageSource:
     """List the images that a text or table names, with the positions by the source's own names."""
-    folder = source.parent
+    folder, disk = source.parent, Disk()
     paths: list[pathlib.Path] = []
     lines: dict[pathlib.Path, int] = {}
     for number, line in rows:
         if not line:
             continue
         # Written out, so that a name has no .. in it, and a path that is there twice is found.
-        path = pathlib.Path(os.path.normpath(folder / line))
+        text = os.path.normpath(line)
+        file = os.fspath(file_of(text))
+        path = disk.find(folder, file) or folder / file
+        path = pathlib.Path(os.path.normpath(f"{path}{text[len(file) :]}"))
         where = f"{source}: line {number}"
         try:
             check_source(file_of(path), _AN_IMAGE)

@@ -14,6 +14,10 @@ _NAME = re.compile(r".*?_\d{7,}_\d{4,}_\d{2,}_(\d{3,})_([^_]+)_([^_]+)_")
 """`data.places` writes a row's northdeg, latitude and longitude into its image's name."""
 
 
+_WIDEST = 60.0
+"""Degrees of longitude of a city's images; a plane of more stretches distances by over 15 %."""
+
+
 class Views(NamedTuple):
     """Position and heading of every image; metres are of one UTM zone for each city."""
 
@@ -31,7 +35,7 @@ def views_of(places: Places) -> Views:
 
     Raises:
         InputError: in the layout of GSV-Cities, a file is not named in its way, or bears no
-            latitude or longitude.
+            latitude or longitude; or a city is wider than a plane can be.
     """
     if places.names is None:
         fields = np.array([_fields(places, file) for file in places.files])
@@ -46,6 +50,12 @@ def views_of(places: Places) -> Views:
     for number in np.unique(city):
         of = city == number
         here = continuous(longitude[of])
+        if (wide := np.ptp(here)) > _WIDEST:
+            raise InputError(
+                f"{places.root}: found the images of {places.cities[number]} over {wide:.0f} "
+                f"degrees of longitude, expected at most {_WIDEST:g}, as cells are of one plane: "
+                "a set of several cities has a table each, or no columns lat,lon"
+            )
         known[number] = np.ptp(latitude[of]) > 0 or np.ptp(here) > 0
         east[of], north[of] = to_metres(latitude[of], here)
     return Views(east, north, heading % 360, known)

@@ -17,7 +17,7 @@ SamePlace = Callable[
 _CHUNK = 2**21
 
 
-def near(positions: Float64[np.ndarray, "image 2"], radius: float) -> SamePlace:
+def near(positions: Float64[np.ndarray, "image axis"], radius: float) -> SamePlace:
     """Make the test that two images were taken at most `radius` metres apart."""
 
     def same(a: Int64[np.ndarray, " pair"], b: Int64[np.ndarray, " pair"]) -> np.ndarray:

@@ -20,7 +20,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from crisalad_jax.data.positions import AXES, MOST_METRES, utm_position
+from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, utm_positions
 from crisalad_jax.serve.access import Access, RefusedError
 from crisalad_jax.serve.service import MapService
 from crisalad_jax.serve.worker import MapFailedError, NameTakenError
@@ -259,12 +259,12 @@ def make_app(
         """Append a picture to the map, for good; answers see it from then on."""
         if not service.appends:
             raise RefusedError(403, "images: found a map that is only read, expected --append")
-        axes, position = _position(name, (east, north), (lat, lon), (x, y))
+        position = _position(name, (east, north), (lat, lon), (x, y))
         with uploads.taken():
             data, _ = await _picture(request, max_bytes)
         with room.taken():
             start = time.perf_counter()
-            fields = await service.append(data, name, axes, position)
+            fields = await service.append(data, name, position)
         return Appended(**fields, latency_ms=_milliseconds(start))
 
     _leave_out_unused(app)
@@ -371,15 +371,13 @@ async def _body(request: fastapi.Request, limit: int) -> bytes:
     return bytes(data)
 
 
-def _position(
-    name: str, *pairs: tuple[float | None, float | None]
-) -> tuple[tuple[str, str] | None, tuple[float, float] | None]:
-    """Return the position of a new image and its axes, by default what a name with @UTM says.
+def _position(name: str, *pairs: tuple[float | None, float | None]) -> Positions | None:
+    """Return the position of a new image, by default what a name with @UTM says.
 
     The pairs are what the request says along each of `AXES`.
     """
     given = [
-        (axes, (first, second))
+        Positions(axes, {name: (first, second)})
         for axes, (first, second) in zip(AXES, pairs, strict=True)
         if first is not None and second is not None
     ]
@@ -389,8 +387,8 @@ def _position(
         )
     if given:
         return given[0]
-    position = utm_position(name.rpartition("/")[2])
-    return (None, None) if position is None else (AXES[0], position)
+    said = utm_positions([name])
+    return said if said.of else None
 
 
 def _milliseconds(start: float) -> float:

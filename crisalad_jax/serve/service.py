@@ -13,7 +13,7 @@ import numpy as np
 
 from crisalad_jax.data.exif import exif_position
 from crisalad_jax.data.images import decode_image, read_image
-from crisalad_jax.data.positions import AXES
+from crisalad_jax.data.positions import AXES, Positions
 from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_similarity, position_fields
@@ -119,16 +119,14 @@ class MapService:
         self,
         data: bytes,
         name: str,
-        axes: tuple[str, str] | None,
-        position: tuple[float, float] | None,
+        position: Positions | None,
     ) -> dict[str, Any]:
         """Append a picture to the map, for good once this returns.
 
         Args:
             data: the picture's file.
             name: its name in the map.
-            axes: axes of its position; None where that is unknown, and EXIF data may say it.
-            position: where it was taken.
+            position: where it was taken; None where that is unknown, and EXIF data may say it.
 
         Returns:
             Its number, its name, its position, and how many images the map has now.
@@ -139,13 +137,13 @@ class MapService:
         """
         check_new_name(name)
         picture = await self._prepared(data, name)
-        by_exif = axes is None
+        by_exif = position is None
         if by_exif:
             loop = asyncio.get_running_loop()
             file = io.BytesIO(data)
-            position = await loop.run_in_executor(self._threads, exif_position, file)
-            axes = None if position is None else AXES[1]
-        work = Addition(picture, data, name, axes, position, by_exif)
+            said = await loop.run_in_executor(self._threads, exif_position, file)
+            position = said and Positions(AXES[1], {name: said})
+        work = Addition(picture, data, name, position, by_exif)
         number = await asyncio.wrap_future(self._worker.submit(work))
         places = self._worker.places
         return {

@@ -52,9 +52,8 @@ class Addition(NamedTuple):
     data: bytes
     """Its file."""
     name: str
-    axes: tuple[str, str] | None
-    """Axes of its position; None where that is unknown."""
-    position: tuple[float, float] | None
+    position: Positions | None
+    """Its position; None where that is unknown."""
     by_exif: bool = False
     """Whether the position is what EXIF data says, which a map in other axes leaves out."""
 
@@ -163,24 +162,30 @@ class MapWorker:
 
     def _append(self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]) -> None:
         """Append the additions of a batch together, without those that the map does not take."""
-        axes, names, rows = self.places.axes, set[str](), list[int]()
-        works: list[Addition] = []
+        axes, zone = self.places.axes, self.places.zone
+        names, rows, works = set[str](), list[int](), list[Addition]()
+        of: dict[str, tuple[float, float]] = {}
         for row, (work, result) in enumerate(batch):
             if not isinstance(work, Addition):
                 continue
-            if work.by_exif and axes and work.axes != axes:
-                work = work._replace(axes=None, position=None)
+            position = work.position
+            if work.by_exif and position and axes not in (None, position.axes):
+                position = None
+            try:
+                position = position and position.fitted("position", axes, zone)
+            except InputError as error:
+                result.set_exception(error)
+                continue
             if work.name in names or self.places.image(work.name) is not None:
                 found = f"name: found {work.name!r}, which the map has already, expected a new one"
                 result.set_exception(NameTakenError(found))
-            elif work.axes and axes and work.axes != axes:
-                found = f"position: found {', '.join(work.axes)}, expected {', '.join(axes)}"
-                result.set_exception(InputError(f"{found} as in the map"))
             elif _is_crossed(self.places.folder / ADDED, work.name, names):
                 found = f"name: found {work.name!r}, a folder or below a file of the map's"
                 result.set_exception(NameTakenError(f"{found}, expected a new name"))
             else:
-                axes = axes or work.axes
+                if position is not None:
+                    axes, zone = axes or position.axes, zone or position.zone
+                    of |= position.of
                 names.add(work.name)
                 rows.append(row)
                 works.append(work)
@@ -194,8 +199,7 @@ class MapWorker:
                 [len(work.data) for work in works],
                 descriptors[rows],
                 root=real_path(root).as_posix(),
-                positions=axes
-                and Positions(axes, {each.name: each.position for each in works if each.position}),
+                positions=axes and Positions(axes, of, zone),
             )
         for number, row in enumerate(rows, first):
             batch[row].result.set_result(number)

@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import stat
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -128,6 +129,27 @@ def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
         raise InputError(
             f"{path}: cannot be read: {error.strerror}, expected {expected}"
         ) from error
+
+
+def check_one_array(path: pathlib.Path) -> None:
+    """Check that a file is not an .npz archive, where one array is expected.
+
+    Raises:
+        InputError: it is one; the message says how to save an array of it.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
+            if file.read(2) != b"PK":
+                return  # a .npy file whose last bytes happen to look like an archive's
+            arrays = [name.removesuffix(".npy") for name in archive.namelist()]
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+        return  # whoever reads it says what it is
+    names = ", ".join(arrays[:8]) or "nothing"
+    first = arrays[0] if arrays else "arr_0"
+    raise InputError(
+        f"{path}: found an .npz archive of {names}, expected one array: "
+        f"numpy.save({path.stem + '.npy'!r}, numpy.load({path.name!r})[{first!r}]) writes it"
+    )
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:

@@ -339,7 +339,9 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
         "crisalad_jax.retrieval.maps.build.describe_alone", None
     )  # nothing is described
     made = index(shared, images, folder, "--positions", table)
-    fails(capfd, *made, words=("found positions in lat, lon, expected east, north as in the map",))
+    fails(
+        capfd, *made, words=("degrees of longitude from the middle of zone 10 south, whose metres",)
+    )
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The GSV-Cities reader on small trees, against the rows they were written from."""
 
 import csv
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -99,6 +100,15 @@ def test_chosen_cities_keep_their_order(two_cities):
     assert places.place_id.tolist() == [3, 7, 12, 100000, 100007, 100099]
 
 
+def test_a_city_that_was_not_downloaded(two_cities):
+    """Its table came with the others: the message says how to go on, and that works."""
+    shutil.rmtree(two_cities / "Images" / "A")
+    words = r"A\.csv: found no folder A in .*Images, .* the names of some as --cities: there are B$"
+    with pytest.raises(InputError, match=words):
+        read_places(two_cities)
+    assert read_places(two_cities, cities=["B"]).cities == ("B",)
+
+
 def test_ids_with_an_offset_name_files_without_it(tmp_path):
     write_city(tmp_path, "A", make_rows("A", 300042, 4))
     places = read_places(tmp_path)
@@ -155,7 +165,7 @@ def test_places_too_small(two_cities):
 @pytest.mark.parametrize(
     ("cities", "message"),
     [
-        (["A", "Paris"], "found Paris, expected some of A, B"),
+        (["A", "Paris"], r"cities \(--cities\): found Paris, expected some of .*: A, B"),
         (["A", "A"], "each named once"),
         ([], "at least one"),
     ],

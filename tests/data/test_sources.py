@@ -14,7 +14,7 @@ from crisalad_jax.data.exif import exif_position
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera
 from crisalad_jax.data.loader import image_batches
-from crisalad_jax.data.positions import read_positions
+from crisalad_jax.data.positions import Positions, read_positions
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time, list_frames
 from crisalad_jax.utils.errors import InputError
@@ -124,14 +124,15 @@ def test_a_table(root, tmp_path, text, axes, of):
     (tmp_path / "poses.csv").write_text(text, encoding="utf-8")
     source = open_source(tmp_path / "poses.csv")
     assert source.root == tmp_path
-    assert source.positions == (None if of is None else (axes, of))
+    assert source.positions == (None if of is None else Positions(axes, of))
     if of is not None:
         assert set(of) <= set(source.names)
 
 
 def test_a_table_of_positions_has_the_same_forms(tmp_path):
     (tmp_path / "p.csv").write_text("name;x;y\na.jpg;1,5;-2.25\n")
-    assert read_positions(tmp_path / "p.csv") == (("x", "y"), {"a.jpg": (1.5, -2.25)})
+    found = read_positions(tmp_path / "p.csv")
+    assert found == Positions(("x", "y"), {"a.jpg": (1.5, -2.25)})
 
 
 @pytest.mark.parametrize(
@@ -225,7 +226,8 @@ def test_a_frame_has_one_name_however_it_is_written(root, tmp_path):
     ):
         open_source(work / "list.txt")
     (work / "table.csv").write_text("name,x,y\nwalk.avi#t=0.15,1,2\n")
-    assert open_source(work / "table.csv").positions == (("x", "y"), {"walk.avi#t=0.200": (1, 2)})
+    named = Positions(("x", "y"), {"walk.avi#t=0.200": (1, 2)})
+    assert open_source(work / "table.csv").positions == named
     (work / "positions.csv").write_text("name,x,y\nwalk.avi#t=0.2,1,2\n")
     assert read_positions(work / "positions.csv").of == {"walk.avi#t=0.200": (1, 2)}
 

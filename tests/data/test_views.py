@@ -110,6 +110,12 @@ def test_a_city_has_one_zone_even_across_its_edge_and_across_180_degrees():
         assert views.east[1] - views.east[0] == pytest.approx(100, rel=2e-3)
 
 
+def test_a_city_as_wide_as_the_world_is_refused():
+    places = named(("000", "0.0", "-60.0"), ("000", "0.0", "100.0"))
+    with pytest.raises(InputError, match="found the images of city0 over 160 degrees of longitude"):
+        views_of(places)
+
+
 @pytest.mark.parametrize(
     ("file", "words"),
     [

@@ -23,9 +23,10 @@ class Benchmark:
     miss. None where the set has no ground truth at all."""
     rule: str
     """Rule that makes a database image positive, in words."""
-    database_positions: Float64[np.ndarray, "database 2"] | None = None
-    """East and north in metres, for maps; None where there are none, or only placeholders."""
-    query_positions: Float64[np.ndarray, "q 2"] | None = None
+    database_positions: Float64[np.ndarray, "database axis"] | None = None
+    """East and north in metres; of a set wider than one UTM zone points on the ellipsoid
+    (`metres.on_ellipsoid`). None where there are none, or only placeholders."""
+    query_positions: Float64[np.ndarray, "q axis"] | None = None
     radius: float = 25.0
     """Metres within which two positions show the same place."""
 

@@ -12,6 +12,7 @@ from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_split, list_part
 from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
 from crisalad_jax.data.benchmarks.tables_of_positions import positions_beside
+from crisalad_jax.data.names import matched
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 from crisalad_jax.utils.shapes import Int64
@@ -132,17 +133,21 @@ def _by_table(
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
     matches: dict[str, set[int]] = {}
     without: set[str] = set()
-    for line, query, match in _rows(table):
-        for side, name, numbers in (("query", query, queries), ("database", match, database)):
-            if name not in numbers and (name or side == "query"):
+    rows = list(_rows(table))
+    asked = matched((query for _, query, _ in rows), queries)
+    there = matched((match for _, _, match in rows), database)
+    for line, query, match in rows:
+        for side, name, names in (("query", query, asked), ("database", match, there)):
+            if name not in names and (name or side == "query"):
                 folder = "queries" if side == "query" else "database"
                 raise InputError(
                     f"{table}: line {line}: found {side} {name!r}, expected the path of an image "
                     f"below {table.parent / folder}"
                 )
+        query = asked[query]
         matches.setdefault(query, set())
         if match:
-            matches[query].add(database[match])
+            matches[query].add(database[there[match]])
         else:
             without.add(query)
         if query in without and matches[query]:

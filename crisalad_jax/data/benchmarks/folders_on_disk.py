@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Iterable, Sequence
 
 from crisalad_jax.data.images import list_images
+from crisalad_jax.data.names import Disk
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 
@@ -107,9 +108,10 @@ def find_image_root(
         roots = (beside, beside.absolute().parent)
     else:
         roots = (pathlib.Path(images),)
+    disk = Disk()
     candidates = [root / folder for root in roots for folder in folders]
     for candidate in candidates:
-        if (candidate / first).is_file():
+        if disk.find(candidate, first) is not None:
             return candidate
     raise InputError(
         f"{named_by}: found no image {first} in {', '.join(map(str, candidates))}; expected its "
@@ -120,23 +122,17 @@ def find_image_root(
 def find_images(
     named_by: pathlib.Path, root: pathlib.Path, names: Iterable[str]
 ) -> tuple[pathlib.Path, ...]:
-    """Return the paths of all images that a file names relative to `root`.
+    """Return the paths of all images that a file names relative to `root`; see `names.Disk`.
 
     Raises:
         InputError: some are missing; how many, and which is the first.
     """
-    paths = tuple(root / name for name in names)
-    # List each folder once: to stat thousands of files one by one is slow over a network.
-    there: dict[pathlib.Path, frozenset[str]] = {}
-    for folder in dict.fromkeys(path.parent for path in paths):
-        try:
-            there[folder] = frozenset(os.listdir(folder))
-        except OSError:
-            there[folder] = frozenset()
-    missing = [path for path in paths if path.name not in there[path.parent]]
+    disk, names = Disk(), list(names)
+    paths = [disk.find(root, name) for name in names]
+    missing = [root / name for name, path in zip(names, paths, strict=True) if path is None]
     if missing:
         raise InputError(
             f"{named_by}: found {len(missing)} of {len(paths)} images missing, expected all; the "
             f"first is {missing[0]}"
         )
-    return paths
+    return tuple(path for path in paths if path is not None)

@@ -24,7 +24,9 @@ def check_radius(radius: float) -> None:
 
 
 def within(
-    database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"], radius: float
+    database: Float64[np.ndarray, "images axis"],
+    queries: Float64[np.ndarray, "q axis"],
+    radius: float,
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
     """Find the database images at most `radius` away from each query, as ascending indices."""
     import scipy.spatial  # takes a fifth of a second, which reading images does not need

@@ -16,6 +16,7 @@ import numpy as np
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, listing, shown
 from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.data.metres import on_ellipsoid
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
 from crisalad_jax.utils.shapes import Float, Float64, Int64
@@ -88,11 +89,13 @@ class _Side(NamedTuple):
 
     images: tuple[pathlib.Path, ...]
     positions: Float64[np.ndarray, "images 2"]
+    degrees: Float64[np.ndarray, "images 2"]
+    """Latitude and longitude; 0 where nothing asks for them."""
     headings: Float64[np.ndarray, " images"]
 
     def only(self, chosen: Int64[np.ndarray, " _"]) -> "_Side":
         images = tuple(self.images[i] for i in chosen)
-        return _Side(images, self.positions[chosen], self.headings[chosen])
+        return _Side(images, self.positions[chosen], self.degrees[chosen], self.headings[chosen])
 
 
 def _read(
@@ -118,7 +121,7 @@ def _read(
     start = 0
     for folder in folders:
         there, asked = (
-            _read_side(folder / part, headings=turned, subtask=subtask)
+            _read_side(folder / part, degrees=len(folders) > 1, headings=turned, subtask=subtask)
             for part in ("database", "query")
         )
         near = within(there.positions, asked.positions, radius)
@@ -154,10 +157,17 @@ def _read(
         queries=tuple(path for side in queries for path in side.images),
         positives=tuple(positives),
         rule=f"{rule}; no panoramas",
-        database_positions=np.concatenate([side.positions for side in database]),
-        query_positions=np.concatenate([side.positions for side in queries]),
+        database_positions=_positions(database),
+        query_positions=_positions(queries),
         radius=radius,
     )
+
+
+def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:
+    """Return the metres of one city, or points of several, each of which has its own zone."""
+    if len(sides) == 1:
+        return sides[0].positions
+    return on_ellipsoid(*np.concatenate([side.degrees for side in sides]).T)
 
 
 def heading_difference(
@@ -189,9 +199,10 @@ def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
     return folders
 
 
-def _read_side(folder: pathlib.Path, *, headings: bool, subtask: bool) -> _Side:
+def _read_side(folder: pathlib.Path, *, degrees: bool, headings: bool, subtask: bool) -> _Side:
     """Read a folder's images that are no panoramas, in the order of the tables."""
-    raw = _read_table(folder / "raw.csv", ("key", "pano", *(["ca"] if headings else [])))
+    more = ("lat", "lon") * degrees + ("ca",) * headings
+    raw = _read_table(folder / "raw.csv", ("key", "pano", *more))
     columns = ("key", "easting", "northing")
     tables = {"postprocessed.csv": _read_table(folder / "postprocessed.csv", columns)}
     if subtask:
@@ -218,10 +229,15 @@ def _read_side(folder: pathlib.Path, *, headings: bool, subtask: bool) -> _Side:
         [_number(path, row, name, tables[path.name]) for name in ("easting", "northing")]
         for row, _ in chosen
     ]
+    places = [
+        [_number(folder / "raw.csv", row, name, raw) if degrees else 0.0 for name in ("lat", "lon")]
+        for row, _ in chosen
+    ]
     angles = [_number(folder / "raw.csv", row, "ca", raw) if headings else 0.0 for row, _ in chosen]
     return _Side(
         images=find_images(folder / "raw.csv", folder / "images", names),
         positions=np.array(positions),
+        degrees=np.array(places),
         headings=np.array(angles),
     )
 

@@ -20,6 +20,7 @@ from crisalad_jax.data.benchmarks.netvlad import read_netvlad
 from crisalad_jax.data.benchmarks.salad_lists import has_lists, is_list, read_salad_lists
 from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_one_array
 
 
 class Layout(NamedTuple):
@@ -32,7 +33,9 @@ class Layout(NamedTuple):
 
 
 LAYOUTS = {
-    "utm": Layout("a folder of @UTM names", read_utm, ("split", "radius", "queries")),
+    "utm": Layout(
+        "a folder of @UTM names", read_utm, ("split", "radius", "queries", "ignore_zones")
+    ),
     "vpr-bench": Layout("a VPR-Bench folder", vpr_bench.read_vpr_bench),
     "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images")),
     "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images")),
@@ -54,6 +57,7 @@ def open_benchmark(
     max_heading_difference: float | None = None,
     frames: int | None = None,
     queries: str | None = None,
+    ignore_zones: bool = False,
     layout: str | None = None,
 ) -> Benchmark:
     """Read an evaluation set of the given `layout`, or of the layout that its files show.
@@ -70,6 +74,7 @@ def open_benchmark(
         max_heading_difference: largest difference of headings of a positive in degrees.
         frames: largest number of frames between a query and a positive.
         queries: the folder of the queries, where there are several.
+        ignore_zones: whether @UTM numbers of all zones are compared as if of one plane.
         layout: one of `LAYOUTS`; `msls-subtask` is never found from the files.
 
     Returns:
@@ -97,6 +102,7 @@ def open_benchmark(
         "max_heading_difference": max_heading_difference,
         "frames": frames,
         "queries": queries,
+        "ignore_zones": ignore_zones or None,
     }
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():
@@ -115,6 +121,7 @@ def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> 
             return "netvlad"
         if is_list(root):
             return "salad"
+        check_one_array(root)
         raise InputError(
             f"{root}: found a file, expected a folder, a .mat file of NetVLAD or a list of SALAD "
             "that ends in dbImages.npy"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_bytes
+from crisalad_jax.utils.files import check_one_array, read_bytes
 
 _KINDS = re.compile(r"[?biufcSUO]\d{0,5}")
 _LARGEST_ITEM = 2**16
@@ -47,6 +47,8 @@ def read_npy(path: pathlib.Path) -> np.ndarray:
     Raises:
         InputError: the file is missing, damaged, or holds anything else.
     """
+    archive = path.with_suffix(".npz")
+    check_one_array(archive if archive.exists() and not path.exists() else path)
     data = read_bytes(path, "a .npy file")
     try:
         return _load(data)

@@ -5,27 +5,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crisalad_jax.data.metres import continuous, to_metres
+from crisalad_jax.data.metres import comparable
+from crisalad_jax.data.names import matched
 from crisalad_jax.data.positions import AXES, read_positions
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64
 
 BOTH = "positions.csv"
 SIDES = ("database", "queries")
-_WIDEST = 30.0
-"""Degrees of longitude from the median, farther than which one zone's metres are no distances."""
 
-Metres = Float64[np.ndarray, "images 2"]
+Metres = Float64[np.ndarray, "images axis"]
 
 
 def positions_beside(
     folder: pathlib.Path, database: Sequence[pathlib.Path], queries: Sequence[pathlib.Path]
 ) -> tuple[Metres, Metres] | tuple[None, None]:
-    """Read where the images of two folders were taken, in metres east and north.
+    """Read where the images of two folders were taken, as points whose distances are metres.
 
     `positions.csv` names images by their path in `folder`, as `database/1.jpg`. Or `database.csv`
     and `queries.csv` name them by their path in these folders. The columns are `name,east,north`
-    or `name,lat,lon`; degrees are projected to UTM, all to one zone.
+    or `name,lat,lon`; degrees are projected to UTM if all are of one zone, else they become points
+    on the ellipsoid (`metres.comparable`).
 
     Args:
         folder: the folder that holds `database/`, `queries/` and the tables.
@@ -37,8 +37,7 @@ def positions_beside(
 
     Raises:
         InputError: one side's table without the other's, or both kinds; tables of metres and of
-            degrees; an image without a position; positions too far apart for one zone; or what
-            `read_positions` raises.
+            degrees; an image without a position; or what `read_positions` raises.
     """
     both, sides = folder / BOTH, [folder / f"{side}.csv" for side in SIDES]
     there = [table for table in (both, *sides) if table.exists()]
@@ -57,31 +56,18 @@ def positions_beside(
         positions = read_positions(table)
         axes.add(positions.axes)
         names = ["/".join(image.parts[len(root.parts) :]) for image in images]
-        missing = [name for name in names if name not in positions.of]
+        lines = matched(names, positions.of)
+        missing = [name for name in names if name not in lines]
         if missing:
             raise InputError(
                 f"{table}: found {len(missing)} of {len(names)} images of {side} without a line, "
                 f"expected all; the first is {missing[0]}"
             )
-        found.append(np.array([positions.of[name] for name in names], np.float64))
+        found.append(np.array([positions.of[lines[name]] for name in names], np.float64))
     if len(axes) > 1:
         raise InputError(
             f"{there[0]}: found lat,lon in one table and east,north in the other, expected the same"
         )
     if axes == {AXES[1]}:
-        found = _projected(there[0], found)
+        found = np.split(comparable(*np.concatenate(found).T), [len(found[0])])
     return found[0], found[1]
-
-
-def _projected(table: pathlib.Path, sides: list[Metres]) -> list[Metres]:
-    """Project both sides' degrees to metres of one zone."""
-    latitude, longitude = np.concatenate(sides).T
-    longitude = continuous(longitude)
-    far = np.abs(longitude - np.median(longitude)).max()
-    if far > _WIDEST:
-        raise InputError(
-            f"{table}: found longitudes {far:.0f} degrees from the median, expected one region: "
-            f"at most {_WIDEST:g} degrees"
-        )
-    metres = np.stack(to_metres(latitude, longitude), axis=1)
-    return np.split(metres, [len(sides[0])])

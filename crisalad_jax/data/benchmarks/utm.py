@@ -7,6 +7,7 @@ panorama, tile, heading, pitch, roll, height, time, note, suffix. Unused fields 
 import os
 import pathlib
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,9 +21,10 @@ from crisalad_jax.data.benchmarks.folders_on_disk import (
 )
 from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.positions import utm_position
+from crisalad_jax.data.metres import Zone, on_ellipsoid
+from crisalad_jax.data.positions import utm_degrees, utm_position, utm_zones
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.shapes import Float64
+from crisalad_jax.utils.shapes import Float64, Int64
 
 QUERIES = "queries"
 """Default folder of the queries."""
@@ -45,8 +47,12 @@ def read_utm(
     radius: float = DEFAULT_RADIUS,
     *,
     queries: str = QUERIES,
+    ignore_zones: bool = False,
 ) -> Benchmark:
-    """Read `@UTM_east@UTM_north@...` images; a positive is at most `radius` metres away.
+    """Read `@UTM_east@UTM_north@zone@letter@...` images; a positive is at most `radius` m away.
+
+    Distances are those of east and north between images of one zone and hemisphere, and those on
+    the ground between others.
 
     VPR-datasets-downloader writes placeholder coordinates for Nordland (easting 0, frames
     25 / 10.5 m apart), SPED and AmsterTime (easting 0, places 1 km apart). The benchmark's name
@@ -59,10 +65,12 @@ def read_utm(
         radius: in metres, inclusive.
         queries: the folder of the queries: SVOX has `queries_night` and others beside `queries`.
             The benchmark's name says which, unless it is `queries`.
+        ignore_zones: whether the numbers of all zones are compared as if of one plane, as the
+            public tools do. The name of a benchmark with several zones then says so.
 
     Raises:
-        InputError: no such split or folder, a folder without images, a name without coordinates, a
-            negative radius.
+        InputError: no such split or folder, a folder without images, a name without coordinates,
+            or without a zone where others are of several, a negative radius.
     """
     root = pathlib.Path(root)
     check_radius(radius)
@@ -87,7 +95,6 @@ def read_utm(
             f"northings of {metres:.4g} m a frame",
         )
 
-    positives = within(places, asked, radius)
     if radius < _PLACE_METRES and _are_placeholders(places, asked):
         known = _PAIRED.get(len(database)) if len(database) == len(asking) else None
         return Benchmark(
@@ -96,21 +103,61 @@ def read_utm(
             root=root,
             database=database,
             queries=asking,
-            positives=positives,
+            positives=within(places, asked, radius),
             rule="the same place; by eastings of 0 and northings of whole kilometres the "
             "coordinates are placeholders"
             + (f", and by {len(database)} places it is {known}" if known else ""),
         )
 
     rule = f"UTM distance of at most {radius:g} m"
+    paths = [str(path) for path in (*database, *asking)]
+    zones = [] if ignore_zones else utm_zones(paths)
+    if len(set(zones)) > 1:
+        positives, places, asked = _across_zones(paths, zones, places, asked, radius)
+        rule += f"; between zones {shown(set(map(str, zones)))} the distance on the ground"
+    else:
+        positives = within(places, asked, radius)
+    ending = f"{radius:g} m{', zones ignored' * ignore_zones}"
     cities = _msls_cities(database + asking)
     if cities is None:
-        name = f"{name}{which} (@UTM, {radius:g} m)"
+        name = f"{name}{which} (@UTM, {ending})"
     else:
         title = f"{msls_title(cities)}{which}, downloader style"
-        name = f"{title}, {len(asking)} queries, {radius:g} m"
+        name = f"{title}, {len(asking)} queries, {ending}"
         rule += f"; by the notes in the names it is MSLS of {', '.join(sorted(cities))}"
     return Benchmark(name, root, database, asking, positives, rule, places, asked, radius)
+
+
+def _across_zones(
+    names: Sequence[str],
+    zones: Sequence[Zone | None],
+    places: Float64[np.ndarray, "images 2"],
+    asked: Float64[np.ndarray, "q 2"],
+    radius: float,
+) -> tuple[
+    tuple[Int64[np.ndarray, " _"], ...],
+    Float64[np.ndarray, "images 3"],
+    Float64[np.ndarray, "q 3"],
+]:
+    """Find the positives of a set of several zones, and both sides' points on the ellipsoid.
+
+    Images of one zone match by its metres, so that published sets such as MSLS, with a city a
+    zone, have the positives that other tools find.
+    """
+    degrees = utm_degrees(names, zones, np.concatenate([places, asked]))
+    there, here = np.split(on_ellipsoid(*degrees.T), [len(places)])
+    numbers = {zone: number for number, zone in enumerate(dict.fromkeys(zones))}
+    of_each = np.array([numbers[zone] for zone in zones])
+    of_places, of_asked = np.split(of_each, [len(places)])
+    positives = [
+        near[of_places[near] != zone]
+        for near, zone in zip(within(there, here, radius), of_asked, strict=True)
+    ]
+    for zone in numbers.values():
+        of, by = np.flatnonzero(of_places == zone), np.flatnonzero(of_asked == zone)
+        for query, near in zip(by, within(places[of], asked[by], radius), strict=True):
+            positives[query] = np.sort(np.concatenate([positives[query], of[near]]))
+    return tuple(positives), there, here
 
 
 def has_utm_names(folder: pathlib.Path, queries: str = QUERIES) -> bool:

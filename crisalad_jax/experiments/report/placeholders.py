@@ -19,7 +19,9 @@ class Placed(NamedTuple):
     """Metres from the centre beyond which an image is out of place."""
 
 
-def find_placed(database: Float[np.ndarray, "n 2"], queries: Float[np.ndarray, "q 2"]) -> Placed:
+def find_placed(
+    database: Float[np.ndarray, "n axis"], queries: Float[np.ndarray, "q axis"]
+) -> Placed:
     """Tell images with a likely position from those with a placeholder.
 
     An image is out of place if it lies ten times farther from the median position than nine tenths
@@ -32,7 +34,7 @@ def find_placed(database: Float[np.ndarray, "n 2"], queries: Float[np.ndarray, "
     trusted = points[~(many | (points == 0).all(axis=1))]
     trusted = trusted if len(trusted) else points
     centre = np.median(trusted, axis=0)
-    reach = np.quantile(np.hypot(*(trusted - centre).T), 0.9)
+    reach = np.quantile(np.linalg.norm(trusted - centre, axis=1), 0.9)
     limit = max(_TIMES * float(reach), _LEAST)
-    placed = np.hypot(*(points - centre).T) <= limit
+    placed = np.linalg.norm(points - centre, axis=1) <= limit
     return Placed(placed[: len(database)], placed[len(database) :], limit)

@@ -1,5 +1,6 @@
 """The sections of a page: words and pictures, which are written as files and embedded."""
 
+import math
 import pathlib
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -9,6 +10,7 @@ from jaxtyping import Float
 
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.metres import flattened
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report.curves import PrecisionCurve, precision_curves, recall_curves
 from crisalad_jax.experiments.report.embedding import Drawing, drawing, webp
@@ -59,8 +61,7 @@ class Subject(NamedTuple):
             return None
         if not (self.placed.queries[query] and self.placed.database[index]):
             return None
-        change = asked[query] - places[index]
-        return float(np.hypot(*change))
+        return math.dist(asked[query], places[index])
 
 
 class Photograph(NamedTuple):
@@ -211,6 +212,7 @@ def positions_map(subject: Subject) -> PositionsMap | None:
     placed = subject.placed
     if places is None or asked is None or placed is None:
         return None
+    places, asked = np.split(flattened(np.concatenate([places, asked])), [len(places)])
     path = subject.out / "positions.png"
     verdicts, first = subject.verdicts, subject.neighbours.indices[:, 0]
     position_map(path, places, asked, first, verdicts.right, verdicts.matched, placed)

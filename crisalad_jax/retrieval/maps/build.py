@@ -13,7 +13,8 @@ from crisalad_jax.config.checks import choose
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.positions import Positions, read_positions, utm_positions
+from crisalad_jax.data.names import matched
+from crisalad_jax.data.positions import AXES, Positions, read_positions, utm_positions
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig
@@ -97,7 +98,7 @@ def index_images(
     config = target.description.config
     names, sizes, new = _new_images(target, root, paths)
     listed = {path.relative_to(root).as_posix() for path in paths}
-    target.axes_of(names, positions)  # checks them before any work
+    target.fitted(names, positions)  # checks them before any work
     stay = sum(target.image(name) is not None for name in positions.of)
     waiting: list[Described] = []
     unreadable: list[str] = []
@@ -207,7 +208,8 @@ def index(
             map's way, and of a new map the model's.
         compute_dtype: type of the matrix products. None is the map's, and of a new map the model's.
         positions: where images were taken, or a table of it. None is what `images` says, if that
-            is a table; else what @UTM names say; else what the EXIF data of JPEGs says.
+            is a table; else what @UTM names say; else what the EXIF data of JPEGs says. Names of
+            several zones of UTM give degrees, or metres of the map's zone.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
         dtype: what files keep descriptors as. None is the map's, and of a new map "float32".
         pca: components that shorten the descriptors, or a file of them, of which the map keeps a
@@ -253,6 +255,8 @@ def index(
     table = source.positions if positions is None else positions
     known = _positions(table, images, source.names)
     by_exif = table is None and not known.of
+    if table is None and known.axes == AXES[1] and description is None:
+        tell(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
     batch_size = useful_batch_size(batch_size, len(source.paths))
     if description is None:
@@ -336,7 +340,7 @@ def _index_share(
     unmatched = [name for name in positions.of if name not in names]
     if has_images(shared.out):
         with Map.open(shared.out, verify=False, calibrated=False) as whole:
-            whole.axes_of(names, positions)
+            whole.fitted(names, positions)
             new = _new_images(whole, images, mine)[2]
             there = len(paths) - len(_new_images(whole, images, paths)[2])
             stay = sum(whole.image(name) is not None for name in positions.of)
@@ -394,6 +398,9 @@ def _positions(
     if given is None:
         return utm_positions(names)
     positions = given if isinstance(given, Positions) else read_positions(given)
+    meant = matched(positions.of, frozenset(names))
+    of = {meant.get(name, name): position for name, position in positions.of.items()}
+    positions = positions._replace(of=of)
     if positions.of.keys().isdisjoint(names):
         source = "positions" if isinstance(given, Positions) else given
         raise InputError(

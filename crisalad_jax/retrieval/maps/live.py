@@ -133,6 +133,7 @@ def query_live(
                 (),
                 least,
                 *filtered,
+                zone=places.zone,
             )
             latency = time.perf_counter() - frame.taken
             yield LiveAnswer(found, frame.time, 1000 * latency)

@@ -22,6 +22,7 @@ from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.chunks import check_rows
@@ -124,6 +125,8 @@ class Map:
         self._numbers: dict[str, int] = {}
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
+        self.zone: Zone | None = None
+        """Zone of UTM of all positions in metres east and north; None where it is unknown."""
         self._store = store
         self._close = weakref.finalize(self, store.close)
         self.calibration: Calibration | None = None
@@ -275,17 +278,19 @@ class Map:
             added = record.get("added")  # older records have none
             if not isinstance(added, str | None):
                 raise ValueError(f"found added {added!r}, expected a time")
+            zone = record.get("zone") and Zone(int(record["zone"][0]), bool(record["zone"][1]))
             segment = _Segment(len(self), len(images), str(record["sha256"]))
             if not images:
                 raise ValueError("no images")
         except (ValueError, LookupError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: not a whole record of images: {error!r}") from error
-        self._take(images, axes, segment, added)
+        self._take(images, axes, zone, segment, added)
 
     def _take(
         self,
         images: list[MapImage],
         axes: tuple[str, str] | None,
+        zone: Zone | None,
         segment: _Segment,
         added: str | None,
     ) -> None:
@@ -293,6 +298,7 @@ class Map:
         self._numbers |= {image.name: segment.first + i for i, image in enumerate(images)}
         self.images += images
         self.axes = self.axes or axes
+        self.zone = self.zone or zone
         self._segments.append(segment)
 
     def search(
@@ -436,20 +442,16 @@ class Map:
             )
         check_rows(descriptors, name, range(len(descriptors)), unit=True)
 
-    def axes_of(self, names: Iterable[str], positions: Positions | None) -> tuple[str, str] | None:
-        """Return the axes of the positions of new images; None where none of them has one.
+    def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
+        """Return the positions of new images in the map's axes; None where none of them has one.
 
         Raises:
-            InputError: the map's positions are in other axes.
+            InputError: they have no place there, see `Positions.fitted`.
         """
-        if positions is None or positions.of.keys().isdisjoint(names):
+        if positions is None:
             return None
-        if self.axes and positions.axes != self.axes:
-            raise InputError(
-                f"{self.folder}: found positions in {', '.join(positions.axes)}, expected "
-                f"{', '.join(self.axes)} as in the map"
-            )
-        return positions.axes
+        of = {name: positions.of[name] for name in names if name in positions.of}
+        return positions._replace(of=of).fitted(self.folder, self.axes, self.zone) if of else None
 
     def append(
         self,
@@ -467,11 +469,12 @@ class Map:
             sizes: of their files, in bytes.
             descriptors: unit vectors; kept as the map's type.
             root: the folder of these images.
-            positions: where they were taken, as far as that is known.
+            positions: where they were taken, as far as that is known; those of another zone of UTM
+                become the map's.
 
         Raises:
             InputError: a name that is there already or twice, descriptors that are no unit vectors,
-                positions in other axes than the map's, or a store that cannot be written to.
+                positions that have no place among the map's, or a store that cannot be written to.
         """
         self._check_descriptors("descriptors", descriptors)
         if twice := len(names) - len(set(names) - self._numbers.keys()):
@@ -479,12 +482,12 @@ class Map:
                 f"{self.folder}: found {twice} of {len(names)} names twice, or in the map already, "
                 "expected new ones"
             )
-        known = positions.of if positions else {}
+        positions = self.fitted(names, positions)
+        axes, known, zone = positions or (None, {}, None)
         images = [
             MapImage(name, size, known.get(name), root)
             for name, size in zip(names, sizes, strict=True)
         ]
-        axes = self.axes_of(names, positions)
         rows = np.ascontiguousarray(descriptors, self.head.dtype)
         segment = _Segment(len(self), len(images), hashlib.sha256(rows.data).hexdigest())
         self._store.add(segment.first, rows)
@@ -492,13 +495,14 @@ class Map:
             "root": root,
             "added": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "axes": axes,
+            "zone": zone,
             "sha256": segment.sha256,
             "names": list(names),
             "bytes": list(sizes),
             "positions": [image.position for image in images],
         }
         write_record(self._record(segment.first), record)
-        self._take(images, axes, segment, record["added"])
+        self._take(images, axes, zone, segment, record["added"])
 
     @property
     def descriptors(self) -> Iterator[Float[np.ndarray, "n d"]]:
@@ -541,6 +545,7 @@ class Map:
             "positions": sum(image.position is not None for image in self.images),
             "axes": self.axes,
             **contents(self),
+            "zone": self.zone and str(self.zone),
             "descriptor": f"{description.descriptor_length} numbers, {description.dtype}",
             "image_size": list(description.config.image_size),
             "resize": description.config.images_in_words,

@@ -12,6 +12,7 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.retrieval.by_engine import describe_by_engine
@@ -55,6 +56,8 @@ class Answers(NamedTuple):
     best: Float32[np.ndarray, " query"] | None = None
     """Similarity of the most similar image of the map, where a filter may have chosen another; None
     without a filter, where it is the first answer's."""
+    zone: Zone | None = None
+    """Zone of UTM of all positions; None where it is unknown."""
 
     @property
     def known(self) -> Bool[np.ndarray, " query"]:
@@ -180,7 +183,14 @@ def query(
     lost = set(unreadable)
     readable = [path for path in paths if path not in lost]
     return Answers(
-        readable, neighbours, places.images, places.axes, unreadable, min_similarity, *filtered
+        readable,
+        neighbours,
+        places.images,
+        places.axes,
+        unreadable,
+        min_similarity,
+        *filtered,
+        zone=places.zone,
     )
 
 

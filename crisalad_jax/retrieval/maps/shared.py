@@ -147,7 +147,7 @@ class SharedMap(NamedTuple):
                             i for i, one in enumerate(images_there) if not target.image(one.name)
                         ]
                         if new:
-                            _add(target, [images_there[i] for i in new], rows[new], part.axes)
+                            _add(target, [images_there[i] for i in new], rows[new], part)
                 shutil.rmtree(folder)
 
 
@@ -164,14 +164,12 @@ def _additions(part: Map) -> Iterator[tuple[Sequence[MapImage], np.ndarray]]:
             start = end
 
 
-def _add(
-    target: Map, images: Sequence[MapImage], rows: np.ndarray, axes: tuple[str, str] | None
-) -> None:
+def _add(target: Map, images: Sequence[MapImage], rows: np.ndarray, part: Map) -> None:
     of = {image.name: image.position for image in images if image.position is not None}
     target.append(
         [image.name for image in images],
         [image.bytes for image in images],
         rows,
         root=images[0].root,
-        positions=None if axes is None else Positions(axes=axes, of=of),
+        positions=None if part.axes is None else Positions(part.axes, of, part.zone),
     )

@@ -138,6 +138,7 @@ OPTIONS = {
     "max_heading_difference": 40.0,
     "frames": 2,
     "queries": "queries_night",
+    "ignore_zones": True,
 }
 
 

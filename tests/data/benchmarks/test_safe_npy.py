@@ -14,7 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.benchmarks.safe_npy import read_npy, unpickle
+from crisalad_jax.retrieval.descriptor_files import open_npy, read_descriptors
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import ragged
 
@@ -363,3 +365,28 @@ def test_damaged_files(tmp_path, damage):
     with pytest.raises(InputError, match=rf"a\.npy: {words}") as caught:
         read_npy(path)
     assert "\n" not in str(caught.value)
+
+
+def test_an_archive_of_arrays_is_told(tmp_path):
+    """Under its own suffix, another one, or in place of the file that is read."""
+    array = np.arange(3)
+    np.savez(tmp_path / "gt.npz", matches=array, other=array)
+    words = (
+        r"gt\.npz: found an \.npz archive of matches, other, expected one array: "
+        r"numpy\.save\('gt\.npy', numpy\.load\('gt\.npz'\)\['matches'\]\) writes it"
+    )
+    for path in (tmp_path / "gt.npz", tmp_path / "gt.npy"):
+        with pytest.raises(InputError, match=words):
+            read_npy(path)
+    with pytest.raises(InputError, match=words):
+        open_benchmark(tmp_path / "gt.npz")
+    with pytest.raises(InputError, match=words):
+        read_descriptors(tmp_path / "gt.npz")
+    with pytest.raises(InputError, match=words):
+        open_npy(tmp_path / "gt.npz")
+    (tmp_path / "gt.npz").rename(tmp_path / "gt.npy")
+    with pytest.raises(InputError, match=r"gt\.npy: found an \.npz archive of matches, other"):
+        read_npy(tmp_path / "gt.npy")
+    # What the message says works.
+    np.save(tmp_path / "one.npy", np.load(tmp_path / "gt.npy")["matches"])
+    assert read_npy(tmp_path / "one.npy").tolist() == [0, 1, 2]

@@ -13,6 +13,7 @@ import sys
 
 import numpy as np
 import pymilvus
+import pyproj
 import pytest
 
 import crisalad_jax.retrieval.maps.map
@@ -548,6 +549,52 @@ def test_positions_of_a_map_are_of_one_kind(folder):
                     target.append(names(8, 1), [7], rows(8, 1), root="/", positions=where)
             else:
                 target.append(names(7, 1), [7], rows(7, 1), root="/", positions=where)
+
+
+FIRST = "@0499000.00@5411000.00@32@U@@@@@@@@@@@.jpg"
+NEXT = "@0939500.00@5420600.00@31@U@@@@@@@@@@@.jpg"
+
+
+def test_a_map_has_metres_of_one_zone(folder):
+    """Images of a neighbouring zone get the numbers that pyproj gives them in the map's."""
+    into = pyproj.Transformer.from_crs("EPSG:32631", "EPSG:32632", always_xy=True)
+    with open_for_appending(folder, description("files")) as target:
+        target.append([FIRST], [7], rows(7, 1), root="/", positions=utm_positions([FIRST]))
+        target.append([NEXT], [7], rows(8, 1), root="/", positions=utm_positions([NEXT]))
+        degrees = Positions(("lat", "lon"), {"a.jpg": (48.85, 9.0)})
+        target.append(["a.jpg"], [7], rows(9, 1), root="/", positions=degrees)
+        far = FIRST.replace("@32@", "@10@")
+        with pytest.raises(
+            InputError, match=r"132 degrees of longitude .* of zone 32 north, whose"
+        ):
+            target.append([far], [7], rows(10, 1), root="/", positions=utm_positions([far]))
+    with Map.open(folder) as places:
+        first, second, third = (image.position for image in places.images[-3:])
+        assert (places.axes, places.zone) == (("east", "north"), (32, False))
+        assert places.summary()["zone"] == "32 north"
+    assert first == (499000.0, 5411000.0)
+    # Rounded to a tenth of a millimetre; the series is as exact.
+    np.testing.assert_allclose(second, into.transform(939500, 5420600), atol=3e-4)
+    degrees = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
+    np.testing.assert_allclose(third, degrees.transform(9.0, 48.85), atol=3e-4)
+
+
+def test_names_of_several_zones_make_a_map_of_degrees(folder):
+    south = "@0500000.00@9999990.00@32@M@@@@@@@@@@@.jpg"
+    north = south.replace("@9999990.00@32@M@", "@0000010.00@32@N@")
+    both = utm_positions([south, north, "plain.jpg"])
+    assert both.axes == ("lat", "lon")
+    # Ten metres of the plane are 10.004 m on the ground, of 110,574 m a degree.
+    assert both.of[north] == (pytest.approx(10.004 / 110_574, abs=1e-9), 9.0)
+    assert both.of[south] == (pytest.approx(-10.004 / 110_574, abs=1e-9), 9.0)
+    with open_for_appending(folder, description("files")) as target:
+        target.append([south, north], [7, 7], rows(7, 2), root="/", positions=both)
+        target.append([FIRST], [7], rows(9, 1), root="/", positions=utm_positions([FIRST]))
+        back = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4326")
+        # Rounded to 1e-9 degrees.
+        expected = back.transform(499000, 5411000)
+        np.testing.assert_allclose(target.images[-1].position, expected, atol=2e-9)
+        assert (target.axes, target.zone) == (("lat", "lon"), None)
 
 
 @pytest.mark.parametrize(
