@@ -506,7 +506,7 @@ def test_files_that_need_a_part_that_is_not_there_name_its_plug_in(
         read_config(cj.TrainConfig, run)
     # As one writes it by hand: nobody knows which plug-in.
     with pytest.raises(InputError, match=r"is a plug-in missing.*FILE\.py or MODULE"):
-        SinkhornConfig(step="momentum")  # type: ignore
+        SinkhornConfig(step="momentum")
 
 
 @pytest.mark.parametrize(

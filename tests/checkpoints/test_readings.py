@@ -64,12 +64,12 @@ class Lightning(nn.Module):
 
 WRAPPED = {
     "compiled": lambda net: torch.compile(net),
-    "compiled, parallel": lambda net: nn.DataParallel(torch.compile(net)),  # type: ignore
+    "compiled, parallel": lambda net: nn.DataParallel(torch.compile(net)),
     "parallel, compiled": lambda net: torch.compile(nn.DataParallel(net)),
     "Lightning": Lightning,
-    "compiled in Lightning": lambda net: Lightning(torch.compile(net)),  # type: ignore
+    "compiled in Lightning": lambda net: Lightning(torch.compile(net)),
     "all of it twice": lambda net: torch.compile(
-        nn.DataParallel(Lightning(torch.compile(nn.DataParallel(Lightning(net)))))  # type: ignore
+        nn.DataParallel(Lightning(torch.compile(nn.DataParallel(Lightning(net)))))
     ),
 }
 
@@ -140,7 +140,7 @@ class Config:
         self._flags = None
 
 
-class Beside(dict):  # type: ignore[type-arg]
+class Beside(dict):
     """As EasyDict, CfgNode and AttributeDict: a dictionary with attributes."""
 
     def __init__(self) -> None:
@@ -169,7 +169,7 @@ def test_objects_with_the_weights_are_not_made(tmp_path: pathlib.Path, kind: str
 def test_weights_in_a_defaultdict_are_weights(tmp_path: pathlib.Path) -> None:
     state = network().state_dict()
     plain = read_quietly(save(tmp_path / "plain.pth", state))
-    found = read_quietly(save(tmp_path / "d.pth", collections.defaultdict(list, state)))  # type: ignore
+    found = read_quietly(save(tmp_path / "d.pth", collections.defaultdict(list, state)))
     assert_equal(found.params, plain.params)
 
 
@@ -195,7 +195,7 @@ HOW = r"torch\.save\(model\.state_dict\(\), FILE\) writes a file of the weights 
 @pytest.mark.parametrize("under", [None, "model"])
 def test_a_whole_module_is_named_with_what_to_do(tmp_path: pathlib.Path, under: str | None) -> None:
     net = network()
-    path = save(tmp_path / "whole.pth", net if under is None else {under: net})  # type: ignore
+    path = save(tmp_path / "whole.pth", net if under is None else {under: net})
     with pytest.raises(InputError, match=rf"found parity\.reference\.vit\.ViT, expected .*{HOW}$"):
         read_checkpoint(path)
 

@@ -255,7 +255,7 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
 def test_settings_of_a_file_that_are_none_are_refused(tmp_path: pathlib.Path) -> None:
     state = collections.OrderedDict(random_state(SMALL["dinov2"]))
     for text, words in (("[", "found no configuration"), ('{"image_size": 3}', "found 3, expect")):
-        state._metadata = {"crisalad-jax config": text}  # type: ignore
+        state._metadata = {"crisalad-jax config": text}
         with pytest.raises(InputError, match=rf"^{tmp_path}/x\.pth.*{words}"):
             read_checkpoint(save(tmp_path / "x.pth", state))
 
