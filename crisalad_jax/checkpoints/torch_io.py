@@ -259,7 +259,7 @@ def _read_torch(path: pathlib.Path) -> Any:
         raise InputError(f"{path}: not a whole torch checkpoint: {reason}") from error
 
     def arrays(value: Any, name: object) -> Any:
-        if isinstance(value, Mapping):
+        if isinstance(value, dict):
             made = _Dictionary((key, arrays(item, key)) for key, item in dict.items(value))
             attributes = getattr(value, "__dict__", {})
             made.stands_for = attributes.get("stands_for")
