@@ -5,6 +5,7 @@ import importlib.machinery
 import json
 import pathlib
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -19,15 +20,17 @@ import pytest
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config import plugins, source
+from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.losses import LossConfig, metric_loss
 from crisalad_jax.nn.model import describe
 from crisalad_jax.sinkhorn import SinkhornConfig, solve
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
 from tests.cli.test_cli import Capture, fails, succeeds
-from tests.conftest import BATCH, MODEL, random_params, write_city, write_town
+from tests.conftest import BATCH, MODEL, RECIPE, random_params, write_city, write_town
 
 ROOT = pathlib.Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -477,21 +480,51 @@ def test_a_function_that_makes_no_tokens_is_named(returned: Any, words: str) -> 
         cj.ModelConfig(aggregator="wrong-tokens").descriptor_dim  # noqa: B018
 
 
-def test_weights_that_need_a_part_that_is_not_there(
+def test_files_that_need_a_part_that_is_not_there_name_its_plug_in(
     tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, monkeypatch
 ) -> None:
     weights, steps = tmp_path / "w.safetensors", REGISTRIES["step"]
     built_in = dict(steps._parts)
     load_plugin(str(EXAMPLES / "plugins" / "momentum.py"))
     save_with_step(weights, "momentum")
+    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
+    succeeds(capfd, "index", "--images", images, "--weights", weights, "--out", out, "--quiet")
+    run = tmp_path / "config.json"
+    config = dataclasses.replace(RECIPE, model=load_weights(weights)[1])
+    write_json(run, to_plain(config))
     monkeypatch.setattr(steps, "_parts", built_in)
+    words = "step: found 'momentum', expected one of dual-softmax, newton, "
+    hint = "(the plug-in momentum.py had it: --plugin momentum.py, or load_plugin)"
     with pytest.raises(InputError) as error:
         load_weights(weights)
-    words = f"{weights} (metadata): step: found 'momentum', expected one of dual-softmax, newton, "
-    assert str(error.value).startswith(words)
-    assert "is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin" in str(error.value)
+    assert str(error.value).startswith(f"{weights} (metadata): {words}")
+    assert hint in str(error.value)
     data = ("evaluate", "--data", shared / "town", "--weights", weights)
-    fails(capfd, *data, words=(words, "is a plug-in missing?"))
+    fails(capfd, *data, words=(words, hint))
+    fails(capfd, "query", next(images.iterdir()), "--map", out, words=(words, hint))
+    with pytest.raises(InputError, match=re.escape(hint)):
+        read_config(cj.TrainConfig, run)
+    # As one writes it by hand: nobody knows which plug-in.
+    with pytest.raises(InputError, match=r"is a plug-in missing.*FILE\.py or MODULE"):
+        SinkhornConfig(step="momentum")
+
+
+@pytest.mark.parametrize(
+    ("module", "home"),
+    [
+        ("crisalad_jax.transport.steps", None),
+        ("vpr_parts.gem", "vpr_parts.gem"),
+        ("__main__", "train_mine.py"),
+    ],
+)
+def test_where_a_part_is_from(module: str, home: str | None, monkeypatch) -> None:
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", "/some/where/train_mine.py")
+    assert plugins.home_of(module) == home
+
+
+def test_of_a_notebook_nothing_is_recorded(monkeypatch) -> None:
+    monkeypatch.delattr(sys.modules["__main__"], "__file__")
+    assert plugins.home_of("__main__") is None
 
 
 # From training to the table

@@ -28,7 +28,7 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
         path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
             DINO-SALAD, CricaVPR or another layout in `docs/methods.md`; torch files need torch. Or
             the name of a published model, as `crisalad models` lists them: it is downloaded once
-            into the cache. Or "starter", the small model in this package.
+            into the cache. Or "starter", the small model in this package, or "hog", a baseline.
         verify: whether to check the bytes of a file of this package against its checksum.
 
     Returns:
@@ -56,9 +56,10 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
 def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False) -> pathlib.Path:
     """Return the file that is meant by a path, or by the name of a published model.
 
-    None is the small model in this package, with a note; it has a name, too, "starter". A published
-    model is downloaded the first time, and its licence told each time. A file of such a name in the
-    working directory is taken instead, with a note.
+    None is the small model in this package, with a note; it has a name, too, "starter". Another
+    name is "hog", histograms of oriented gradients, a baseline. A published model is downloaded the
+    first time, and its licence told each time. A file of such a name in the working directory is
+    taken instead, with a note.
 
     Args:
         weights: a path, or a name of `crisalad models`, or None.
@@ -84,15 +85,15 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
     is_there = os.path.isfile(path)
     if is_there and path.suffix:
         return path
-    if name == starter.NAME and not is_there:
-        return starter.FILE
+    if name in starter.FILES and not is_there:
+        return starter.FILES[name]
     # Imported here: the published models, whose names have no suffix, need JAX.
     from crisalad_jax.checkpoints.published import PUBLISHED
     from crisalad_jax.checkpoints.published.base import nearest_names
 
     model = PUBLISHED.get(name)
     if is_there:
-        if model is not None or name == starter.NAME:
+        if model is not None or name in starter.FILES:
             tell(f"{name}: found a file of this name here, and took that, not the model so named")
         return path
     if model is not None:

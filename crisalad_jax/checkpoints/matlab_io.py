@@ -5,7 +5,7 @@ scipy reads them, which runs nothing of the file. Axes of length 1 are dropped, 
 
 import pathlib
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,22 @@ MATLAB_SUFFIX = ".mat"
 AVERAGE = "net.meta.normalization.averageImage"
 """Name of the image that is subtracted from pixels of 0 to 255."""
 _WEIGHTS = re.compile(r"net\.layers\[(\d+)\]\.weights\[(\d)\]")
+_SETTINGS = "crisalad"
+"""Name of a field of net.meta."""
 _EXPECTED = "a MATLAB file of a network: net.layers with weights, and its averageImage"
 
 
-def read_matlab(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Return all weights of a network as float32, and its average image, by their paths.
+class Network(NamedTuple):
+    """What a file holds."""
+
+    state: dict[str, np.ndarray]
+    """Weights as float32, and the average image, by their paths."""
+    settings: str | None
+    """The text that `write_matlab` added."""
+
+
+def read_matlab(path: pathlib.Path) -> Network:
+    """Read all weights of a network, and its average image.
 
     Raises:
         InputError: the file is cut short, or no network.
@@ -48,7 +59,8 @@ def read_matlab(path: pathlib.Path) -> dict[str, np.ndarray]:
         for i, array in enumerate(weights):
             name = f"net.layers[{number}].weights[{i}]"
             state[name] = _numbers(path, name, array)
-    return state
+    text = getattr(network.meta, _SETTINGS, None)
+    return Network(state, None if text is None else str(text))
 
 
 def _numbers(path: pathlib.Path, name: str, value: Any) -> np.ndarray:
@@ -58,8 +70,8 @@ def _numbers(path: pathlib.Path, name: str, value: Any) -> np.ndarray:
     return array.astype(np.float32)
 
 
-def write_matlab(path: pathlib.Path, state: dict[str, np.ndarray]) -> None:
-    """Write a network under the paths that `read_matlab` returns.
+def write_matlab(path: pathlib.Path, state: dict[str, np.ndarray], settings: str | None) -> None:
+    """Write a network under the paths that `read_matlab` returns, and a text with it, if any.
 
     Raises:
         InputError: the file cannot be made.
@@ -74,6 +86,8 @@ def write_matlab(path: pathlib.Path, state: dict[str, np.ndarray]) -> None:
         weights = np.empty(len(arrays), object)
         weights[:] = arrays
         layers[number] = {"name": f"layer {number}", "weights": weights}
-    meta = {"normalization": {"averageImage": state[AVERAGE]}}
+    meta: dict[str, Any] = {"normalization": {"averageImage": state[AVERAGE]}}
+    if settings is not None:
+        meta[_SETTINGS] = settings
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         scipy.io.savemat(file, {"net": {"layers": layers, "meta": meta}}, oned_as="column")

@@ -1,7 +1,8 @@
-"""The model in this package: small, trained on rendered pictures alone, there before any download.
+"""The models in this package, there before any download: a small one, and a baseline.
 
-docs/starter.md says how it was trained, and what it recalls. It is no published model: its file is
-part of the package, and its licence the package's.
+docs/starter.md says how the small one was trained, on rendered pictures alone, and what it recalls.
+The baseline, histograms of oriented gradients, has no parameters: its file is a configuration. They
+are no published models: their files are part of the package, and their licence the package's.
 """
 
 import os
@@ -13,6 +14,8 @@ from crisalad_jax.utils.notes import tell
 NAME = "starter"
 """Its name, for `--weights` and `load`."""
 FILE = pathlib.Path(__file__).with_name(f"{NAME}.safetensors")
+FILES = {NAME: FILE, "hog": FILE.with_stem("hog")}
+"""The files of all models in this package by their names."""
 BEST = "megaloc"
 """The published model that recalls the most, which a note names."""
 
@@ -32,20 +35,23 @@ def tell_taken() -> None:
 
 
 def named(weights: str | os.PathLike[str]) -> str:
-    """Return the words for a file of weights in what people read: of this model its name."""
-    return NAME if pathlib.Path(weights) == FILE else os.fspath(weights)
+    """Return the words for a file of weights in what people read: of one of these its name."""
+    names = (name for name, file in FILES.items() if file == pathlib.Path(weights))
+    return next(names, os.fspath(weights))
 
 
 def recorded(weights: str | os.PathLike[str]) -> str:
-    """Return what a map records of where its weights are: a path, or the name of this model.
+    """Return what a map records of where its weights are: a path, or the name of one of these.
 
     The package has another place on another machine, where a map may be taken.
     """
     path = real_path(pathlib.Path(weights))
-    is_named = os.fspath(weights) == NAME and not path.exists()
-    return NAME if is_named or path == real_path(FILE) else str(path)
+    if os.fspath(weights) in FILES and not path.exists():
+        return os.fspath(weights)
+    names = (name for name, file in FILES.items() if real_path(file) == path)
+    return next(names, str(path))
 
 
 def resolved(record: str) -> pathlib.Path:
     """Return the file of weights that a map has a record of, the opposite of `recorded`."""
-    return FILE if record == NAME else pathlib.Path(record)
+    return FILES.get(record, pathlib.Path(record))

@@ -1,5 +1,6 @@
 """Read and write public torch checkpoints, and convert them to this package's files and back."""
 
+import collections
 import dataclasses
 import json
 import os
@@ -17,7 +18,16 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from crisalad_jax.checkpoints.layouts import LAYOUTS, State, check_holds, infer, to_params, to_state
+from crisalad_jax.checkpoints.layouts import (
+    LAYOUTS,
+    State,
+    check_holds,
+    infer,
+    public_shapes,
+    renamed_to,
+    to_params,
+    to_state,
+)
 from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY, vocabulary_model
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX, read_matlab, write_matlab
 from crisalad_jax.checkpoints.safetensors_io import write_safetensors
@@ -47,7 +57,7 @@ SUFFIXES = {
 
 
 class _Unread:
-    """A stand-in for an array of NumPy beside the weights, such as the recalls of a training run.
+    """A stand-in for an array of NumPy with the weights, such as the recalls of a training run.
 
     Torch refuses a whole file with one, and NumPy itself would run on bytes of the file.
     """
@@ -69,6 +79,35 @@ _NUMPY = (
     ),
 )
 """What a pickled array or number of NumPy asks for."""
+_HOW = "torch.save(model.state_dict(), FILE) writes a file of the weights alone"
+
+
+def _stand_in(name: str) -> type:
+    """Make a stand-in for any other class or function that a file names: a dictionary.
+
+    Its making runs nothing of the file. Torch fills exactly this kind of dictionary with items, as
+    of a `defaultdict`, and with attributes, as of an `argparse.Namespace`.
+    """
+
+    def new(_: type, *__: Any) -> Any:
+        made = collections.OrderedDict()
+        vars(made)["stands_for"] = name
+        return made
+
+    return type(name, (), {"__new__": new})
+
+
+class _Dictionary(dict[Any, Any]):
+    """A dictionary of a file."""
+
+    stands_for: str | None = None
+    """The class of the file that it was, if it was none of a dictionary."""
+    settings: Any = None
+    """The configuration as JSON, where the names and shapes do not show all of it."""
+
+
+_SETTINGS = "crisalad-jax config"
+"""Key of the configuration in the metadata of a public checkpoint that we write."""
 
 
 class Checkpoint(NamedTuple):
@@ -102,13 +141,19 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     state, config = _unwrap(_read(path), path)
     layout = "reference"
     if config is None:
-        layout, config = infer(state, source=str(path))
+        text = state.settings
+        layout, config, state = infer(state, source=str(path))
+        if text is not None:
+            ours = from_plain(ModelConfig, _json(text, path), source=f"{path} ({_SETTINGS})")
+            config = with_free_fields_of(ours, config)
     elif count_layers(config) > len(state):
         # Check before making a table of names: the file may claim any depth.
         raise InputError(
             f"{path}: found {len(state)} tensors, expected those of {count_layers(config)} blocks "
             "and layers, as its configuration says"
         )
+    else:
+        state = renamed_to(state, public_shapes(config, layout).keys())
     state = {name: _float32(name, array, path) for name, array in state.items()}
     params, extras = to_params(state, config, layout, source=str(path))
     return Checkpoint(jax.tree.map(jnp.asarray, params), config, extras, layout)
@@ -161,15 +206,21 @@ def _read(path: pathlib.Path) -> Any:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
     if path.suffix == MATLAB_SUFFIX:
-        return read_matlab(path)
+        network = read_matlab(path)
+        state = _Dictionary(network.state)
+        state.settings = network.settings
+        return state
     if start[8:] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
         return _read_safetensors(path)
     return _read_torch(path)
 
 
-def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
+def _read_safetensors(path: pathlib.Path) -> _Dictionary:
     try:
-        return safetensors.numpy.load_file(path)
+        state = _Dictionary(safetensors.numpy.load_file(path))
+        with safetensors.safe_open(path, framework="numpy") as file:
+            state.settings = (file.metadata() or {}).get(_SETTINGS)
+        return state
     except AttributeError as error:  # safetensors' error for a type that numpy lacks
         raise InputError(f"{path}: found a type that numpy does not know: {error}") from error
     except (safetensors.SafetensorError, OSError, ValueError) as error:
@@ -179,10 +230,15 @@ def _read_safetensors(path: pathlib.Path) -> dict[str, np.ndarray]:
 def _read_torch(path: pathlib.Path) -> Any:
     torch = _torch(f"read {path}")
     _check_archive(path)
+    named: list[str] = []
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about deprecated formats, which are refused below
-            with torch.serialization.safe_globals([(_Unread, name) for name in _NUMPY]):
+            if zipfile.is_zipfile(path):
+                named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+            stand_ins = [(_stand_in(name), name) for name in named if name not in _NUMPY]
+            stand_ins += [(_Unread, name) for name in _NUMPY]
+            with torch.serialization.safe_globals(stand_ins):
                 content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         # Torch's message is a page of advice on how to run the code anyway: shorten it.
@@ -192,16 +248,24 @@ def _read_torch(path: pathlib.Path) -> Any:
         what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
         raise InputError(
             f"{path}: refused: it {what}, expected nothing but tensors (loading anything else "
-            "could run code)"
+            f"could run code): {_HOW}"
         ) from error
     except Exception as error:  # a damaged pickle may raise any exception
         reason = str(error).split("\n")[0][:200]
         reason = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
+        others = [name for name in named if name not in _NUMPY]
+        if others:
+            reason += f" (it has {', '.join(sorted(others)[:3])} with the weights: {_HOW})"
         raise InputError(f"{path}: not a whole torch checkpoint: {reason}") from error
 
     def arrays(value: Any, name: object) -> Any:
-        if isinstance(value, Mapping):
-            return {key: arrays(item, key) for key, item in value.items()}
+        if isinstance(value, dict):
+            made = _Dictionary((key, arrays(item, key)) for key, item in dict.items(value))
+            attributes = getattr(value, "__dict__", {})
+            made.stands_for = attributes.get("stands_for")
+            metadata = attributes.get("_metadata")  # as of any module's state_dict
+            made.settings = metadata.get(_SETTINGS) if isinstance(metadata, Mapping) else None
+            return made
         if not isinstance(value, torch.Tensor):
             return value
         half = value.dtype in (torch.float16, torch.bfloat16)
@@ -253,10 +317,10 @@ def _torch(purpose: str) -> Any:
     return torch
 
 
-def _unwrap(content: Any, path: pathlib.Path) -> tuple[State, ModelConfig | None]:
+def _unwrap(content: Any, path: pathlib.Path) -> tuple[_Dictionary, ModelConfig | None]:
     """Return the state in a file's dictionary, and the configuration if our reference wrote one."""
     config = None
-    for key in ("state_dict", "model_state_dict", "model"):
+    for key in ("state_dict", "model_state_dict", "model", "teacher"):
         if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
             if isinstance(content.get("config"), str):
                 config = from_plain(
@@ -269,9 +333,11 @@ def _unwrap(content: Any, path: pathlib.Path) -> tuple[State, ModelConfig | None
             f"{path}: found one tensor by itself, of shape {content.shape}, expected a dictionary "
             "of tensors by name (a vocabulary needs its backbone: `crisalad convert --backbone`)"
         )
-    if not isinstance(content, Mapping) or not content:
-        kind = "nothing" if isinstance(content, Mapping) else type(content).__name__
-        raise InputError(f"{path}: found {kind}, expected a dictionary of tensors by name")
+    if not isinstance(content, _Dictionary) or not content:
+        kind = type(content).__name__
+        if isinstance(content, _Dictionary):
+            kind = content.stands_for or "nothing"
+        raise InputError(f"{path}: found {kind}, expected a dictionary of tensors by name: {_HOW}")
     strange = [
         str(name)
         for name, value in content.items()
@@ -279,17 +345,16 @@ def _unwrap(content: Any, path: pathlib.Path) -> tuple[State, ModelConfig | None
     ]
     if strange:
         raise InputError(
-            f"{path}: found {', '.join(sorted(strange))}, expected nothing but tensors by name"
+            f"{path}: found {', '.join(sorted(strange))}, expected nothing but tensors by name: "
+            f"{_HOW}"
         )
-    if all(name.startswith("module.") for name in content):
-        content = {name.removeprefix("module."): value for name, value in content.items()}
     return content, config
 
 
 def _json(text: str, path: pathlib.Path) -> Any:
     try:
         return json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: found no configuration under 'config': {error}") from error
 
 
@@ -333,24 +398,33 @@ def write_checkpoint(
 ) -> None:
     """Write a model under public names, as published: nested, prefixed, in the public order.
 
+    A configuration that names and shapes do not show, such as another image size than the published
+    one, is in the metadata of the state, where no other program looks.
+
     Raises:
         InputError: the layout cannot hold this model, the file cannot be made, or torch is needed
             and not installed.
     """
     path = pathlib.Path(path)
     names = choose("layout", layout, LAYOUTS)
-    check_holds(config, layout, extras)
+    shown = check_holds(config, layout, extras)
+    is_all = with_free_fields_of(config, shown) == shown
+    settings = None if is_all else json.dumps(to_plain(config))
+    metadata = {} if settings is None else {_SETTINGS: settings}
     state = to_state(params, config, layout, extras)
     if names.stored == "safetensors":
-        write_safetensors(path, state, {"format": "pt"})
+        write_safetensors(path, state, {"format": "pt"} | metadata)
         return
     if names.stored == "matlab":
-        write_matlab(path, state)
+        write_matlab(path, state, settings)
         return
     torch = _torch(f"write {path}")
     content: Any = {
         f"{names.module}{name}": torch.from_numpy(np.array(array)) for name, array in state.items()
     }
+    if metadata:
+        content = collections.OrderedDict(content)
+        content._metadata = metadata
     if names.under is not None:
         content = {names.under: content}
     if names.bare:

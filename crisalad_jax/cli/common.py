@@ -254,6 +254,6 @@ def load_model(
 
 def _name(weights: pathlib.Path) -> str:
     """Return what a file of weights is called in tables and titles."""
-    if weights == starter.FILE:
-        return starter.NAME
+    if weights in starter.FILES.values():
+        return starter.named(weights)
     return f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name

@@ -76,5 +76,5 @@ def _choices(command: str, action: argparse.Action) -> Any:
     if action.dest == "recipe":
         return tuple(RECIPES)
     if (command, action.dest) == ("models", "name"):
-        return (starter.NAME, *PUBLISHED)
+        return (*starter.FILES, *PUBLISHED)
     return action.choices and tuple(each for each in action.choices if each != "None")

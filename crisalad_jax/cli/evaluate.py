@@ -66,8 +66,8 @@ class Evaluate:
     """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
     folders; a .mat file of NetVLAD; .npy lists of SALAD."""
     weights: pathlib.Path | None = None
-    """By default starter, the small model in this package; or a .safetensors file, or a published
-    model's name (`crisalad models`)."""
+    """By default starter, the small model in this package; or hog, a baseline that learns nothing;
+    or a .safetensors file, or a published model's name (`crisalad models`)."""
     preset: str | None = None
     """Evaluate an untrained model of this size in place of weights: tiny, s14, b14, l14 or g14."""
     image_size: tuple[int, int] | None = None

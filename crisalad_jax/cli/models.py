@@ -46,13 +46,15 @@ def run(arguments: Models) -> None:
             f"{starter.NAME}: the small model in this package, which extract, index and evaluate "
             "take by default"
         )
+        say("hog: histograms of oriented gradients, a baseline without parameters, by its name too")
         say("crisalad models NAME tells all of one: its images, paper, file and address")
         values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
     else:
-        own = arguments.name == starter.NAME
-        values = _own_facts() if own else _facts(published_model(arguments.name))
+        name = arguments.name
+        own = name in starter.FILES
+        values = _own_facts(name) if own else _facts(published_model(name))
         width = max(map(len, values))
-        say("\n".join(f"{name:<{width}}  {_cell(value)}" for name, value in values.items()))
+        say("\n".join(f"{key:<{width}}  {_cell(value)}" for key, value in values.items()))
     if arguments.json is not None:
         write_or_print_json(arguments.json, values)
 
@@ -68,17 +70,23 @@ def _facts(model: Published) -> dict[str, Any]:
     }
 
 
-def _own_facts() -> dict[str, Any]:
-    """Return what is known of the model in this package, in the words for published ones."""
-    params, config = load_weights(starter.FILE)
+_NOTES = {
+    starter.NAME: f"trained on rendered pictures alone (docs/{starter.NAME}.md)",
+    "hog": "a baseline that learns nothing: histograms of oriented gradients",
+}
+
+
+def _own_facts(name: str) -> dict[str, Any]:
+    """Return what is known of a model in this package, in the words for published ones."""
+    params, config = load_weights(starter.FILES[name])
     unsaid = dict.fromkeys(field.name for field in dataclasses.fields(Published))
     return unsaid | {
-        "name": starter.NAME,
+        "name": name,
         "descriptor": config.descriptor_dim,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(params)),
         "images": config.images_in_words,
-        "file": str(starter.FILE),
-        "note": f"in this package; trained on rendered pictures alone (docs/{starter.NAME}.md)",
+        "file": str(starter.FILES[name]),
+        "note": f"in this package; {_NOTES[name]}",
         "licence": "Apache-2.0",
         "commercial": True,
         "cached": True,

@@ -12,6 +12,7 @@ import numpy as np
 
 from crisalad_jax.config.aliases import upgrade
 from crisalad_jax.config.parts import Part
+from crisalad_jax.config.plugins import home_of
 from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
@@ -19,17 +20,25 @@ from crisalad_jax.utils.files import read_json
 _T = TypeVar("_T")
 NAME = "name"
 """Key of a part's name beside its fields."""
+_PLUGIN = "plugin"
+"""Key of the plug-in that registered a part, next to its name."""
 
 
 def to_plain(config: Any) -> dict[str, Any]:
-    """Convert a configuration to nested dictionaries of JSON values, with its parts' names."""
+    """Convert a configuration to nested dictionaries of JSON values, with its parts' names.
+
+    A part of a plug-in also has the plug-in's, so that who lacks it is told which it was.
+    """
     return json.loads(json.dumps(_plain(config)))
 
 
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        return {NAME: value.part_name, **fields} if isinstance(value, Part) else fields
+        if not isinstance(value, Part):
+            return fields
+        home = home_of(type(value).__module__)
+        return {NAME: value.part_name, **({_PLUGIN: home} if home else {}), **fields}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     value = value.item() if isinstance(value, np.generic) else value
@@ -71,9 +80,9 @@ def _config(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
     before = len(problems)
     if issubclass(kind, Part):
         value = dict(value)
-        name = value.pop(NAME, None)
+        name, plugin = value.pop(NAME, None), value.pop(_PLUGIN, None)
         try:
-            kind = kind.registry.find(name)
+            kind = kind.registry.find(name, plugin)
         except InputError as error:
             problems.append(f"{error} @ {path}")
             return None

@@ -169,8 +169,10 @@ class Registry(Generic[P]):
                 f"{where}: found {part.__qualname__}, expected a subclass of {self.base.__name__}"
             )
         fields = [field.name for field in dataclasses.fields(part)]
-        if "name" in fields:
-            raise InputError(f"{where}: found a field 'name', which files keep the part's own in")
+        for reserved in {"name", "plugin"} & set(fields):
+            raise InputError(
+                f"{where}: found a field {reserved!r}, which files keep the part's own in"
+            )
         hidden = [name for name in fields if callable(getattr(self.base, name, None))]
         if hidden:
             raise InputError(f"{where}: found a field {hidden[0]!r}, which is the name of a method")
@@ -228,8 +230,12 @@ class Registry(Generic[P]):
         """Return whether a part has this name."""
         return name in self._parts
 
-    def find(self, name: str) -> type[P]:
+    def find(self, name: str, plugin: str | None = None) -> type[P]:
         """Return the class of the part with this name; if needed, load installed plug-ins first.
+
+        Args:
+            name: of the part.
+            plugin: the plug-in that registered it, where that is known.
 
         Raises:
             InputError: there is none; the message lists those there are.
@@ -238,9 +244,11 @@ class Registry(Generic[P]):
         if name not in self.names():
             load_entry_points()
         if name not in self.names():
+            hint = "is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin"
+            if plugin is not None:
+                hint = f"the plug-in {plugin} had it: --plugin {plugin}, or load_plugin"
             raise InputError(
-                f"{self.kind}: found {name!r}, expected one of {', '.join(self.names())} (is a "
-                "plug-in missing? --plugin FILE.py or MODULE, or load_plugin)"
+                f"{self.kind}: found {name!r}, expected one of {', '.join(self.names())} ({hint})"
             )
         return self._parts[name]
 

@@ -157,6 +157,21 @@ def plugin_of(module: str) -> str | None:
     return None if path is None else str(path)
 
 
+def home_of(module: str) -> str | None:
+    """Return what `--plugin` takes to load a part's module: a file's name, or the module.
+
+    Files record it: no folder, so that a copy on another machine is the same. None for modules of
+    this package, and where there is no file, as in a notebook.
+    """
+    if module.partition(".")[0] == __name__.partition(".")[0]:
+        return None
+    file = plugin_of(module)
+    if module == "__main__":
+        file = getattr(sys.modules[module], "__file__", None)
+        return file and os.path.basename(file)
+    return os.path.basename(file) if file else module
+
+
 def load_entry_points() -> None:
     """Import the modules that installed packages name under `ENTRY_POINTS`, each once.
 

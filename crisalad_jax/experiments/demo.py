@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 import jax
 
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
-from crisalad_jax.evaluation.evaluate import KS, evaluate
-from crisalad_jax.evaluation.metrics import recalls
+from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.experiments.baselines import hog_neighbours
 from crisalad_jax.experiments.report import (
     RecallRow,
     prediction_gallery,
@@ -106,7 +105,7 @@ def _demo(config: DemoConfig, out: pathlib.Path, quiet: bool, started: float) ->
     trained, model = load_weights(out / "run" / "last.safetensors")
     after = measure(trained, model)
 
-    rows = [RecallRow(benchmark.name, "HOG, no learning", "any", _hog_recalls(benchmark))]
+    rows = _rows(benchmark, "HOG, no learning", measure(*load("hog")))
     rows += _rows(benchmark, "untrained", before)
     rows += _rows(benchmark, "trained", after)
     pictures = [out / name for name in ("recall.png", "training.png", "gallery.png")]
@@ -154,7 +153,3 @@ def demo_recipe(config: DemoConfig) -> TrainConfig:
 
 def _rows(benchmark: Benchmark, model: str, results: list[GroupingResult]) -> list[RecallRow]:
     return [RecallRow(benchmark.name, model, r.grouping, r.recalls) for r in results]
-
-
-def _hog_recalls(benchmark: Benchmark) -> dict[int, float]:
-    return recalls(hog_neighbours(benchmark, max(KS)).indices, benchmark.ground_truth(), KS)

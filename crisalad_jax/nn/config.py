@@ -15,6 +15,7 @@ from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.hog import HogConfig as HogConfig  # registers it
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 

@@ -13,6 +13,7 @@ from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.run import Batch, Run, Told
+from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError, Stopped
 from crisalad_jax.utils.progress import Bar, progress_bar
@@ -117,6 +118,12 @@ def check_learns(config: TrainConfig) -> None:
         raise InputError(
             f"aggregator: found {config.model.aggregator.part_name}, with which nothing trains, "
             "expected another; `crisalad vocabulary` makes its models"
+        )
+    if not count_trainable(config.model, config.trainable):
+        names = config.model.backbone.part_name, config.model.aggregator.part_name
+        raise InputError(
+            f"trainable: found {config.trainable}, of which backbone {names[0]} with aggregator "
+            f"{names[1]} has no parameters, expected some"
         )
 
 

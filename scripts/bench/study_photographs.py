@@ -11,14 +11,14 @@ import dataclasses
 import json
 import pathlib
 import time
+from collections.abc import Mapping
 
 import jax
 
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
-from crisalad_jax.evaluation.evaluate import KS, evaluate
-from crisalad_jax.evaluation.metrics import recalls
-from crisalad_jax.experiments.baselines import hog_neighbours
+from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.report import RecallRow, recall_markdown
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
@@ -60,8 +60,8 @@ def train(
     return params, json.loads(timing.read_text())["seconds"]
 
 
-def hog_recalls(benchmark: Benchmark) -> dict[int, float]:
-    return recalls(hog_neighbours(benchmark, max(KS)).indices, benchmark.ground_truth(), KS)
+def hog_recalls(benchmark: Benchmark) -> Mapping[int, float]:
+    return evaluate(*load("hog"), benchmark, quiet=True)[0].recalls
 
 
 def main() -> None:

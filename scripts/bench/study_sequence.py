@@ -19,10 +19,8 @@ from tables import Study, Table, flags, leave, read
 
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.images import read_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import recalls
-from crisalad_jax.experiments.baselines import hog_descriptors
 from crisalad_jax.experiments.synthetic import View, render
 from crisalad_jax.retrieval.sequence import BayesFilter
 
@@ -69,10 +67,7 @@ def write_street(root: pathlib.Path) -> pathlib.Path:
 
 def descriptors(benchmark: Benchmark, weights: list[pathlib.Path]) -> Iterator[tuple[str, Sides]]:
     """Yield each model's name and descriptors of the database and of the queries."""
-    sides = (benchmark.database, benchmark.queries)
-    database, queries = (hog_descriptors([read_image(path) for path in side]) for side in sides)
-    yield "HOG, no learning", (database, queries)
-    for file in weights:
+    for file in (pathlib.Path("hog"), *weights):
         params, config = load(file)
         found: list[Sides] = []
         evaluate(
@@ -82,7 +77,8 @@ def descriptors(benchmark: Benchmark, weights: list[pathlib.Path]) -> Iterator[t
             groupings=["single"],
             observe=lambda _, database, queries, to=found: to.append((database, queries)),
         )
-        yield f"{file.parent.name}/{file.name}", found[0]
+        hog = file == pathlib.Path("hog")
+        yield "HOG, no learning" if hog else f"{file.parent.name}/{file.name}", found[0]
 
 
 SURE = 0.4

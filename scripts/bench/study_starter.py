@@ -8,37 +8,23 @@ in another way. With --page the table takes its place in the page.
 """
 
 import argparse
-import itertools
 import pathlib
 from collections.abc import Iterator, Mapping
 
 import jax
-import numpy as np
 
 from crisalad_jax.checkpoints import starter
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.evaluation.metrics import (
-    Interval,
-    bootstrap_interval,
-    recalls,
-    right_retrievals,
-)
-from crisalad_jax.experiments.baselines import hog_neighbours
+from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.utils.files import around
 
 KS = (1, 5, 10)
 Models = dict[str, tuple[Crisalad, ModelConfig]]
-
-
-def by_hog(data: Benchmark) -> tuple[Mapping[int, float], Interval]:
-    """Recalls of HOG, and the interval of the first."""
-    indices, positives = hog_neighbours(data, max(KS)).indices, data.ground_truth()
-    hits = np.asarray(right_retrievals(indices[:, :1], positives)).reshape(-1).astype(int)
-    return recalls(indices, positives, KS), bootstrap_interval(hits)
 
 
 def by_model(
@@ -52,8 +38,8 @@ def by_model(
 def rows(models: Models, sets: list[Benchmark]) -> Iterator[str]:
     """The lines of the table."""
     for data in sets:
-        described = ((name, by_model(*model, data)) for name, model in models.items())
-        for name, (found, interval) in itertools.chain([("HOG", by_hog(data))], described):
+        for name, model in models.items():
+            found, interval = by_model(*model, data)
             first, *others = (f"{100 * found[k]:.1f}" for k in KS)
             low, high = (f"{100 * each:.1f}" for each in (interval.low, interval.high))
             cells = (data.name, str(len(data.queries)), name, f"{first} ({low} to {high})", *others)
@@ -68,7 +54,8 @@ def main() -> None:
     parser.add_argument("--page", type=pathlib.Path)
     given = parser.parse_args()
     own, config = load_weights(given.weights)
-    models: Models = {"untrained": (init_crisalad(jax.random.key(0), config), config)}
+    untrained = init_crisalad(jax.random.key(0), config)
+    models: Models = {"HOG": load("hog"), "untrained": (untrained, config)}
     for name, _, file in (each.partition("=") for each in given.others):
         models[name] = load_weights(file)
     models["**starter**"] = own, config

@@ -13,7 +13,7 @@ from crisalad_jax import describe
 from crisalad_jax.checkpoints.layouts import infer, public_shapes, to_params, to_state
 from crisalad_jax.checkpoints.layouts.cnn import vgg_numbers
 from crisalad_jax.checkpoints.matlab_io import AVERAGE, read_matlab, write_matlab
-from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint
+from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint, write_checkpoint
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
@@ -40,7 +40,7 @@ def matlab_state(hloc: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def small_network(average: np.ndarray) -> dict[str, np.ndarray]:
     """A whole NetVLAD of two clusters and three numbers, with an average image."""
     config = dataclasses.replace(
-        infer(blank(zoo.layout("netvlad_vgg16_hloc_mat")), source="zoo")[1],
+        infer(blank(zoo.layout("netvlad_vgg16_hloc_mat")), source="zoo").config,
         aggregator=NetVladConfig(clusters=2),
         projection=ProjectionConfig(dim=3),
     )
@@ -68,14 +68,14 @@ def tiny() -> dict[str, np.ndarray]:
 
 def test_a_written_file_is_what_scipy_and_we_read(tmp_path: pathlib.Path) -> None:
     path, state = tmp_path / "net.mat", tiny()
-    write_matlab(path, state)
+    write_matlab(path, state, None)
     network = scipy.io.loadmat(path, struct_as_record=False, squeeze_me=True)["net"]
     assert len(network.layers) == 3
     for number, i in ((0, 0), (0, 1), (2, 0), (2, 1)):
         expected = state[f"net.layers[{number}].weights[{i}]"]
         np.testing.assert_array_equal(network.layers[number].weights[i], expected)
     np.testing.assert_array_equal(network.meta.normalization.averageImage, state[AVERAGE])
-    found = read_matlab(path)
+    found = read_matlab(path).state
     assert found.keys() == state.keys()
     for name, array in state.items():
         np.testing.assert_array_equal(found[name], array)
@@ -100,7 +100,7 @@ def test_what_is_no_network(tmp_path: pathlib.Path) -> None:
 
 
 def test_every_cut_is_told(tmp_path: pathlib.Path) -> None:
-    write_matlab(tmp_path / "net.mat", tiny())
+    write_matlab(tmp_path / "net.mat", tiny(), None)
     whole = (tmp_path / "net.mat").read_bytes()
     for size in range(8, len(whole) - 8, len(whole) // 40):
         (tmp_path / "cut.mat").write_bytes(whole[:size])
@@ -116,16 +116,24 @@ def test_the_mean_is_the_files_first_pixel_to_the_bit(tmp_path: pathlib.Path, fi
     average = np.random.default_rng(0).uniform(0, 255, (4, 6, 3)).astype(np.float32)
     average[0, 0] = first
     state = small_network(average)
-    write_matlab(tmp_path / "net.mat", state)
+    write_matlab(tmp_path / "net.mat", state, None)
     read = read_checkpoint(tmp_path / "net.mat")
     mean = np.float32(255) * np.array(read.config.preprocessing.mean)
     np.testing.assert_array_equal(mean.astype(np.float32), average[0, 0])
     convert(tmp_path / "net.mat", tmp_path / "ours.safetensors")
     convert(tmp_path / "ours.safetensors", tmp_path / "back.mat")
-    back = read_matlab(tmp_path / "back.mat")
+    back = read_matlab(tmp_path / "back.mat").state
     assert back.keys() == state.keys()
     for name, array in state.items():
         np.testing.assert_array_equal(back[name], array)
+
+
+def test_another_image_size_comes_back(tmp_path: pathlib.Path) -> None:
+    write_matlab(tmp_path / "net.mat", small_network(np.zeros((4, 6, 3), np.float32)), None)
+    read = read_checkpoint(tmp_path / "net.mat")
+    config = dataclasses.replace(read.config, image_size=(128, 160))
+    write_checkpoint(tmp_path / "back.mat", read.params, config, "netvlad-matlab", read.extras)
+    assert read_checkpoint(tmp_path / "back.mat").config == config
 
 
 def test_a_model_from_another_file_is_written_with_its_own_mean() -> None:
@@ -155,10 +163,10 @@ def test_matlabs_file_is_hlocs_module_and_goes_back(tmp_path: pathlib.Path) -> N
     state = matlab_state(hloc)
     shapes = zoo.layout(f"{name}_mat")
     assert {k: v.size for k, v in state.items()} == {k: np.prod(s) for k, s in shapes.items()}
-    write_matlab(tmp_path / "Pitts30K_struct.mat", state)
+    write_matlab(tmp_path / "Pitts30K_struct.mat", state, None)
     read = read_checkpoint(tmp_path / "Pitts30K_struct.mat")
     assert read.layout == "netvlad-matlab"
-    layout, config = infer(hloc, source="hloc")
+    layout, config, _ = infer(hloc, source="hloc")
     assert (layout, read.config) == ("netvlad-hloc", config)
     params, _ = to_params(hloc, config, layout, source="hloc")
     jax.tree.map(np.testing.assert_array_equal, read.params, params)
@@ -169,7 +177,7 @@ def test_matlabs_file_is_hlocs_module_and_goes_back(tmp_path: pathlib.Path) -> N
 
     convert(tmp_path / "Pitts30K_struct.mat", tmp_path / "ours.safetensors")
     convert(tmp_path / "ours.safetensors", tmp_path / "back.mat")
-    back = read_matlab(tmp_path / "back.mat")
+    back = read_matlab(tmp_path / "back.mat").state
     assert back.keys() == state.keys()
     for key, array in state.items():
         np.testing.assert_array_equal(back[key], array)

@@ -109,6 +109,21 @@ def test_a_map_of_another_versions_model_says_so(
     fails(capfd, "query", list_images(images)[0], "--map", out, words=words)
 
 
+def test_a_map_asked_with_another_model_blames_no_version(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+) -> None:
+    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
+    said(capfd, "index", "--images", images, "--out", out, "--quiet")
+    weights = shared / "weights.safetensors"
+    code = main(
+        [str(a) for a in ("query", list_images(images)[0], "--map", out, "--weights", weights)]
+    )
+    (line,) = capfd.readouterr().err.splitlines()
+    assert code == 2
+    assert "(starter), but" in line
+    assert "version" not in line
+
+
 def test_a_map_made_in_python_by_its_name_is_asked_without_weights(
     shared: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:

@@ -15,6 +15,7 @@ from crisalad_jax.checkpoints.layouts.base import State as State
 from crisalad_jax.checkpoints.layouts.table import check_holds as check_holds
 from crisalad_jax.checkpoints.layouts.table import infer as infer
 from crisalad_jax.checkpoints.layouts.table import public_shapes as public_shapes
+from crisalad_jax.checkpoints.layouts.table import renamed_to as renamed_to
 from crisalad_jax.checkpoints.layouts.table import table as table
 from crisalad_jax.checkpoints.layouts.table import to_params as to_params
 from crisalad_jax.checkpoints.layouts.table import to_state as to_state

@@ -2,8 +2,8 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Set
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from crisalad_jax.checkpoints.layouts.base import LAYOUTS, State
 from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words
 from crisalad_jax.checkpoints.layouts.forms import Absent, Entry, Extra
+from crisalad_jax.checkpoints.layouts.readings import Reading, readings
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences
@@ -20,6 +21,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
 
 
@@ -39,38 +41,68 @@ def table(config: ModelConfig, layout: str) -> list[Entry | Extra | Absent]:
     return list(chosen.lines(config))
 
 
-def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
+class Inferred(NamedTuple):
+    """What a state is."""
+
+    layout: str
+    config: ModelConfig
+    state: State
+    """The arrays by the layout's own names."""
+
+
+def infer(state: State, *, source: str) -> Inferred:
     """Infer the layout and the configuration of a state, from its names and shapes.
 
     Settings that no shape shows are the published ones: heads of width 64 in the backbone, 16 heads
-    in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize.
+    in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize. Names
+    of wrappers are taken away (see `readings`); a note says what else is left out.
 
     Raises:
         InputError: naming `source`, if the names are of no layout or the widths of no model.
     """
-    found: list[tuple[int, str, ModelConfig]] = []
+    found: list[tuple[int, Inferred, Reading]] = []
     problems: list[str] = []
-    for layout in LAYOUTS.values():
-        if layout.infer is not None and layout.detects(state):
-            try:
-                config = layout.infer(state)
-                names = public_shapes(config, layout.name).keys()
-            except InputError as error:
-                problems.append(f"{error}, as in {layout.holds}")
-            else:
-                found.append((len(names ^ state.keys()), layout.name, config))
+    for reading in readings(state):
+        for layout in LAYOUTS.values():
+            if layout.infer is not None and layout.detects(reading.state):
+                try:
+                    config = layout.infer(reading.state)
+                    names = public_shapes(config, layout.name).keys()
+                except InputError as error:
+                    problems.append(f"{error}, as in {layout.holds}")
+                else:
+                    inferred = Inferred(layout.name, config, reading.state)
+                    found.append((len(names ^ reading.state.keys()), inferred, reading))
+        if any(unlike == 0 for unlike, *_ in found):
+            break
     if found:
         # Families share names: the one that holds most of them, and the first of equals.
-        _, name, config = min(found, key=lambda each: each[0])
-        return name, config
+        _, inferred, reading = min(found, key=lambda each: each[0])
+        _tell_left_out(reading, source)
+        return inferred
     if problems:
         raise InputError(f"{source}: {problems[0]}")
-    _check_halves(state, source)
+    for reading in readings(state):
+        _check_halves(reading.state, source)
     names = ", ".join(sorted(state)[:3]) or "none"
     raise InputError(
         f"{source}: found no checkpoint that we know (its first names: {names}), expected one of "
         f"the {len(LAYOUTS)} kinds that `crisalad convert --help-all` lists"
     )
+
+
+def renamed_to(state: State, names: Set[str]) -> State:
+    """Return the reading of a state that has the most of these names, and no others."""
+    return min((each.state for each in readings(state)), key=lambda x: len(names ^ x.keys()))
+
+
+def _tell_left_out(reading: Reading, source: str) -> None:
+    if reading.left_out:
+        kinds = dict.fromkeys(name.partition(".")[0] for name in reading.left_out)
+        tell(
+            f"{source}: took the model under {reading.inside.removesuffix('.')}, and left out "
+            f"{len(reading.left_out)} tensors of {', '.join(kinds)}"
+        )
 
 
 def _check_halves(state: State, source: str) -> None:
@@ -89,8 +121,11 @@ def _check_halves(state: State, source: str) -> None:
             )
 
 
-def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -> None:
+def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -> ModelConfig:
     """Check that a model can be written in `layout` and read back as the same model.
+
+    Returns:
+        The configuration that is inferred from its file, which may have other free fields.
 
     Raises:
         InputError: what `table` raises; a setting that no shape tells and that differs from the
@@ -108,17 +143,18 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
         if not np.isfinite(array).all():
             raise InputError(f"extra.{line.name}: holds NaN or infinity")
     if layout == "reference" or LAYOUTS[layout].infer is None:
-        return
+        return config
     shapes = public_shapes(config, layout)
     blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
     blank |= {line.theirs: line.stored(extras or {}) for line in lines}
-    _, read_back = infer(blank, source=f"layout {layout}")
+    read_back = infer(blank, source=f"layout {layout}").config
     wrong = differences(_told(with_free_fields_of(config, read_back)), _told(config))
     if wrong:
         raise InputError(
             f"layout {layout}: cannot tell these apart from the published ones: "
             f"{'; '.join(wrong)} (layout reference can)"
         )
+    return read_back
 
 
 def _told(config: ModelConfig) -> ModelConfig:
@@ -165,17 +201,18 @@ def to_params(
 ) -> tuple[Crisalad, dict[str, np.ndarray]]:
     """Convert arrays by public name to (parameters, extras), as numpy arrays of the same types.
 
-    The extras are arrays of public checkpoints that no descriptor needs: DINOv2's mask token, and
-    the batch norms' counts of batches, DINOv3's periods.
+    The extras are arrays of public checkpoints that no descriptor needs, and that a file may lack:
+    DINOv2's mask token, the batch norms' counts of batches, DINOv3's periods.
 
     Raises:
         InputError: naming `source` and every name that is missing, unknown or misshaped.
     """
     shapes = public_shapes(config, layout)
     for line in table(config, layout):
-        if isinstance(line, Extra) and line.free_axes and line.theirs in state:
-            found = state[line.theirs].shape
-            shapes[line.theirs] = found if line.fits(found) else shapes[line.theirs]
+        if isinstance(line, Extra) and line.theirs not in state:
+            del shapes[line.theirs]
+        elif isinstance(line, Extra) and line.fits(state[line.theirs].shape):
+            shapes[line.theirs] = state[line.theirs].shape
     problems = [f"{name} missing" for name in shapes.keys() - state.keys()]
     problems += [f"{name} unknown" for name in state.keys() - shapes.keys()]
     problems += [
@@ -193,7 +230,8 @@ def to_params(
     extras: dict[str, np.ndarray] = {}
     for line in table(config, layout):
         if isinstance(line, Extra):
-            (extras[line.name],) = line.form.ours(state[line.theirs])
+            if line.theirs in state:
+                (extras[line.name],) = line.form.ours(state[line.theirs])
         elif isinstance(line, Absent):
             shape = template[line.ours].shape
             ours[line.ours] = np.full(shape, line.value, np.float32)

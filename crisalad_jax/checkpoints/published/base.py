@@ -116,7 +116,7 @@ def nearest_names(name: str) -> str:
     plain = re.sub(r"[^a-z0-9]+", "-", name.lower())
     near = [plain] if plain in PUBLISHED else []
     # No published one, but --weights takes its name, too.
-    near += difflib.get_close_matches(plain, (starter.NAME,), n=1, cutoff=0.75)
+    near += difflib.get_close_matches(plain, starter.FILES, n=1, cutoff=0.75)
     # Of a family that is named alone the longest descriptors, which recall the most.
     near += sorted(
         (each for each in PUBLISHED if each.startswith(f"{plain}-")),

@@ -9,7 +9,8 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from crisalad_jax.checkpoints.starter import NAME, resolved
+from crisalad_jax.checkpoints.runtime import read_header
+from crisalad_jax.checkpoints.starter import FILES, resolved
 from crisalad_jax.config.io import from_plain
 from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
@@ -38,7 +39,7 @@ class MapHead:
     model: str
     """The `model_hash` of the weights that describe its images, and its queries."""
     weights: str
-    """Where those weights were: a path, or `starter.NAME`."""
+    """Where those weights were: a path, or a name in `starter.FILES`."""
     descriptor_length: int
     store: str = "files"
     """Where descriptors are stored; see `store.store_name`."""
@@ -189,7 +190,10 @@ def check_model(
             f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
         )
     elif digest != description.model:
-        version = " of another version of this package" if description.weights == NAME else ""
+        file = FILES.get(description.weights)
+        known = None if file is None else read_header(file)
+        is_todays = known is None or known["model_sha256"] == description.model
+        version = "" if is_todays else " of another version of this package"
         raise InputError(
             f"{folder}: found a map made by model {description.model[:12]} "
             f"({description.weights}{version}), but {weights} is model {digest[:12]}: expected the "

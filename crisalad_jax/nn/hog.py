@@ -1,0 +1,85 @@
+"""Histograms of oriented gradients (Dalal and Triggs, CVPR 2005), a baseline without learning."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
+
+_SIDE = 128
+_CELL = 8
+_CELLS = _SIDE // _CELL
+_BINS = 9
+_DIM = (_CELLS - 1) ** 2 * 4 * _BINS
+_GREY = (9798, 19235, 3735)
+"""Shares of red, green and blue in 2^15 parts, by which OpenCV makes a picture grey (BT.601)."""
+
+
+@BACKBONES.register("hog")
+@dataclasses.dataclass(frozen=True)
+class HogConfig(Backbone):
+    """Histograms of oriented gradients of 128 x 128 pixels (Dalal and Triggs, CVPR 2005).
+
+    Pictures are grey, with Sobel gradients. Unsigned angles fall into 9 bins, linearly between the
+    two nearest. Cells have 8 x 8 pixels. Blocks of 2 x 2 cells, one cell apart, are divided by
+    their L2 norms. A picture without gradients gets equal values. There are no parameters: the
+    class token is the descriptor. Images are bytes, with a mean of 0 and a deviation of 1/255.
+    """
+
+    dim: int = _DIM
+    depth: int = 1
+    patch_size: ClassVar[int] = _SIDE
+
+    def __post_init__(self) -> None:
+        """Check that its sizes are the only ones."""
+        require(
+            (self.dim, self.depth) == (_DIM, 1),
+            f"HogConfig: found dim {self.dim} and depth {self.depth}, expected {_DIM} and 1",
+        )
+
+    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """Return 1 x 1: the whole image is one patch."""
+        height, width = image_size
+        require(
+            (height, width) == (_SIDE, _SIDE),
+            f"image size: found {height} x {width}, expected {_SIDE} x {_SIDE} for backbone hog",
+        )
+        return 1, 1
+
+    def init(self, key: PRNGKeyArray) -> None:
+        """Return no parameters."""
+
+    def apply(
+        self,
+        params: None,
+        images: Float[Array, "image height width 3"],
+        request: FeatureRequest,
+        *,
+        remat: str,
+    ) -> Features:
+        """Return the descriptor as the class token, and as the only patch."""
+        pixels = jnp.round(images.astype(jnp.float32)).astype(jnp.int32)
+        grey = (pixels * jnp.array(_GREY, jnp.int32)).sum(axis=-1) + (1 << 14) >> 15
+        padded = jnp.pad(grey.astype(jnp.float32), ((0, 0), (1, 1), (1, 1)), mode="reflect")
+        rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
+        columns = padded[..., :-2] + 2 * padded[..., 1:-1] + padded[..., 2:]
+        across, down = rows[..., 2:] - rows[..., :-2], columns[:, 2:] - columns[:, :-2]
+
+        # In bins, from the centre of the first: each of the two nearest takes 1 less the distance.
+        angle = jnp.arctan2(down, across) % jnp.pi * (_BINS / jnp.pi) - 0.5
+        away = jnp.abs(angle[..., None] - jnp.arange(_BINS, dtype=jnp.float32))
+        shares = jnp.maximum(0, 1 - jnp.minimum(away, _BINS - away))
+        votes = jnp.sqrt(across**2 + down**2)[..., None] * shares
+        cells = votes.reshape(-1, _CELLS, _CELL, _CELLS, _CELL, _BINS).sum(axis=(2, 4))
+
+        corners = (cells[:, i : i + _CELLS - 1, j : j + _CELLS - 1] for i in (0, 1) for j in (0, 1))
+        blocks = jnp.concatenate(list(corners), axis=-1)
+        norms = jnp.linalg.norm(blocks, axis=-1, keepdims=True)
+        blocks = jnp.where(norms > 0, blocks / jnp.where(norms > 0, norms, 1), 0)
+        descriptors = blocks.reshape(-1, _DIM)
+        is_flat = ~descriptors.any(axis=-1, keepdims=True)
+        descriptors = jnp.where(is_flat, 1, descriptors)
+        return Features(descriptors, descriptors[:, None])

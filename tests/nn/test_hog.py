@@ -1,0 +1,184 @@
+"""HOG against a pixel-by-pixel writing of its definition, and on real photographs."""
+
+import dataclasses
+import json
+import math
+import pathlib
+
+import cv2
+import numpy as np
+import pytest
+
+import crisalad_jax as cj
+from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.runtime import read_header
+from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.data import benchmarks
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.nn.hog import HogConfig
+from crisalad_jax.training.loop import check_learns
+from crisalad_jax.utils.errors import InputError
+from tests.cli.test_cli import Capture, fails, succeeds
+from tests.conftest import RECIPE
+
+PHOTOGRAPHS = pathlib.Path(__file__).parents[3] / "shared" / "data"
+
+
+CONFIG = cj.ModelConfig(
+    image_size=(128, 128),
+    preprocessing=cj.PreprocessingConfig(mean=(0.0, 0.0, 0.0), deviation=(1 / 255,) * 3),
+    backbone="hog",
+    aggregator="class-token",
+    cross_image=cj.CrossImageConfig(layers=0),
+)
+
+
+def hog(pictures):
+    """The descriptors of pictures of 128 x 128."""
+    params, config = cj.load("hog")
+    return np.asarray(cj.describe(params, np.asarray(pictures), config))
+
+
+def test_its_file_is_its_configuration():
+    params, config = cj.load("hog")
+    assert config == CONFIG
+    header = read_header(find_weights("hog"))
+    assert header["model_sha256"] == model_hash(params, config)
+    # It has no weights to go with a state of the code.
+    assert "parts" not in header
+
+
+def _grey_picture(grey):
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def _naive_hog(grey):
+    """The definition in loops, for a 128 x 128 picture."""
+    padded = np.pad(grey.astype(np.float64), 1, mode="reflect")
+    cells = np.zeros((16, 16, 9))
+    for y in range(128):
+        for x in range(128):
+            (a, b, c), (d, _, f), (g, h, i) = padded[y : y + 3, x : x + 3]
+            across = c + 2 * f + i - a - 2 * d - g
+            down = g + 2 * h + i - a - 2 * b - c
+            angle = math.degrees(math.atan2(down, across)) % 180
+            # Bins are 20 degrees wide with centres at 10, 30, ... 170; 170 and 10 are neighbours.
+            position = (angle - 10) / 20
+            low = math.floor(position)
+            strength = math.hypot(across, down)
+            cells[y // 8, x // 8, low % 9] += strength * (low + 1 - position)
+            cells[y // 8, x // 8, (low + 1) % 9] += strength * (position - low)
+    parts = []
+    for row in range(15):
+        for column in range(15):
+            block = cells[row : row + 2, column : column + 2].ravel()
+            parts.append(block / np.linalg.norm(block))
+    descriptor = np.concatenate(parts)
+    return descriptor / np.linalg.norm(descriptor)
+
+
+def test_hog_is_its_definition():
+    grey = np.random.default_rng(0).integers(0, 256, (128, 128))
+    found = hog(_grey_picture(grey)[None])
+    assert found.shape == (1, 8100)
+    assert found.dtype == np.float32
+    # 1e-5 of entries near 0.01 to 0.03: gradients and angles are float32.
+    np.testing.assert_allclose(found[0], _naive_hog(grey), atol=1e-6, rtol=1e-5)
+
+
+def test_an_edge_falls_into_the_bins_of_its_angle():
+    # A vertical edge has angle 0: half in the bin of 170 degrees, half in that of 10.
+    grey = np.zeros((128, 128))
+    grey[:, 61:] = 200
+    blocks = hog(_grey_picture(grey)[None]).reshape(15, 15, 4, 9)
+    energy = (blocks.astype(np.float64) ** 2).sum(axis=(0, 1, 2))
+    # 1e-6: float32 squares that add up to 1.
+    np.testing.assert_allclose(energy, [0.5, 0, 0, 0, 0, 0, 0, 0, 0.5], atol=1e-6)
+    # Columns 60 and 61 have gradients; both are in cell column 7, so in blocks of columns 6 and 7.
+    np.testing.assert_array_equal(blocks.any(axis=(0, 2, 3)).nonzero()[0], [6, 7])
+
+
+def test_contrast_and_brightness_do_not_matter():
+    grey = np.random.default_rng(1).integers(0, 100, (128, 128))
+    found = hog(np.stack([_grey_picture(grey), _grey_picture(2 * grey + 30)]))
+    # 1e-6: doubled integers give doubled float32 gradients, up to the rounding of their angles.
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+
+
+def test_every_picture_gets_a_unit_descriptor():
+    pictures = np.random.default_rng(2).integers(0, 256, (3, 128, 128, 3)).astype(np.uint8)
+    pictures[1] = 90  # one colour
+    found = hog(pictures)
+    # 1e-5: 8,100 float32 squares.
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    assert np.ptp(found[1]) == 0
+
+
+def test_colours_are_grey_as_opencv_has_them():
+    colours = np.random.default_rng(3).integers(0, 256, (128, 128, 3)).astype(np.uint8)
+    grey = _grey_picture(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY))
+    np.testing.assert_array_equal(*hog(np.stack([colours, grey])))
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("sped_val", (60.5, 76.9, 85.0)), ("corridor", (43.2, 71.2, 82.9))]
+)
+def test_recall_on_photographs(name, expected):
+    if not (PHOTOGRAPHS / name).is_dir():
+        pytest.skip(f"no photographs in {PHOTOGRAPHS / name}")
+    benchmark = benchmarks.open_benchmark(PHOTOGRAPHS / name)
+    (result,) = cj.evaluate(*cj.load("hog"), benchmark, quiet=True)
+    for k, recall in zip((1, 5, 10), expected, strict=True):
+        # 2 points, two or three queries: another JPEG decoder changes grey levels by one.
+        assert 100 * result.recalls[k] == pytest.approx(recall, abs=2)
+
+
+def test_a_set_is_ranked_as_by_its_definition(shared: pathlib.Path):
+    """All pictures of both sides, by the definition in loops and a plain product."""
+    benchmark = benchmarks.open_benchmark(shared / "town")
+
+    def described(paths):
+        resized = (resize_image(read_image(path), (128, 128)) for path in paths)
+        return np.stack([_naive_hog(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY)) for x in resized])
+
+    database, queries = described(benchmark.database), described(benchmark.queries)
+    expected = np.argsort(-(queries @ database.T), axis=1, kind="stable")
+    (result,) = cj.evaluate(*cj.load("hog"), benchmark, quiet=True)
+    np.testing.assert_array_equal(result.neighbours.indices, expected)
+    pairs = zip(expected, benchmark.ground_truth(), strict=True)
+    assert result.recalls[1] == np.mean([np.isin(row[:1], truth).any() for row, truth in pairs])
+
+
+def test_its_name_is_taken_by_every_verb_that_describes(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+):
+    town = shared / "town"
+    images, out = town / "images" / "test" / "database", tmp_path / "map"
+    words = succeeds(capfd, "evaluate", "--data", town, "--weights", "hog", "--quiet")
+    assert "hog images at 128 x 128" in " ".join(words.split())
+    given = ("--test", town, "--weights", "hog", "starter", "--seeds", 1, "--quiet")
+    words = succeeds(capfd, "compare", *given, "--out", tmp_path / "compared")
+    assert "hog" in words
+    succeeds(capfd, "index", "--images", images, "--weights", "hog", "--out", out, "--quiet")
+    assert json.loads((out / "map.json").read_text())["weights"] == "hog"
+    first = sorted(images.iterdir())[0]
+    succeeds(capfd, "query", first, "--map", out, "--quiet")
+    npy = tmp_path / "hog.npy"
+    succeeds(capfd, "extract", "--images", images, "--weights", "hog", "--out", npy, "--quiet")
+    assert np.load(npy).shape[1] == 8100
+    assert "baseline" in succeeds(capfd, "models")
+    assert "baseline" in succeeds(capfd, "models", "hog")
+
+
+def test_what_it_cannot_do_is_one_line(
+    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
+):
+    size = ("--image-size", 224, 224)
+    data = ("--data", shared / "town", "--weights", "hog")
+    fails(capfd, "evaluate", *data, *size, words=("found 224 x 224, expected 128 x 128",))
+    recipe = dataclasses.replace(RECIPE, model=CONFIG)
+    with pytest.raises(InputError, match=r"found all, of which backbone hog with .* no parameters"):
+        check_learns(recipe)
+    with pytest.raises(InputError, match="found dim 9 and depth 1, expected 8100 and 1"):
+        HogConfig(dim=9)
