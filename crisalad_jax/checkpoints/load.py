@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING, NamedTuple
 
 from crisalad_jax.checkpoints import starter
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from crisalad_jax.nn.model import Crisalad
 
 
+@brief
 class Model(NamedTuple):
     """A model's parameters and configuration."""
 

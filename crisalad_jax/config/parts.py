@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, ca
 
 from crisalad_jax.config.checks import REGISTRY, check_types
 from crisalad_jax.config.concise import concise_repr, in_one_line
+from crisalad_jax.config.field_docs import with_field_docs
 from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_of
 from crisalad_jax.utils.errors import InputError
 
@@ -213,7 +214,7 @@ class Registry(Generic[P]):
                 f"{earlier!r}, expected one name for a class"
             )
         part.part_name = name
-        self._parts[name] = part
+        self._parts[name] = with_field_docs(part)
         self._presets[name] = presets
 
     def names(self) -> list[str]:

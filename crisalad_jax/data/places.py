@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.own_places import read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
@@ -27,6 +28,7 @@ IDS_PER_CITY = 10**5
 Order = Literal["within-city", "shuffled"]
 
 
+@brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class Places:
     """Images grouped by place: place p owns images `place_start[p]` to `place_start[p + 1]`."""

@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.utils.errors import InputError
 
@@ -13,6 +14,7 @@ AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
 """Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
 
 
+@brief
 class Positions(NamedTuple):
     """Positions by image name; images without a position are absent."""
 
@@ -44,6 +46,7 @@ def utm_positions(names: Sequence[str]) -> Positions:
     return Positions(AXES[0], positions)
 
 
+@brief
 class ImageTable(NamedTuple):
     """A table of images, with their positions as far as it has them."""
 

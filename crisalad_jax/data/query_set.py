@@ -6,6 +6,7 @@ import pathlib
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import has_split
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
@@ -14,6 +15,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Int64
 
 
+@brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class QuerySet:
     """Queries that have positives in a database, and these positives."""

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crisalad_jax.config.checks import check_types
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float64, Int64
 
@@ -19,6 +20,7 @@ _PRIOR_FRAMES = 10
 """Number of frames that the map's own mean counts for in the mean of the frames so far."""
 
 
+@brief
 class SequenceState(NamedTuple):
     """What a filter knows after some frames."""
 
@@ -151,6 +153,7 @@ class BayesFilter:
         return np.convolve(values, np.ones(2 * reach + 1))[reach : reach + len(values)]
 
 
+@brief
 class Followed(NamedTuple):
     """Where a camera was at each frame of a sequence."""
 

@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Callable, Generator
 from typing import NamedTuple
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import THREADS, OnBadImage
 from crisalad_jax.data.places import Places
@@ -19,6 +20,7 @@ from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
 
+@brief
 class FitResult(NamedTuple):
     """Result of a run."""
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
@@ -47,6 +48,7 @@ class Spread(NamedTuple):
     most: float
 
 
+@brief
 class Row(NamedTuple):
     """A line of the table: a method under one grouping."""
 
@@ -74,6 +76,7 @@ class Row(NamedTuple):
     """Differences to the reference by set, then by K; None of the reference itself."""
 
 
+@brief
 class Summary(NamedTuple):
     """Contents of the tables and the page."""
 

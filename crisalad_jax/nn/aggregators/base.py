@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.parts import Part, Registry
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
@@ -17,6 +18,7 @@ from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.errors import InputError
 
 
+@brief
 class TokenShape(NamedTuple):
     """The shape of an image's tokens: a global one and local ones."""
 

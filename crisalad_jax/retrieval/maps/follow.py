@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.sequence import BayesFilter, SequenceState
 from crisalad_jax.utils.shapes import Float32, Float64, Int64
@@ -13,6 +14,7 @@ _NUMBERS = 2**25
 """Similarities computed at a time: 128 MiB."""
 
 
+@brief
 class Followed(NamedTuple):
     """Images of a map at each of some frames, the most probable first."""
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time
@@ -35,6 +36,7 @@ AT_ONCE = 1024
 """Number of queries that are searched for together: the map is read once for so many."""
 
 
+@brief
 class Answers(NamedTuple):
     """The answers to some queries, by query."""
 

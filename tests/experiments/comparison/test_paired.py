@@ -70,7 +70,7 @@ def test_it_is_a_bootstrap_written_out(same_seeds):
         values.append(ours[seeds][:, queries].mean() - theirs[others][:, queries].mean())
     expected = np.quantile(values, (0.025, 0.975))
     found = paired_difference(ours, theirs, same_seeds=same_seeds).interval
-    # A quantile of 10,000 draws is off by a thirtieth of their deviation; 0.15 of it is four of that.
+    # A quantile of 10,000 draws is off by a thirtieth of their deviation, four times which is 0.13.
     assert found == pytest.approx(expected, abs=0.15 * np.std(values))
     assert (found.high - found.low < 0.1) == same_seeds
 

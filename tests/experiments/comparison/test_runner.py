@@ -340,7 +340,7 @@ def test_rows_draw_seeds_together_where_they_share_them(finished, settings, shar
         write_json(folder / "training.json", trained)
         write_json(folder / "test-0.json", record | {"groupings": {"single": ranks[seed]}})
     speed = read_json(finished / "speed.json", "times")
-    write_json(finished / "speed.json", speed | {"rounds": dict.fromkeys(names, [1.0])})
+    write_json(finished / "speed.json", speed | {"rounds": {name: [1.0] for name in names}})
     _, same, alone = comparison.summarise(prepared, finished).rows
     assert same.differences["town"][1].interval == (0, 0)
     # All queries hit or miss with their seed: two seeds miss both in a quarter of the resamples.
