@@ -218,8 +218,8 @@ def _relate_windows(
     descriptors = _relate_last(
         params,
         folder.of(images),
-        places.reshape(windows.images.shape)[rows],
-        windows.looks(folder.readable)[rows],
+        jnp.asarray(places.reshape(windows.images.shape)[rows]),
+        jnp.asarray(windows.looks(folder.readable)[rows]),
         config,
     )
     return np.asarray(descriptors)[: len(windows.images)]
