@@ -34,7 +34,7 @@ from crisalad_jax.checkpoints.runtime import (
     TOKENS,
 )
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
-from crisalad_jax.config.checks import check_types, choose
+from crisalad_jax.config.checks import PATH, check_types, choose, takes
 from crisalad_jax.config.concise import concise
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
@@ -221,6 +221,7 @@ def _without_sources() -> Iterator[None]:
         jax.config.update(_SOURCES, before)
 
 
+@takes(out=PATH)
 def write_export(
     out: str | os.PathLike[str],
     params: Crisalad,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.images import read_image
@@ -104,6 +105,7 @@ def _read(
         raise InputError(f"{path}: {error}") from error
 
 
+@takes(places=Places)
 def training_batches(
     places: Places,
     *,

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.own_places import read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
@@ -67,6 +68,7 @@ class Places:
         return f"place {self.place_id[place] % IDS_PER_CITY} of {city}"
 
 
+@takes(root=PATH)
 def read_places(
     root: str | os.PathLike[str], *, cities: Sequence[str] | None = None, min_images: int = 4
 ) -> Places:

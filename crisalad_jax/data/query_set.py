@@ -6,6 +6,7 @@ import pathlib
 
 import numpy as np
 
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import has_split
@@ -37,6 +38,7 @@ class QuerySet:
         return pathlib.Path(self.files[image])
 
 
+@takes(root=PATH)
 def read_query_set(
     root: str | os.PathLike[str],
     *,

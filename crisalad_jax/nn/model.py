@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
 from crisalad_jax.nn.backbones.base import Features
@@ -59,6 +60,7 @@ class Crisalad:
     """Parameters of `ModelConfig.projection`; None without one."""
 
 
+@takes(config=ModelConfig)
 def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     """Draw random parameters in float32.
 
@@ -165,6 +167,7 @@ def _check_classes(params: Any, config: Any) -> None:
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
 
 
+@takes(config=ModelConfig)
 def cast_params(params: Any, config: ModelConfig) -> Any:
     """Cast the weights of the backbone's large linear layers to the type of their products.
 

@@ -6,6 +6,7 @@ import pathlib
 from collections.abc import Callable, Generator
 from typing import NamedTuple
 
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import THREADS, OnBadImage
@@ -34,6 +35,7 @@ class FitResult(NamedTuple):
     """Number of unreadable images that were masked out, counted each time they came up."""
 
 
+@takes(config=TrainConfig, places=(Places, QuerySet), out=PATH)
 def fit(
     config: TrainConfig,
     places: Places | QuerySet,

@@ -13,7 +13,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.losses import (
     Loss,
@@ -219,6 +219,7 @@ def _init_loss(key: PRNGKeyArray | None, loss: Loss, config: StepConfig) -> Clas
     return None
 
 
+@takes(config=TrainConfig)
 def step_config(
     config: TrainConfig,
     *,
@@ -268,6 +269,7 @@ def step_config(
     )
 
 
+@takes(config=TrainConfig)
 def make_train_step(
     config: TrainConfig,
     *,

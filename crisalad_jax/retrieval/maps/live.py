@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count
+from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.live import Frame
@@ -52,6 +52,7 @@ class LiveAnswer(NamedTuple):
         return json_text({"query": row.pop("query")} | more | row)
 
 
+@takes(places=Map)
 def query_live(
     places: Map,
     params: "Crisalad | Runtime",

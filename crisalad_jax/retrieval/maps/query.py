@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count
+from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import check_rate_used, open_source
@@ -87,6 +87,7 @@ class Answers(NamedTuple):
         return position_fields(image, self.axes)
 
 
+@takes(places=Map)
 def query(
     places: Map,
     params: "Crisalad | Runtime",
