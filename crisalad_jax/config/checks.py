@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 import math
 import os
 import types
@@ -95,7 +96,7 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
     """
 
     def decorate(function: _F) -> _F:
-        names = function.__code__.co_varnames
+        names = list(inspect.signature(function).parameters)
         places = [(names.index(name), name, kind) for name, kind in kinds.items()]
 
         @functools.wraps(function)

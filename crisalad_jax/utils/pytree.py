@@ -73,6 +73,8 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
 def check_drawn(tree: Any, where: str) -> None:
     """Check that new parameters are arrays of numbers that can train, in float32 at least.
 
+    An array of no numbers is no parameter: optimisers divide by its size. None stands for it.
+
     Raises:
         InputError: naming `where` and the first leaf that is not.
     """
@@ -81,6 +83,8 @@ def check_drawn(tree: Any, where: str) -> None:
         if dtype not in (jnp.float32, jnp.float64):
             path = f" {name}" if name else ""
             raise InputError(f"{where}: found parameter{path} of type {dtype}, expected float32")
+        if not leaf.size:
+            raise InputError(f"{where}: found no numbers in parameter {name}, expected None")
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:

@@ -53,6 +53,9 @@ class Aggregator(Part, abc.ABC):
         768
     """
 
+    dimension_first: ClassVar[bool] = False
+    """Whether descriptors have the first dimension of all local tokens, then their second, and so
+    on, as public ones; if not, token after token."""
     learns: ClassVar[bool] = True
     """Whether its parameters train; if not, no part of the model does."""
     fixed_grid: ClassVar[bool] = False
@@ -104,9 +107,9 @@ class Aggregator(Part, abc.ABC):
             key: draws dropout, one for all or one an image; None means inference.
         """
 
-    def order(self, local: Float[Array, "token dim"]) -> Array:
+    def order(self, local: Float[Array, "*batch token dim"]) -> Array:
         """Return the local tokens in the published order of the descriptor's numbers."""
-        return local
+        return jnp.swapaxes(local, -2, -1) if self.dimension_first else local
 
     def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
         """Raise InputError where an image with this grid is too small; by default never."""
