@@ -106,6 +106,15 @@ import crisalad_jax as cj
 class Thawed:
     scale: float = 1.0
 """, "register_loss 'thawed': found Thawed, which is no frozen dataclass, expected @dataclasses."),
+    "thawed loss": ("""
+import dataclasses
+import crisalad_jax as cj
+
+@cj.register_loss("thawed")
+@dataclasses.dataclass
+class Thawed(cj.Loss):
+    scale: float = 1.0
+""", "found a part that is no frozen dataclass in line 6, expected @dataclasses.dataclass(frozen="),
     "bare": ("""
 import crisalad_jax as cj
 

@@ -34,7 +34,8 @@ from crisalad_jax.checkpoints.runtime import (
     TOKENS,
 )
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
-from crisalad_jax.config.checks import check_types, choose
+from crisalad_jax.config.checks import PATH, check_types, choose, takes
+from crisalad_jax.config.concise import concise
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.prepare import normalised
@@ -84,6 +85,7 @@ _PROBES = 3
 """Images that a program of any number of images is checked with."""
 
 
+@concise()
 @dataclasses.dataclass(frozen=True)
 class ExportConfig:
     """The format, the inputs and the platforms of an exported program.
@@ -219,6 +221,7 @@ def _without_sources() -> Iterator[None]:
         jax.config.update(_SOURCES, before)
 
 
+@takes(out=PATH)
 def write_export(
     out: str | os.PathLike[str],
     params: Crisalad,

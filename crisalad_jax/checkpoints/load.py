@@ -6,6 +6,8 @@ import re
 from typing import TYPE_CHECKING, NamedTuple
 
 from crisalad_jax.checkpoints import starter
+from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from crisalad_jax.nn.model import Crisalad
 
 
+@brief
 class Model(NamedTuple):
     """A model's parameters and configuration."""
 
@@ -21,6 +24,7 @@ class Model(NamedTuple):
     config: "ModelConfig"
 
 
+@takes(path=PATH)
 def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
     """Load a model from a file of this package, a public checkpoint, or a published one by name.
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.engines import EngineName, Precision, Program, load_program
 from crisalad_jax.config.checks import choose
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.prepare import Preparation
@@ -40,6 +41,7 @@ _READS: Mapping[str, tuple[str, ...]] = {
 """Formats that an engine reads, its own first."""
 
 
+@brief
 @dataclasses.dataclass(frozen=True)
 class Runtime:
     """A model in an engine, in place of its parameters.

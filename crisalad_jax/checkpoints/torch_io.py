@@ -39,6 +39,7 @@ from crisalad_jax.checkpoints.weights import (
     save_weights,
 )
 from crisalad_jax.config.checks import choose
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
@@ -110,6 +111,7 @@ _SETTINGS = "crisalad-jax config"
 """Key of the configuration in the metadata of a public checkpoint that we write."""
 
 
+@brief
 class Checkpoint(NamedTuple):
     """A model from any file we can read."""
 

@@ -215,7 +215,7 @@ def _hashes(folder: pathlib.Path) -> dict[str, str]:
 
 
 def _stored(state: PyTree) -> dict[str, Any]:
-    """Return the leaves by name, without empty ones (absent registers), which orbax refuses."""
+    """Return the leaves by name, without empty ones, which orbax refuses."""
     return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}
 
 

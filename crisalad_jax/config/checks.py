@@ -2,10 +2,12 @@
 
 import dataclasses
 import functools
+import inspect
 import math
+import os
 import types
-from collections.abc import Mapping
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -64,6 +66,54 @@ def check_count(what: str, count: Any) -> None:
     if not isinstance(count, types) or isinstance(count, bool):
         raise InputError(f"{what}: found {count!r}, expected {words} of at least 1")
     require(int(count) >= 1, f"{what}: found {count}, expected at least 1")
+
+
+PATH = (str, os.PathLike)
+"""Classes of a file's or a folder's name."""
+_ABSENT = object()
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
+    """Make a decorator that checks the classes of a public function's arguments.
+
+    Two that are swapped are then one line, and not an attribute that something lacks far below.
+
+    Args:
+        **kinds: the class, or the classes, of an argument by its name.
+
+    Returns:
+        The decorator.
+
+    Example:
+        >>> @takes(path=PATH, k=int)
+        ... def look(path, k=5):
+        ...     return k
+        >>> look(5, "picture.jpg")
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: path: found 5, expected a path
+    """
+
+    def decorate(function: _F) -> _F:
+        names = list(inspect.signature(function).parameters)
+        places = [(names.index(name), name, kind) for name, kind in kinds.items()]
+
+        @functools.wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            for place, name, kind in places:
+                value = args[place] if place < len(args) else options.get(name, _ABSENT)
+                if value is not _ABSENT and not isinstance(value, kind):
+                    plain = value is None or isinstance(value, str | int | float)
+                    found = repr(value) if plain else type(value).__name__
+                    classes = kind if isinstance(kind, tuple) else (kind,)
+                    words = "a path" if kind is PATH else ", or ".join(map(_words, classes))
+                    raise InputError(f"{name}: found {found}, expected {words}")
+            return function(*args, **options)
+
+        return cast(_F, call)
+
+    return decorate
 
 
 def check_types(config: Any) -> None:

@@ -1,19 +1,28 @@
-"""Print a configuration by what differs from the defaults, as Python that makes it again."""
+"""How public classes print: their `repr`, and their HTML in a notebook."""
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable
+import pathlib
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
+
+from crisalad_jax.config.field_docs import with_field_docs
 
 _T = TypeVar("_T")
 _WIDTH = 88
 """Characters of a line, at most: as a notebook shows without a scroll bar."""
+_FEW = 4
+"""Number of items in a collection that is shown whole; of a larger one the first is shown."""
 _SWITCH = "__concise_switch__"
 _ALWAYS = "__concise_always__"
+_BRIEF = "__concise_brief__"
 
 
 def concise(*always: str, switch: tuple[str, Any] | None = None) -> Callable[[type[_T]], type[_T]]:
-    """Return a decorator that gives a dataclass the `repr` of `concise_repr`.
+    """Return a decorator that gives a configuration the `repr` of `concise_repr`.
+
+    Its `help` shows the texts below its fields.
 
     Args:
         *always: fields that are printed at their defaults too.
@@ -24,29 +33,54 @@ def concise(*always: str, switch: tuple[str, Any] | None = None) -> Callable[[ty
         setattr(cls, _ALWAYS, always)
         setattr(cls, _SWITCH, switch)
         cls.__repr__ = concise_repr  # pyright: ignore[reportAttributeAccessIssue]
-        return cls
+        return with_field_docs(cls)
 
     return decorate
 
 
-def concise_repr(config: Any) -> str:
-    """Write a configuration as the call that makes it, without fields that change nothing.
+def brief(cls: type[_T]) -> type[_T]:
+    """Give a class of results a `repr` of a line for each field, whatever its size.
+
+    Arrays print as type and shape, parameters as their number, collections as their first items. A
+    notebook shows the same as a table, and `help` the texts below the fields.
+
+    Args:
+        cls: a dataclass or NamedTuple.
+
+    Example:
+        >>> import numpy as np
+        >>> from typing import NamedTuple
+        >>> @brief
+        ... class Found(NamedTuple):
+        ...     names: list[str]
+        ...     descriptors: np.ndarray
+        >>> Found([f"{i}.jpg" for i in range(9)], np.zeros((9, 256)))
+        Found(names=['0.jpg', ... 8 more], descriptors=float64[9, 256])
+    """
+    setattr(cls, _BRIEF, True)
+    cls.__repr__ = concise_repr  # pyright: ignore[reportAttributeAccessIssue]
+    cls._repr_html_ = _html  # pyright: ignore[reportAttributeAccessIssue]
+    return with_field_docs(cls)
+
+
+def concise_repr(value: Any) -> str:
+    """Write a value as the call that makes it, without fields that change nothing.
 
     Those are fields at their defaults, and fields that are not in use. A part at its defaults is
     its name. Long calls take a line for each field.
 
     Args:
-        config: a dataclass.
+        value: a dataclass, or a NamedTuple that is `brief`.
 
     Returns:
-        Python, where the classes that it names are imported.
+        For a configuration Python, where the classes that it names are imported.
 
     Example:
         >>> from crisalad_jax import CrossImageConfig, ModelConfig
         >>> print(ModelConfig(aggregator="gem", cross_image=CrossImageConfig(layers=0, heads=4)))
         ModelConfig(backbone='vit', aggregator='gem', cross_image=CrossImageConfig(layers=0))
     """
-    return _write(config, "", 0, _WIDTH)
+    return _write(value, "", 0, _WIDTH)
 
 
 def in_one_line(value: Any) -> str:
@@ -59,34 +93,88 @@ def _write(value: Any, before: str, indent: int, width: float) -> str:
     """Write `before` and a value; the line has `indent` characters already."""
     if type(value).__repr__ is not concise_repr:
         return f"{before}{value!r}"
-    shown = _shown(value)
+    shown = list(_shown(value))
     name = getattr(value, "part_name", None)
     if before and name and not shown:
         return f"{before}{name!r}"
     opening = f"{before}{type(value).__qualname__}("
-    line = f"{opening}{', '.join(_write(*field, 0, math.inf) for field in shown)})"
+    inner = indent + 4
+    if hasattr(value, _BRIEF):
+        texts = [f"{field}={_short(each)}" for field, each in shown]
+        lines = [_clipped(text, _WIDTH - inner) for text in texts]
+    else:
+        texts = [_write(each, f"{field}=", 0, math.inf) for field, each in shown]
+        lines = [_write(each, f"{field}=", inner, width) for field, each in shown]
+    line = f"{opening}{', '.join(texts)})"
     if indent + len(line) <= width:
         return line
-    inner = indent + 4
-    fields = [f"{' ' * inner}{_write(*field, inner, width)},\n" for field in shown]
-    return f"{opening}\n{''.join(fields)}{' ' * indent})"
+    fields = "".join(f"{' ' * inner}{line},\n" for line in lines)
+    return f"{opening}\n{fields}{' ' * indent})"
 
 
-def _shown(config: Any) -> list[tuple[Any, str]]:
-    """Return the values of the fields that are printed, each with `name=`."""
-    always, switch = getattr(config, _ALWAYS, ()), getattr(config, _SWITCH, None)
-    fields = dataclasses.fields(config)
-    if switch is not None and getattr(config, switch[0]) == switch[1]:
+def _short(value: Any) -> str:
+    """Write a field of a `brief` class in one line."""
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if isinstance(shape, tuple) and dtype is not None:
+        return f"{dtype}{list(shape)}" if shape else str(value)
+    if type(value).__repr__ is concise_repr:
+        return _write(value, "", 0, math.inf)
+    if isinstance(value, pathlib.PurePath):
+        return repr(str(value))
+    if isinstance(value, float):  # a fraction has four digits, and metres all of theirs
+        return f"{value:.4g}" if abs(value) < 1000 else repr(value)
+    if isinstance(value, Mapping):
+        return _few("{}", len(value), (f"{k!r}: {_short(v)}" for k, v in value.items()))
+    if hasattr(value, "_fields"):
+        fields = (f"{name}={_short(each)}" for name, each in zip(value._fields, value, strict=True))
+        return f"{type(value).__name__}({', '.join(fields)})"
+    if isinstance(value, list | tuple):
+        return _few("[]" if isinstance(value, list) else "()", len(value), map(_short, value))
+    first, *more = repr(value).splitlines() or [""]
+    return f"{first}, {more[-1]}" if more else first  # parameters: their class and their number
+
+
+def _few(ends: str, count: int, items: Iterator[str]) -> str:
+    texts = list(itertools.islice(items, count if count <= _FEW else 1))
+    if count > _FEW:
+        texts.append(f"... {count - 1:,} more")
+    return f"{ends[0]}{', '.join(texts)}{ends[1]}"
+
+
+def _clipped(text: str, width: int) -> str:
+    return text if len(text) <= width else f"{text[: width - 4]} ..."
+
+
+def _html(self: Any) -> str:
+    import html
+
+    rows = (
+        f"<tr><th>{field}</th><td>{html.escape(_clipped(_short(value), _WIDTH))}</td></tr>"
+        for field, value in _shown(self)
+    )
+    return f"<table><caption>{type(self).__qualname__}</caption>{''.join(rows)}</table>"
+
+
+def _shown(value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of the fields that are printed."""
+    if not dataclasses.is_dataclass(value):
+        for name in value._fields:
+            if getattr(value, name) is not value._field_defaults.get(name, dataclasses.MISSING):
+                yield name, getattr(value, name)
+        return
+    always, switch = getattr(value, _ALWAYS, ()), getattr(value, _SWITCH, None)
+    fields = dataclasses.fields(value)
+    if switch is not None and getattr(value, switch[0]) == switch[1]:
         fields = [field for field in fields if field.name == switch[0]]
-    values = [(field, getattr(config, field.name)) for field in fields]
-    return [
-        (value, f"{field.name}=")
-        for field, value in values
-        if field.name in always or not _is_default(field, value)
-    ]
+    for field in fields:
+        each = getattr(value, field.name)
+        if field.name in always or not _is_default(field, each):
+            yield field.name, each
 
 
 def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
     if field.default_factory is not dataclasses.MISSING:
         return value == field.default_factory()
-    return field.default is not dataclasses.MISSING and value == field.default
+    if field.default is dataclasses.MISSING:
+        return False
+    return value is field.default or (not hasattr(value, "shape") and value == field.default)

@@ -4,19 +4,15 @@
 fields.
 """
 
-import ast
 import contextlib
 import dataclasses
-import functools
-import inspect
 import io
-import itertools
-import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
+from crisalad_jax.config.field_docs import field_docs
 from crisalad_jax.config.parts import Part, Registry
 from crisalad_jax.utils.errors import InputError
 
@@ -229,31 +225,3 @@ def config_of(flags: Flags, parsed: Any) -> Any:
         given = getattr(parsed, name)
         values[name] = config_of(value, given) if isinstance(value, Flags) else given
     return flags.kind(**values)
-
-
-@functools.cache
-def field_docs(kind: type) -> Mapping[str, str]:
-    """Read the texts below the fields of a dataclass and of its base classes."""
-    docs: dict[str, str] = {}
-    for each in reversed(kind.__mro__):
-        if not dataclasses.is_dataclass(each):
-            continue
-        try:
-            source = textwrap.dedent(inspect.getsource(each))
-        except (OSError, TypeError):  # made in a console
-            continue
-        (node,) = ast.parse(source).body
-        body = node.body if isinstance(node, ast.ClassDef) else []
-        for line, below in itertools.pairwise(body):
-            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
-                text = _text(below)
-                if text is not None:
-                    docs[line.target.id] = text
-    return docs
-
-
-def _text(node: ast.stmt) -> str | None:
-    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-        value = node.value.value
-        return inspect.cleandoc(value) if isinstance(value, str) else None
-    return None

@@ -9,10 +9,11 @@ import functools
 import importlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 from crisalad_jax.config.checks import REGISTRY, check_types
 from crisalad_jax.config.concise import concise_repr, in_one_line
+from crisalad_jax.config.field_docs import with_field_docs
 from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_of
 from crisalad_jax.utils.errors import InputError
 
@@ -54,7 +55,18 @@ class Part:
 P = TypeVar("P", bound=Part)
 
 if TYPE_CHECKING:
-    OrName = Annotated[P, "or its name"]
+
+    class OrName(Generic[P]):
+        """A field that takes a part or its name, and has the part."""
+
+        def __get__(self, instance: object, owner: Any = None) -> P:
+            """Return the part."""
+            ...
+
+        def __set__(self, instance: object, value: P | str) -> None:
+            """Take a part or its name."""
+            ...
+
 else:
 
     class OrName:
@@ -215,7 +227,7 @@ class Registry(Generic[P]):
                 f"{earlier!r}, expected one name for a class"
             )
         part.part_name = name
-        self._parts[name] = part
+        self._parts[name] = with_field_docs(part)
         self._presets[name] = presets
 
     def names(self) -> list[str]:
@@ -262,7 +274,7 @@ class Registry(Generic[P]):
         return part(**{**self._presets[name].get(preset or "", {}), **fields})
 
 
-def part_field(registry: Registry[P], default: str | type[P]) -> P:
+def part_field(registry: Registry[P], default: str | type[P]) -> Any:
     """Return a dataclass field for a part, by default the one with this name, or of this class."""
     make: Any = functools.partial(registry.make, default) if isinstance(default, str) else default
     return dataclasses.field(default_factory=make, metadata={REGISTRY: registry})

@@ -126,6 +126,11 @@ def _run(load: Callable[[], ModuleType], file: str) -> None:
             lines.append(error.lineno)
         where = f" in line {lines[-1]}" if lines else ""
         what = " ".join(str(error).split())
+        if "non-frozen dataclass" in what:  # a part's, before it is registered
+            raise InputError(
+                f"found a part that is no frozen dataclass{where}, expected "
+                "@dataclasses.dataclass(frozen=True)"
+            ) from error
         raise InputError(
             f"cannot be loaded: it raises {type(error).__name__}{where}: {what}"
         ) from error

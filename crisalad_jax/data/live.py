@@ -12,6 +12,7 @@ from typing import NamedTuple, Self
 import cv2
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.images import IMAGE_SUFFIXES, read_image
 from crisalad_jax.data.opencv import QUIET
@@ -32,6 +33,7 @@ _TURN = 0.1
 """Longest seconds between two calls of `check`."""
 
 
+@brief
 class Frame(NamedTuple):
     """A picture with its moment."""
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from crisalad_jax.config.checks import takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.opencv import ONE_THREAD
@@ -35,6 +37,7 @@ THREADS = usable_cores()
 """OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
 
 
+@brief
 class ImageBatch(NamedTuple):
     """Images of one size; `valid` is False for padding and for images that cannot be read."""
 
@@ -102,6 +105,7 @@ def _read(
         raise InputError(f"{path}: {error}") from error
 
 
+@takes(places=Places)
 def training_batches(
     places: Places,
     *,

@@ -15,6 +15,8 @@ from typing import Literal
 
 import numpy as np
 
+from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.names import Disk, plain
 from crisalad_jax.data.own_places import read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
@@ -31,6 +33,7 @@ _Listings = dict[str, tuple[str, dict[str, str]]]
 """Folder below Images/, as a table names it -> its name on disk, and the names in it."""
 
 
+@brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class Places:
     """Images grouped by place: place p owns images `place_start[p]` to `place_start[p + 1]`."""
@@ -69,6 +72,7 @@ class Places:
         return f"place {self.place_id[place] % IDS_PER_CITY} of {city}"
 
 
+@takes(root=PATH)
 def read_places(
     root: str | os.PathLike[str], *, cities: Sequence[str] | None = None, min_images: int = 4
 ) -> Places:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.utils.errors import InputError
@@ -28,6 +29,7 @@ _NEAR = 9.0
 distances right to about one percent."""
 
 
+@brief
 class Positions(NamedTuple):
     """Positions by image name; images without a position are absent."""
 
@@ -180,6 +182,7 @@ def utm_positions(names: Sequence[str]) -> Positions:
     return Positions(AXES[1], _by_name(there, np.round(degrees, 9)))
 
 
+@brief
 class ImageTable(NamedTuple):
     """A table of images, with their positions as far as it has them."""
 

@@ -6,6 +6,8 @@ import pathlib
 
 import numpy as np
 
+from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import has_split
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
@@ -14,6 +16,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Int64
 
 
+@brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class QuerySet:
     """Queries that have positives in a database, and these positives."""
@@ -35,6 +38,7 @@ class QuerySet:
         return pathlib.Path(self.files[image])
 
 
+@takes(root=PATH)
 def read_query_set(
     root: str | os.PathLike[str],
     *,

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, names_in
 from crisalad_jax.data.names import Disk
 from crisalad_jax.data.positions import Positions, read_image_table
@@ -31,6 +32,7 @@ _PATTERN = re.compile(r"[*?\[]")
 _AN_IMAGE = "an image file"
 
 
+@brief
 class ImageSource(NamedTuple):
     """Images in order, and the names that descriptors and maps know them by."""
 

@@ -2,6 +2,7 @@
 
 import datetime
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.evaluation.evaluate import evaluate
@@ -18,6 +19,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import next_writer
 
 
+@takes(places=Map, benchmark=Benchmark)
 def calibrate(
     places: Map,
     params: Crisalad,

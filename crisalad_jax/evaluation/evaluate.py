@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.checks import takes
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
@@ -42,6 +43,7 @@ Observe = Callable[
 """Takes the name of a grouping, the database's descriptors, and the queries' descriptors."""
 
 
+@takes(config=ModelConfig, benchmark=Benchmark)
 def evaluate(
     params: Model,
     config: ModelConfig,

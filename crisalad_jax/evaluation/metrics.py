@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.errors import InputError
 
 
@@ -115,6 +116,7 @@ def bootstrap_interval(
     return Interval(float(low) / (size - 1), float(high) / (size - 1))
 
 
+@brief
 class PrecisionRecall(NamedTuple):
     """Precision and recall of accepting first retrievals by similarity, strictest threshold first.
 

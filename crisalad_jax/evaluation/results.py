@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import (
     Interval,
@@ -37,6 +38,7 @@ class Scores(NamedTuple):
     """See `PrecisionRecall`; None where no query has a positive."""
 
 
+@brief
 class Skipped(NamedTuple):
     """The unreadable images that an evaluation left out, by their indices in the benchmark."""
 
@@ -54,6 +56,7 @@ class Skipped(NamedTuple):
 _NONE = Skipped()
 
 
+@brief
 class GroupingResult(NamedTuple):
     """The result of a benchmark under one grouping."""
 

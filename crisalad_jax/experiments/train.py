@@ -4,6 +4,7 @@ import os
 import pathlib
 from collections.abc import Callable
 
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.own_places import TABLE
@@ -21,6 +22,7 @@ from crisalad_jax.utils.errors import InputError
 Path = str | os.PathLike[str]
 
 
+@takes(config=TrainConfig, data=PATH, out=PATH)
 def train(
     config: TrainConfig,
     data: Path,

@@ -13,11 +13,13 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.parts import Part, Registry, count_arguments
 
 Similarities = Float[Array, "anchor image"]
 
 
+@brief
 class Pairs(NamedTuple):
     """The pairs (anchor, other) that enter the loss."""
 
@@ -25,6 +27,7 @@ class Pairs(NamedTuple):
     negatives: Bool[Array, "anchor image"]
 
 
+@brief
 @dataclasses.dataclass(frozen=True)
 class LossBatch:
     """The inputs of a loss for one batch."""
@@ -60,6 +63,7 @@ class LossBatch:
         return jnp.maximum(self.valid.sum(), 1)
 
 
+@brief
 class LossValue(NamedTuple):
     """A loss, and an accuracy that a classification logs beside it."""
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, takes
 from crisalad_jax.config.concise import concise
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
 from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, Pairs, Similarities, check_value
@@ -111,6 +111,7 @@ def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
     )
 
 
+@takes(config=LossConfig)
 def metric_loss(
     descriptors: Float[Array, "image descriptor"],
     labels: Int[Array, " image"],

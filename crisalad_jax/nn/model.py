@@ -7,13 +7,15 @@ import dataclasses
 import functools
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
 from crisalad_jax.nn.backbones.base import Features
@@ -39,7 +41,9 @@ from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclas
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
 """Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
-Images = UInt8[Array, "image height width 3"] | Float[Array, "image height width 3"]
+AnyArray = Array | np.ndarray
+Images = UInt8[AnyArray, "image height width 3"] | Float[AnyArray, "image height width 3"]
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 
 @pytree_dataclass
@@ -56,6 +60,7 @@ class Crisalad:
     """Parameters of `ModelConfig.projection`; None without one."""
 
 
+@takes(config=ModelConfig)
 def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     """Draw random parameters in float32.
 
@@ -162,6 +167,7 @@ def _check_classes(params: Any, config: Any) -> None:
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
 
 
+@takes(config=ModelConfig)
 def cast_params(params: Any, config: ModelConfig) -> Any:
     """Cast the weights of the backbone's large linear layers to the type of their products.
 
@@ -192,7 +198,7 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     return jax.tree.map(cast, params)
 
 
-def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[..., Any]:
+def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[[_F], _F]:
     """Make a decorator that checks what a trace cannot, before the call of a compiled function.
 
     Args:
@@ -200,7 +206,7 @@ def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[..
         check: raises InputError where the second argument has wrong values.
     """
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(function: _F) -> _F:
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
             given = dict(zip(("params", second, "config"), args, strict=False), **options)
@@ -214,7 +220,7 @@ def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[..
                 check_params(given["params"], given["config"])  # a leaf may be no array
                 raise
 
-        return call
+        return cast(_F, call)
 
     return decorate
 
@@ -238,7 +244,7 @@ def describe(
     images: Images,
     config: ModelConfig,
     *,
-    mask: Bool[Array, "image image"] | None = None,
+    mask: Bool[AnyArray, "image image"] | None = None,
     key: Key[Array, ""] | None = None,
     micro_batch: int | None = None,
 ) -> Float[Array, "image descriptor"]:
@@ -484,6 +490,7 @@ def _extract_features(
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
     if images.shape[0] == 0:
         raise InputError("images: found none, expected at least one")
+    images = jnp.asarray(images)
     config.check_image_size((images.shape[1], images.shape[2]))
     if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):
         raise InputError(
@@ -532,7 +539,7 @@ def attend_across_images(
     tokens: Tokens,
     config: ModelConfig,
     *,
-    mask: Bool[Array, "image image"] | None = None,
+    mask: Bool[AnyArray, "image image"] | None = None,
     key: Key[Array, ""] | None = None,
 ) -> Float[Array, "image descriptor"]:
     """Attend across images and make their descriptors, the second half of `describe`.
@@ -575,7 +582,7 @@ def attend_across_images(
                     f"mask: found shape {mask.shape}, expected {(count, count)}, a row and a "
                     "column for each image"
                 )
-            mask = mask | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
+            mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
         with jax.named_scope("cross_image"):
             sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
             sequence = cross_image_encoder(
@@ -643,15 +650,16 @@ def self_mask(count: Any) -> Bool[Array, "image image"]:
 def valid_mask(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
     """Return the mask that lets valid images attend to each other, and the others to themselves.
 
-    Args:
-        valid: which images are no padding.
+        Args:
+            valid: which images are no padding.
 
-    Returns:
-        A mask for `describe`.
+        Returns:
+            A mask for `describe`.
 
-    Example:
-        >>> import jax.numpy as jnp
-        >>> valid_mask(jnp.array([True, False])).tolist()
-        [[True, False], [False, True]]
+        Example:
+            >>> import jax.numpy as jnp
+    import numpy as np
+            >>> valid_mask(jnp.array([True, False])).tolist()
+            [[True, False], [False, True]]
     """
     return valid[None, :] & valid[:, None] | jnp.eye(len(valid), dtype=bool)

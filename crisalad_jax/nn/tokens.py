@@ -5,6 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from crisalad_jax.config.concise import brief
+
 
 class TransportStatistics(NamedTuple):
     """Statistics of a transport, for a log."""
@@ -17,6 +19,7 @@ class TransportStatistics(NamedTuple):
     """Effective number of patches in a cluster, exp(entropy of its mass), as a mean of clusters."""
 
 
+@brief
 class Tokens(NamedTuple):
     """One global token an image, and local tokens: of SALAD's clusters, or a pyramid's regions.
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
@@ -102,6 +103,7 @@ def describe_files(
     return np.concatenate(parts)
 
 
+@takes(config=ModelConfig)
 def describe_images(
     params: Model,
     config: ModelConfig,

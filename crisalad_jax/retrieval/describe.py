@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int64
 
 from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
@@ -32,6 +33,7 @@ from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.progress import progress_bar
 
 
+@brief
 class FolderTokens(NamedTuple):
     """Tokens of many images on the host (see `Tokens`), and which images could be read."""
 
@@ -216,8 +218,8 @@ def _relate_windows(
     descriptors = _relate_last(
         params,
         folder.of(images),
-        places.reshape(windows.images.shape)[rows],
-        windows.looks(folder.readable)[rows],
+        jnp.asarray(places.reshape(windows.images.shape)[rows]),
+        jnp.asarray(windows.looks(folder.readable)[rows]),
         config,
     )
     return np.asarray(descriptors)[: len(windows.images)]

@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.shapes import Float32, Int64
 
 
+@brief
 class Described(NamedTuple):
     """Descriptors of a few images."""
 

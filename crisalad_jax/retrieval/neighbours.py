@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 
@@ -12,6 +13,7 @@ _PIECE = 2**17
 """Size of a piece that is multiplied in float64, in numbers: 1 MiB, which fits a core's cache."""
 
 
+@brief
 class Neighbours(NamedTuple):
     """The most similar database images of each query, best first."""
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import check_seed, check_types
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
 from crisalad_jax.utils.checksums import checked_safetensors
@@ -51,6 +52,7 @@ class PcaConfig:
         check_types(self)
 
 
+@brief
 class Pca(NamedTuple):
     """Principal components, fitted by `fit_pca`."""
 

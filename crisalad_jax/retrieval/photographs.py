@@ -3,12 +3,14 @@
 import os
 from collections.abc import Iterator, Sequence
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage, image_batches
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
 
 
+@takes(config=ModelConfig)
 def prepare_image(image: Pixels, config: ModelConfig) -> Pixels:
     """Resize a photograph as a model's configuration says; floats are normalised, too.
 

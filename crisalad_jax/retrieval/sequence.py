@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crisalad_jax.config.checks import check_types
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float64, Int64
 
@@ -23,6 +24,7 @@ _ROUNDING = 5e-4
 """Seconds or metres that rounding may hide: videos' times are in whole milliseconds."""
 
 
+@brief
 class SequenceState(NamedTuple):
     """What a filter knows after some frames."""
 
@@ -201,6 +203,7 @@ class BayesFilter:
         return Followed(np.array(places, np.int64), np.array(probabilities))
 
 
+@brief
 class Followed(NamedTuple):
     """Where a camera was at each frame of a sequence."""
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.chunks import check_rows, pieces
@@ -38,6 +39,7 @@ _SHARES = "shares"
 """Key of the shares' digest in a set's record."""
 
 
+@brief
 class Extracted(NamedTuple):
     """The descriptors of a set of images."""
 

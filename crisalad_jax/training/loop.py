@@ -6,6 +6,8 @@ import pathlib
 from collections.abc import Callable, Generator
 from typing import NamedTuple
 
+from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import THREADS, OnBadImage
 from crisalad_jax.data.places import Places
@@ -20,6 +22,7 @@ from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
 
+@brief
 class FitResult(NamedTuple):
     """Result of a run."""
 
@@ -33,6 +36,7 @@ class FitResult(NamedTuple):
     """Number of unreadable images that were masked out, counted each time they came up."""
 
 
+@takes(config=TrainConfig, places=(Places, QuerySet), out=PATH)
 def fit(
     config: TrainConfig,
     places: Places | QuerySet,

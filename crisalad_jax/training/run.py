@@ -433,7 +433,7 @@ class Run:
             told: of several processes, what this one tells the others with the step.
         """
         before = self._before = self._pending
-        proceed = self._all_is_well if before is None else before.metrics.updated
+        proceed: Any = self._all_is_well if before is None else before.metrics.updated
         batch = self._no_images() if batch is None else batch
         self.state, metrics = train_step(
             self.state,

@@ -13,7 +13,8 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.losses import (
     Loss,
     LossConfig,
@@ -54,6 +55,7 @@ LossFunction = Callable[..., Float[Array, ""]]
 """Takes descriptors, labels and, if it has a third argument, which images are valid."""
 
 
+@brief
 class TrainState(NamedTuple):
     """State that changes from step to step."""
 
@@ -65,6 +67,7 @@ class TrainState(NamedTuple):
     """Parameters of the loss, if it has any."""
 
 
+@brief
 class Metrics(NamedTuple):
     """Scalars of one step."""
 
@@ -216,6 +219,7 @@ def _init_loss(key: PRNGKeyArray | None, loss: Loss, config: StepConfig) -> Clas
     return None
 
 
+@takes(config=TrainConfig)
 def step_config(
     config: TrainConfig,
     *,
@@ -265,6 +269,7 @@ def step_config(
     )
 
 
+@takes(config=TrainConfig)
 def make_train_step(
     config: TrainConfig,
     *,

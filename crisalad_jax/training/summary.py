@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
@@ -41,6 +42,7 @@ class ModelSummary(NamedTuple):
     """Counts of one adapter; None where there are no adapters."""
 
 
+@takes(config=ModelConfig)
 def model_summary(
     config: ModelConfig, trainable: str | None = None, *, images: int = 16
 ) -> ModelSummary:

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.parts import Part, Registry
 from crisalad_jax.transport.diagnose import wide_dtype
 from crisalad_jax.utils.errors import InputError
 
 
+@brief
 class Marginals(NamedTuple):
     """Scores that include the dustbin, and the masses of rows and columns."""
 

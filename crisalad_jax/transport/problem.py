@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.pytree import pytree_dataclass, static_field
 
 SCALING_RANGE = 60
@@ -20,6 +21,7 @@ NO_MASS = -1e5
 """Logarithm below which a mass is 0: no format of floats holds exp(-1e5)."""
 
 
+@brief
 class Potentials(NamedTuple):
     """Dual variables over epsilon: the plan is exp(kernel + row + column)."""
 

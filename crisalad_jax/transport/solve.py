@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.config.concise import brief
 from crisalad_jax.transport.config import SinkhornConfig
 from crisalad_jax.transport.diagnose import (
     check_init,
@@ -25,6 +26,7 @@ from crisalad_jax.transport.problem import Potentials, Problem, zero_potentials
 from crisalad_jax.utils.errors import InputError
 
 
+@brief
 class SinkhornResult(NamedTuple):
     """A transport plan and how well it meets its marginals."""
 

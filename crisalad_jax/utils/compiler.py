@@ -4,7 +4,7 @@ import contextlib
 import functools
 import os
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import jax
 from jax.extend.core import get_opaque_trace_state
@@ -15,6 +15,8 @@ from crisalad_jax.utils.kept import kept
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R", covariant=True)
 _LEAST_MEMORY: dict[str, bool | str] = {
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"
 }
@@ -51,9 +53,19 @@ def compiler_options(*, runs_long: bool = False) -> dict[str, bool | str]:
     return _LEAST_MEMORY if target().platform == "cpu" and tested and not runs_long else {}
 
 
-def jit(
-    function: Callable[..., Any], *, runs_long: bool = False, **options: Any
-) -> Callable[..., Any]:
+class Jitted(Protocol[_P, _R]):
+    """A compiled function."""
+
+    def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        """Compute it."""
+        ...
+
+    def lower(self, *args: Any, **kwargs: Any) -> jax.stages.Lowered:
+        """Lower it for the `target`; arguments may be shapes."""
+        ...
+
+
+def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) -> Jitted[_P, _R]:
     """Wrap a function in `jax.jit` with `compiler_options`, outside of other transformations.
 
     Inside another transformation the outermost `jit` decides, because JAX takes no other options.
@@ -95,7 +107,7 @@ def jit(
             return traced.lower(lowering_platforms=lowering_platforms())
 
     call.__dict__["lower"] = lower
-    return call
+    return cast(Jitted[_P, _R], call)
 
 
 def _precision_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[None]:

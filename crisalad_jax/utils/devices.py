@@ -4,7 +4,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import numpy as np
@@ -21,6 +21,7 @@ SHARD_FROM = 2**14
 IMAGE = "image"
 """Name of the mesh's one axis, over which images are sharded."""
 _Tree = TypeVar("_Tree")
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 
 class Devices(NamedTuple):
@@ -132,7 +133,7 @@ def parts_for_caches(images: int, at_once: int) -> int:
     return share // max(n for n in range(1, max(1, at_once) + 1) if share % n == 0)
 
 
-def over_images(argument: str, position: int) -> Callable[[Any], Any]:
+def over_images(argument: str, position: int) -> Callable[[_F], _F]:
     """Make a decorator that tells a compiled function over which devices its images are sharded.
 
     The traced function sees the mesh by `image_mesh`. The sharding of an argument is known before
@@ -146,7 +147,7 @@ def over_images(argument: str, position: int) -> Callable[[Any], Any]:
         The decorator; it keeps `lower`.
     """
 
-    def decorate(function: Any) -> Any:
+    def decorate(function: _F) -> _F:
         def told(call: Callable[..., Any]) -> Callable[..., Any]:
             @functools.wraps(call)
             def within(*args: Any, **options: Any) -> Any:
@@ -157,8 +158,8 @@ def over_images(argument: str, position: int) -> Callable[[Any], Any]:
             return within
 
         wrapped = told(function)
-        wrapped.__dict__["lower"] = told(function.lower)
-        return wrapped
+        wrapped.__dict__["lower"] = told(getattr(function, "lower"))  # noqa: B009
+        return cast(_F, wrapped)
 
     return decorate
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -72,6 +73,8 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
 def check_drawn(tree: Any, where: str) -> None:
     """Check that new parameters are arrays of numbers that can train, in float32 at least.
 
+    An array of no numbers is no parameter: optimisers divide by its size. None stands for it.
+
     Raises:
         InputError: naming `where` and the first leaf that is not.
     """
@@ -80,6 +83,8 @@ def check_drawn(tree: Any, where: str) -> None:
         if dtype not in (jnp.float32, jnp.float64):
             path = f" {name}" if name else ""
             raise InputError(f"{where}: found parameter{path} of type {dtype}, expected float32")
+        if not leaf.size:
+            raise InputError(f"{where}: found no numbers in parameter {name}, expected None")
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
@@ -88,12 +93,17 @@ def named_leaves(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
+_MOST = 24
+"""Number of lines of a printed tree, at most."""
+
+
 def summary(tree: Any) -> str:
     """Write a line for each leaf, its name, shape and type, and the totals below.
 
-    Values are neither read nor computed, so leaves may be arrays of any kind, tracers or
-    `jax.ShapeDtypeStruct`. Where a field is None there is no leaf. Of a leaf without a shape the
-    line has its class.
+    In a larger tree, a line has the number of the leaves whose names begin alike, and of their
+    parameters, so that there are at most `_MOST` lines; `named_leaves` has all. Values are neither
+    read nor computed, so leaves may be arrays of any kind, tracers or `jax.ShapeDtypeStruct`. Where
+    a field is None there is no leaf. Of a leaf without a shape the line has its class.
 
     Args:
         tree: a pytree, such as a model's parameters.
@@ -108,26 +118,43 @@ def summary(tree: Any) -> str:
           bias  (3,)  float32
         1 leaf, 3 parameters, 12 bytes
     """
+    leaves = {name: _sizes(leaf) for name, leaf in named_leaves(tree).items()}
+    depths = range(max((name.count(".") for name in leaves), default=0), -1, -1)
+    groupings = (_by_prefix(leaves, depth + 1) for depth in depths)
+    groups = next((each for each in groupings if len(each) <= _MOST), {"...": list(leaves)})
     lines: list[tuple[str, str, str]] = []
-    count = size = 0
-    for name, leaf in named_leaves(tree).items():
-        shape, dtype = getattr(leaf, "shape", None), getattr(leaf, "dtype", None)
-        if not isinstance(shape, tuple) or dtype is None:
-            lines.append((name, type(leaf).__name__, ""))
-            continue
-        lines.append((name, str(shape), str(dtype)))
-        if all(isinstance(side, int) for side in shape):  # an export's sides may be symbols
-            count += math.prod(shape)
-            size += math.prod(shape) * getattr(dtype, "itemsize", 0)
+    for prefix, names in groups.items():
+        shape, dtype, count, _ = leaves[names[0]]
+        if len(names) > 1:
+            shape, dtype = f"{len(names)} leaves", f"{sum(leaves[n][2] for n in names):,}"
+        lines.append((names[0] if len(names) == 1 else prefix, shape, dtype))
     name_width, shape_width = (max((len(row[i]) for row in lines), default=0) for i in (0, 1))
+    count, size = sum(leaf[2] for leaf in leaves.values()), sum(leaf[3] for leaf in leaves.values())
     return "\n".join(
         [
             type(tree).__name__,
             *(f"  {n:{name_width}}  {s:{shape_width}}  {d}".rstrip() for n, s, d in lines),
-            f"{len(lines)} lea{'f' if len(lines) == 1 else 'ves'}, {count:,} parameters, "
+            f"{len(leaves)} lea{'f' if len(leaves) == 1 else 'ves'}, {count:,} parameters, "
             f"{_in_bytes(size)}",
         ]
     )
+
+
+def _sizes(leaf: Any) -> tuple[str, str, int, int]:
+    """Return a leaf's shape and type as text, its numbers and its bytes."""
+    shape, dtype = getattr(leaf, "shape", None), getattr(leaf, "dtype", None)
+    if not isinstance(shape, tuple) or dtype is None:
+        return type(leaf).__name__, "", 0, 0
+    # An export's sides may be symbols.
+    count = math.prod(shape) if all(isinstance(side, int) for side in shape) else 0
+    return str(shape), str(dtype), count, count * getattr(dtype, "itemsize", 0)
+
+
+def _by_prefix(names: Iterable[str], depth: int) -> dict[str, list[str]]:
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(".".join(name.split(".")[:depth]), []).append(name)
+    return groups
 
 
 def _in_bytes(size: int) -> str:

@@ -56,7 +56,7 @@ def analysed(config: TrainConfig, step: StepConfig, images: int) -> dict[str, An
     batch = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in batch_of(config, images)]
     key = jax.eval_shape(lambda: jax.random.key(0))
     lowered = train_step.lower(*jax.eval_shape(start), *batch, key, step)  # pyright: ignore
-    found = lowered.compile().memory_analysis()
+    found: Any = lowered.compile().memory_analysis()
     return {
         "type": step.compute_dtype,
         "micro_batch": step.micro_batch,
@@ -72,8 +72,8 @@ def taken(config: TrainConfig, step: StepConfig, images: int) -> dict[str, Any]:
     )
     frozen = devices.replicate(cast_params(jax.device_get(frozen), step.model))
     state = jax.jit(lambda tree: jax.tree.map(jax.numpy.copy, tree))(devices.replicate(state))
-    batch = map(devices.shard_batch, batch_of(config, images))
-    state, metrics = train_step(state, frozen, *batch, jax.random.key(1), step)
+    pixels, labels, valid = map(devices.shard_batch, batch_of(config, images))
+    state, metrics = train_step(state, frozen, pixels, labels, valid, jax.random.key(1), step)
     # Linux counts in KiB, others in bytes.
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {

@@ -94,7 +94,8 @@ def our_step(both: Sides, config: TrainConfig, spread: bool) -> Contender:
     count, size = devices.mesh.size, sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     state = jax.tree.map(jnp.copy, state)
     images = devices.shard_batch(both.images)
-    rest = (frozen, images, labels(both), np.ones(len(both.images), bool), jax.random.key(0))
+    valid = jnp.ones(len(both.images), bool)
+    rest = (frozen, images, jnp.asarray(labels(both)), valid, jax.random.key(0))
 
     def call() -> float:
         nonlocal state

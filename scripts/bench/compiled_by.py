@@ -49,15 +49,15 @@ def training(batch: int, devices: Any, preset: str, dtype: str) -> tuple[Callabl
     state, frozen = devices.replicate(init_train_state(params, config.trainable, step))
     state = jax.tree.map(jax.numpy.copy, state)
     images = np.random.default_rng(0).integers(0, 256, (batch, *model.image_size, 3), np.uint8)
-    labels = (np.arange(batch) // 4).astype(np.int32)
-    rest = (frozen, devices.shard_batch(images), labels, np.ones(batch, bool), jax.random.key(0))
+    labels, valid = jax.numpy.arange(batch) // 4, jax.numpy.ones(batch, bool)
+    rest = (frozen, devices.shard_batch(images), labels, valid, jax.random.key(0))
 
     def call() -> Any:
         nonlocal state
         state, metrics = train_step(state, *rest, step)
         return metrics.loss
 
-    return call, lambda: train_step.lower(state, *rest, step).compile()  # pyright: ignore
+    return call, lambda: train_step.lower(state, *rest, step).compile()
 
 
 def timed(call: Callable[[], Any]) -> float:

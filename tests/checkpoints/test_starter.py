@@ -1,6 +1,7 @@
 """The model in the package: its file, its numbers on another machine, what it tells apart."""
 
 import pathlib
+import warnings
 
 import jax
 import numpy as np
@@ -38,6 +39,13 @@ def test_another_machine_gets_the_same_descriptors() -> None:
     images = np.stack([prepare_image(image, config) for image in golden["images"]])
     found = np.asarray(describe(params, images, config))
     np.testing.assert_allclose(found, golden["descriptors"], rtol=0, atol=TOLERANCE)
+
+
+def test_it_has_the_sources_of_its_parts() -> None:
+    """Else each load tells that descriptors may differ: `save_weights` records them anew."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)
+        load("starter")
 
 
 def test_its_name_is_its_file_and_no_weights_mean_it_with_a_note() -> None:

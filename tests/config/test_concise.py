@@ -1,13 +1,38 @@
 """Configurations as they print."""
 
 import dataclasses
+import inspect
+import pathlib
+import pydoc
+import re
+import subprocess
+import sys
 
+import numpy as np
 import pytest
 
 import crisalad_jax as cj
+from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.concise import concise_repr
+from crisalad_jax.config.field_docs import field_docs
+from crisalad_jax.config.parts import REGISTRIES, Part
+from crisalad_jax.data.live import Frame
+from crisalad_jax.data.loader import ImageBatch
+from crisalad_jax.data.places import Places
+from crisalad_jax.evaluation.metrics import PrecisionRecall
+from crisalad_jax.evaluation.results import GroupingResult
+from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.retrieval.maps.build import Indexed
+from crisalad_jax.retrieval.maps.live import LiveAnswer
+from crisalad_jax.retrieval.maps.query import Answers
+from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.pca import Pca
+from crisalad_jax.retrieval.sets import Extracted
 from crisalad_jax.training.recipes import RECIPES
+from crisalad_jax.training.vocabulary import Vocabulary
+from crisalad_jax.transport.solve import SinkhornResult
+from crisalad_jax.utils.pytree import summary
 
 NAMES = {
     kind.__name__: kind
@@ -59,3 +84,100 @@ def test_a_message_with_a_configuration_is_one_line():
         cj.PreprocessingConfig(antialias=cj.PRESETS["tiny"])
     assert "\n" not in str(caught.value)
     assert "found ModelConfig(image_size=(98, 98), " in str(caught.value)
+
+
+LARGE = re.compile(
+    r"ndarray|Array|Crisalad|list\[|Path, \.\.\.\]|str, \.\.\.\]|Sequence|Neighbours"
+)
+RESULTS = [
+    *(value for name in cj.__all__ if inspect.isclass(value := getattr(cj, name))),
+    *(GroupingResult, PrecisionRecall, Answers, LiveAnswer, Indexed, Extracted, Neighbours, Pca),
+    *(Places, Vocabulary, SinkhornResult, ImageBatch, Frame, Runtime),
+]
+
+
+def fields_of(kind):
+    """Annotations of a dataclass's or NamedTuple's fields, as they are written."""
+    names = getattr(kind, "_fields", ())
+    if dataclasses.is_dataclass(kind):
+        names = [field.name for field in dataclasses.fields(kind)]
+    texts = {
+        k: v for each in kind.__mro__ for k, v in vars(each).get("__annotations__", {}).items()
+    }
+    return {name: str(texts.get(name, "")) for name in names}
+
+
+@pytest.mark.parametrize("kind", [kind for kind in RESULTS if fields_of(kind)])
+def test_what_holds_arrays_or_long_lists_prints_briefly(kind):
+    large = [name for name, text in fields_of(kind).items() if LARGE.search(text)]
+    is_config = issubclass(kind, Part) or kind.__name__.endswith(("Config", "Request"))
+    assert is_config or not large or kind.__repr__ in (concise_repr, summary), large
+
+
+def test_a_result_takes_a_line_for_each_field_whatever_its_size():
+    """A result of 3,000 queries, which printed 120,000 numbers; by hand."""
+    indices, similarities = np.zeros((3000, 20), np.int64), np.ones((3000, 20), np.float32)
+    neighbours = Neighbours(indices, similarities)
+    result = GroupingResult("single", {1: 1 / 3, 5: 0.5}, neighbours, rerank="selavpr:20")
+    assert repr(result).splitlines() == [
+        "GroupingResult(",
+        "    grouping='single',",
+        "    recalls={1: 0.3333, 5: 0.5},",
+        "    neighbours=Neighbours(indices=int64[3000, 20], similarities=float32[3000, 20]),",
+        "    rerank='selavpr:20',",
+        ")",
+    ]
+    paths = tuple(pathlib.Path("set", f"{i}.jpg") for i in range(10_000))
+    benchmark = cj.Benchmark("set", pathlib.Path("set"), paths, paths[:2], None, "25 m <> 0")
+    assert repr(benchmark).splitlines()[3:5] == [
+        "    database=('set/0.jpg', ... 9,999 more),",
+        "    queries=('set/0.jpg', 'set/1.jpg'),",
+    ]
+    page = benchmark._repr_html_()
+    assert "<th>rule</th><td>&#x27;25 m &lt;&gt; 0&#x27;</td>" in page
+    assert len(page) < 1000
+
+
+def test_a_runs_result_prints_the_number_of_parameters():
+    params = parameter_shapes(cj.PRESETS["b14"])
+    text = repr(cj.FitResult(params, 10, 0.5, False, 0))  # type: ignore[arg-type]
+    assert len(text.splitlines()) == 7
+    # docs/architecture.md: 11,495,105 trainable and 86,579,712 frozen.
+    assert f"leaves, {11_495_105 + 86_579_712:,} parameters, 392.3 MB" in text
+    assert "qkv" not in text
+
+
+def test_a_line_has_a_width():
+    lines = repr(cj.Tokens(["x" * 50] * 4, {"y" * 50: 1})).splitlines()  # type: ignore[arg-type]
+    assert [len(line) for line in lines[1:-1]] == [89, 68]
+
+
+ABSTRACT = {cj.Aggregator, cj.Augmentation, cj.Backbone, cj.Loss}
+TEXTS = [kind for kind in (*NAMES.values(), *RESULTS) if fields_of(kind) and kind not in ABSTRACT]
+
+
+@pytest.mark.parametrize("kind", [kind for kind in TEXTS if kind.__repr__ is not summary])
+def test_help_shows_the_texts_below_the_fields(kind):
+    shown = " ".join(pydoc.plain(pydoc.render_doc(kind)).replace(" | ", " ").split())
+    for name in fields_of(kind).keys() & field_docs(kind).keys():
+        assert f" {name}: {' '.join(field_docs(kind)[name].split())}" in shown
+
+
+def test_help_of_a_configuration_a_part_and_a_result():
+    """As they are in the sources."""
+    for kind, text in {
+        cj.TrainConfig: " |      places_per_batch: Number of places in a batch; where the loss",
+        NAMES["CircleConfig"]: " |      margin: Relaxation margin, the paper's m.",
+        cj.FitResult: " |      params: Parameters after the last step.",
+    }.items():
+        assert text in pydoc.plain(pydoc.render_doc(kind))
+
+
+def test_an_import_reads_no_sources():
+    program = (
+        "import crisalad_jax as cj; cj.TrainConfig; cj.evaluate; cj.Map\n"
+        "from crisalad_jax.config.field_docs import field_docs\n"
+        "assert field_docs.cache_info().currsize == 0\n"
+        "assert 'patience: ' in cj.TrainConfig.__doc__"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -6,10 +6,14 @@ import warnings
 
 import jax
 import numpy as np
+import optax
 import pytest
 import torch
 
+from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.data.places import read_places
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.nn.model import init_crisalad, parameter_shapes
 from crisalad_jax.training import loop
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.optimiser import (
@@ -21,6 +25,7 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.step import StepConfig, init_train_state
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.pytree import check_drawn, named_leaves
 from tests.conftest import MODEL, RECIPE, STEPS
 
 
@@ -241,3 +246,30 @@ def test_a_warm_up_in_epochs_is_one_in_steps() -> None:
 def test_optimisers_that_do_not_fit_are_refused(fields, words) -> None:
     with pytest.raises(InputError, match=words):
         OptimiserConfig(**fields)
+
+
+def test_an_optimiser_that_divides_by_sizes_takes_every_parameter():
+    """Muon divides by the number of rows, which registers had none of."""
+    params = init_crisalad(jax.random.key(0), MODEL)
+    assert params.backbone.register_tokens is None
+    muon = optax.contrib.muon(1e-3)
+    updates, _ = muon.update(params, muon.init(params), params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(updates))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_no_parameter_is_an_array_of_no_numbers(preset):
+    assert not [n for n, x in named_leaves(parameter_shapes(PRESETS[preset])).items() if not x.size]
+
+
+def test_no_built_in_parts_parameter_is_an_array_of_no_numbers():
+    """Against shapes alone; a plug-in's is refused."""
+    backbone = PRESETS["b14"].backbone
+    for name in REGISTRIES["aggregator"]:
+        part = REGISTRIES["aggregator"].make(name)
+        made = jax.eval_shape(
+            lambda key, p=part: p.init(key, backbone, (16, 16)), jax.random.key(0)
+        )
+        check_drawn(made, name)
+    with pytest.raises(InputError, match=r"^mine: found no numbers in parameter a, expected None$"):
+        check_drawn({"a": np.zeros((0, 3), np.float32)}, "mine")

@@ -39,7 +39,10 @@ def test_leaves_without_values_are_printed():
 def test_a_model_is_printed_without_its_values(monkeypatch):
     params = jax.eval_shape(lambda key: cj.init_crisalad(key, cj.PRESETS["b14"]), jax.random.key(0))
     text = repr(params)
-    assert "\n  backbone.blocks.attn.qkv.weight           (12, 768, 2304)  float32\n" in text
+    # Of a block 768 x 2304 + 2304 for queries, keys and values, and 768 x 768 + 768 after them.
+    assert f"\n  backbone.blocks.attn             4 leaves       {12 * 2_362_368:,}\n" in text
+    assert "\n  backbone.pos_embed               (37, 37, 768)  float32\n" in text
+    assert len(text.splitlines()) <= 26
     # docs/architecture.md: 11,495,105 trainable and 86,579,712 frozen.
     assert text.endswith(f"{11_495_105 + 86_579_712:,} parameters, 392.3 MB")
 

@@ -5,10 +5,12 @@ import pathlib
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Bool, Float64, Int64
 
 
+@brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class Benchmark:
     """One evaluation set, in the order in which its images are described."""

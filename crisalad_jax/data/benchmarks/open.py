@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Callable
 from typing import NamedTuple
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.data.benchmarks import folders, vpr_bench
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import (
@@ -48,6 +48,7 @@ LAYOUTS = {
 """Layouts by the name that `open_benchmark` takes."""
 
 
+@takes(root=PATH)
 def open_benchmark(
     root: str | os.PathLike[str],
     split: str | None = None,

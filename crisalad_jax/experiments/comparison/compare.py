@@ -5,6 +5,7 @@ import pathlib
 import warnings
 from collections.abc import Callable
 
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.experiments.comparison.ablation import adapter_costs_once
 from crisalad_jax.experiments.comparison.page import write_page
@@ -19,6 +20,7 @@ from crisalad_jax.utils.locks import next_writer
 from crisalad_jax.utils.notes import Note
 
 
+@takes(config=ComparisonConfig, out=PATH)
 def compare(
     config: ComparisonConfig,
     out: str | os.PathLike[str],

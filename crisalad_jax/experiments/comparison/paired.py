@@ -33,7 +33,7 @@ def paired_difference(
     hits: Bool[np.ndarray, "seed q"],
     reference: Bool[np.ndarray, "other_seed q"],
     *,
-    same_runs: bool = False,
+    same_seeds: bool = True,
     resamples: int = RESAMPLES,
     confidence: float = 0.95,
     seed: int = 0,
@@ -41,13 +41,15 @@ def paired_difference(
     """Compute the difference of two recalls, and its percentile bootstrap's interval.
 
     A resample draws as many queries with replacement, the same ones for both methods, and as many
-    seeds of each method, which are independent runs. Queries with the same hits are drawn together,
+    seeds. Runs of one seed share initial values and batches, so that the same seeds are drawn for
+    both methods; what a seed does to both cancels. Queries with the same hits are drawn together,
     by a multinomial distribution, which is exact and takes no more time for more queries.
 
     Args:
         hits: whether each query was a hit, for each seed of the method.
         reference: the same of the reference, on the same queries.
-        same_runs: both rank what the same runs describe, so that their seeds are drawn together.
+        same_seeds: whether row i of both is a run of the same seed. If not, as for a model from a
+            file, the seeds of each method are drawn independently.
         resamples: number of resamples.
         confidence: of the interval, 0 to 1.
         seed: of the resampling; the same one gives the same interval.
@@ -56,7 +58,8 @@ def paired_difference(
         The difference, positive where the method recalls more.
 
     Raises:
-        InputError: no queries or seeds, other queries than the reference's, or no such confidence.
+        InputError: no queries or seeds, other queries than the reference's, another number of seeds
+            although they are the same, or no such confidence.
 
     Example:
         >>> first, second = np.array([[True, True, True, False]]), np.array([[False] * 4])
@@ -68,9 +71,10 @@ def paired_difference(
             f"hits: found shapes {hits.shape} and {reference.shape}, expected (seeds, queries) of "
             "the same queries"
         )
-    if same_runs and len(hits) != len(reference):
+    if same_seeds and len(hits) != len(reference):
         raise InputError(
-            f"hits: found {len(hits)} and {len(reference)} seeds of the same runs, expected as many"
+            f"hits: found {len(hits)} and {len(reference)} seeds, expected the same number, or "
+            "same_seeds=False"
         )
     if not 0 < confidence < 1:
         raise InputError(f"confidence: found {confidence}, expected a fraction between 0 and 1")
@@ -81,7 +85,7 @@ def paired_difference(
     recalls = drawn @ patterns.T.astype(float) / queries
     ours, theirs = recalls[:, : len(hits)], recalls[:, len(hits) :]
     weights = _drawn_seeds(generator, resamples, len(hits))
-    other = weights if same_runs else _drawn_seeds(generator, resamples, len(reference))
+    other = weights if same_seeds else _drawn_seeds(generator, resamples, len(reference))
     differences = (weights * ours).sum(axis=1) - (other * theirs).sum(axis=1)
     tail = (1 - confidence) / 2
     # Sums that are equal in exact arithmetic must not differ by their rounding.

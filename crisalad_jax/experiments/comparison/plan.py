@@ -13,6 +13,7 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
 from crisalad_jax.data.loader import OnBadImage
@@ -220,6 +221,7 @@ class Variant:
         return range(1 if self.weights is not None else seeds)
 
 
+@brief
 class Prepared(NamedTuple):
     """A comparison whose parts fit each other."""
 

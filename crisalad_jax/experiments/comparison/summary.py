@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
@@ -39,6 +40,15 @@ class Recall(NamedTuple):
     by_seed: tuple[float, ...]
 
 
+class Spread(NamedTuple):
+    """What repeats of a measurement range over."""
+
+    median: float
+    least: float
+    most: float
+
+
+@brief
 class Row(NamedTuple):
     """A line of the table: a method under one grouping."""
 
@@ -55,21 +65,18 @@ class Row(NamedTuple):
     parameters: int
     trained: int | None
     """Number of parameters that were trained; None for a model from a file."""
-    training: float | None
-    """Training time over the reference's; None where one of the two was not trained."""
-    training_seconds: float | None
-    """Mean over the runs that were trained alone of the steps times a step's median seconds."""
+    training: Spread | None
+    """Training time over the reference's, of each of its runs to each of the reference's; None
+    where one of the two has fewer than two runs that had their device to themselves."""
+    training_seconds: Spread | None
+    """Steps times a step's median seconds, of those runs; None of fewer than two."""
     sittings: int
     """Largest number of calls that a run took; more than one if it was resumed."""
     differences: Mapping[str, Mapping[int, Difference]] | None = None
     """Differences to the reference by set, then by K; None of the reference itself."""
-    beside: bool = False
-    """Whether all runs, or all of the reference's, shared their device with others: the training
-    time tells nothing, and is None."""
-    alone: tuple[int, int] = (0, 0)
-    """Number of runs that were trained here with the device to themselves, and of all trained."""
 
 
+@brief
 class Summary(NamedTuple):
     """Contents of the tables and the page."""
 
@@ -98,19 +105,14 @@ def summarise(
     reference = _reference(prepared)
     ranks = {v.name: _ranks(prepared, out, v, sets) for v in prepared.variants}
     records = {v.name: _training_records(prepared, out, v) for v in prepared.variants}
-    alone = {
-        name: [each for each in trainings if not each.get("beside")]
-        for name, trainings in records.items()
-    }
-    seconds = {name: _seconds(trainings) for name, trainings in alone.items()}
+    seconds = {name: _seconds(trainings) for name, trainings in records.items()}
     rows = []
     for variant in prepared.variants:
         parameters, trained = _parameters(variant)
         batch = statistics.median(raced.rounds[variant.run])
         took, theirs = seconds[variant.name], seconds[reference.name]
-        beside = any(records[n.name] and not alone[n.name] for n in (variant, reference))
-        if beside:
-            took = theirs = None
+        # Runs are not interleaved: one of the same seed met no more of the same load than another.
+        ratios = [ours / other for ours in took for other in theirs]
         for grouping, of_sets in ranks[variant.name].items():
             recalls = {name: {k: recall_of(each, k) for k in KS} for name, each in of_sets.items()}
             rows.append(
@@ -124,18 +126,12 @@ def summarise(
                     measured["batch_size"] / batch if measured["absolute"] else None,
                     parameters,
                     trained,
-                    None if took is None or theirs is None else took / theirs,
-                    took,
+                    _spread(ratios),
+                    _spread(took),
                     max((record["sittings"] for record in records[variant.name]), default=0),
                     None
                     if variant is reference
-                    else _differences(
-                        of_sets,
-                        _under(ranks[reference.name], grouping),
-                        same_runs=variant.run == reference.run,
-                    ),
-                    beside,
-                    (len(alone[variant.name]), len(records[variant.name])),
+                    else _differences(of_sets, _under(ranks[reference.name], grouping)),
                 )
             )
     return Summary(
@@ -173,10 +169,14 @@ def _training_records(
     ]
 
 
-def _seconds(records: list[dict[str, Any]]) -> float | None:
-    if not records:
-        return None
-    return statistics.fmean(record["steps"] * record["step_seconds"] for record in records)
+def _seconds(records: list[dict[str, Any]]) -> list[float]:
+    """Return the seconds of the runs that had their device to themselves, if at least two had."""
+    alone = [each["steps"] * each["step_seconds"] for each in records if not each.get("beside")]
+    return alone if len(alone) > 1 else []
+
+
+def _spread(values: Sequence[float]) -> Spread | None:
+    return Spread(statistics.median(values), min(values), max(values)) if values else None
 
 
 def _parameters(variant: Variant) -> tuple[int, int | None]:
@@ -225,12 +225,19 @@ def _under(groupings: Mapping[str, dict[str, np.ndarray]], grouping: str) -> dic
 
 
 def _differences(
-    ranks: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray], *, same_runs: bool
+    ranks: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray]
 ) -> dict[str, dict[int, Difference]]:
-    """Compute differences by set and K."""
+    """Compute differences by set and K.
+
+    All that is trained here has the same seeds; a model from a file has a single one.
+    """
     return {
         name: {
-            k: paired_difference(hits_of(each, k), hits_of(reference[name], k), same_runs=same_runs)
+            k: paired_difference(
+                hits_of(each, k),
+                hits_of(reference[name], k),
+                same_seeds=len(each) == len(reference[name]),
+            )
             for k in KS
         }
         for name, each in ranks.items()
@@ -302,21 +309,10 @@ def _notes(
         notes.append(
             "Training time: steps x the median time of a step"
             + ("" if measured["absolute"] else f", over {title}'s")
-            + ", without compiling; runs are not interleaved."
+            + ", without compiling: median and range of the runs that had their device to "
+            "themselves, where these are at least two. Runs are not interleaved."
         )
         notes.append(_training_note(prepared))
-    beside = sorted({row.labels[0] for row in rows if row.beside})
-    if beside:
-        notes.append(
-            f"Trained beside others on one device, so that no training time is told: "
-            f"{', '.join(beside)}."
-        )
-    fewer = {row.labels[0]: row.alone for row in rows if 0 < row.alone[0] < row.alone[1]}
-    if fewer:
-        runs = (f"{name} {of} of {all_runs}" for name, (of, all_runs) in sorted(fewer.items()))
-        notes.append(
-            f"Training time of the runs that had their device to themselves: {', '.join(runs)}."
-        )
     resumed = sorted({row.labels[0] for row in rows if row.sittings > 1})
     if resumed:
         notes.append(
@@ -340,12 +336,16 @@ def _notes(
 
 def _difference_note(prepared: Prepared, title: str) -> str:
     """Say how the differences are computed, and what their words mean."""
-    seeds = "" if prepared.config.seeds > 1 else " One seed says nothing of another start."
+    several = prepared.config.seeds > 1
+    seeds = "" if several else " One seed says nothing of another start."
+    apart = ""
+    if several and len({variant.weights is None for variant in prepared.variants}) > 1:
+        apart = "; a model from a file shares none, so that its differences draw them independently"
     return (
         f"Δ: recall less {title}'s on the same queries, in points, with 95 % by bootstrap over "
-        f"queries (drawn together for both) and seeds (drawn for each): {RESAMPLES:,} resamples, "
-        "seed 0, percentiles. Better or worse: the interval excludes 0; else the two are not told "
-        f"apart.{seeds}"
+        "queries and seeds, both drawn together for the two rows (runs of one seed share initial "
+        f"values and batches{apart}): {RESAMPLES:,} resamples, seed 0, percentiles. Better or "
+        f"worse: the interval excludes 0; else the two are not told apart.{seeds}"
     )
 
 

@@ -12,14 +12,12 @@ from rich.text import Text
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.ablation import AdapterCost
 from crisalad_jax.experiments.comparison.paired import Difference
-from crisalad_jax.experiments.comparison.summary import KS, Recall, Row, Summary
+from crisalad_jax.experiments.comparison.summary import KS, Recall, Row, Spread, Summary
 from crisalad_jax.experiments.report.page import ESCAPED
 from crisalad_jax.experiments.report.tables import no_formula
 from crisalad_jax.utils.files import around, atomic_path, write_json
 
 NOTHING = "-"
-BESIDE = "beside others"
-"""In place of the training time of a run that had no device of its own."""
 
 
 def title_of(row: Row, rows: Sequence[Row]) -> str:
@@ -61,13 +59,20 @@ def costs_of(row: Row) -> list[str]:
     speed = f"{row.speed:.2f} x"
     if row.images_per_second is not None:
         speed = f"{row.images_per_second:.0f}"
-    training = BESIDE if row.beside else NOTHING
-    if row.training_seconds is not None and row.images_per_second is not None:
-        training = f"{row.training_seconds / 60:.1f} min"
-    elif row.training is not None:
-        training = f"{row.training:.2f} x"
+    training = NOTHING
+    if row.images_per_second is None:
+        if row.training is not None:
+            training = ratio_words(row.training)
+    elif row.training_seconds is not None:
+        minutes = (f"{seconds / 60:.1f}" for seconds in row.training_seconds)
+        training = "{} min ({} to {})".format(*minutes)
     trained = NOTHING if row.trained is None else f"{row.trained:,}"
     return [f"{row.dimension:,}", speed, f"{row.parameters:,}", trained, training]
+
+
+def ratio_words(times: tuple[float, float, float]) -> str:
+    """Format the median, the least and the most of ratios."""
+    return "{:.2f} x ({:.2f} to {:.2f})".format(*times)
 
 
 COSTS = ("dimension", "images/s", "parameters", "trained", "training time")
@@ -145,9 +150,7 @@ ADAPTERS = (
 
 def adapter_cells(cost: AdapterCost) -> list[str]:
     """Format the cost of an adapter, in the columns of `ADAPTERS`."""
-    time = NOTHING
-    if cost.time is not None:
-        time = "{:.2f} x ({:.2f} to {:.2f})".format(*cost.time)
+    time = NOTHING if cost.time is None else ratio_words(cost.time)
     # The only figure of the paper that no way of counting gives.
     printed = " (printed: 2,356,080)" if cost.adapter == "mlp" else ""
     return [
@@ -214,8 +217,12 @@ def _markdown(header: Sequence[str], rows: list[list[str]], *, labels: int) -> s
 _COLUMNS = (
     *("name", "grouping", "set", "k", "recall", "standard_deviation", "low", "high", "seeds"),
     *("dimension", "speed", "images_per_second", "parameters", "trained", "training"),
-    *("training_seconds", "difference", "difference_low", "difference_high", "verdict"),
+    *("training_least", "training_most", "training_seconds", "training_seconds_least"),
+    *("training_seconds_most", "difference", "difference_low", "difference_high", "verdict"),
 )
+
+
+_NO_SPREAD = (None,) * 3
 
 
 def comma_separated(summary: Summary) -> str:
@@ -226,7 +233,7 @@ def comma_separated(summary: Summary) -> str:
     writer.writerow([*labels, *_COLUMNS])
     for row in summary.rows:
         costs = (row.dimension, row.speed, row.images_per_second, row.parameters)
-        costs += (row.trained, row.training, _absolute(row))
+        costs += (row.trained, *(row.training or _NO_SPREAD), *(_absolute(row) or _NO_SPREAD))
         for name, recalls in row.recalls.items():
             for k, recall in recalls.items():
                 difference = None if row.differences is None else row.differences[name][k]
@@ -240,7 +247,7 @@ def comma_separated(summary: Summary) -> str:
     return text.getvalue()
 
 
-def _absolute(row: Row) -> float | None:
+def _absolute(row: Row) -> Spread | None:
     """Return the seconds of training if they are comparable, which they are not on a CPU."""
     return None if row.images_per_second is None else row.training_seconds
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.parts import Part, Registry
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
@@ -17,6 +18,7 @@ from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.errors import InputError
 
 
+@brief
 class TokenShape(NamedTuple):
     """The shape of an image's tokens: a global one and local ones."""
 
@@ -51,6 +53,9 @@ class Aggregator(Part, abc.ABC):
         768
     """
 
+    dimension_first: ClassVar[bool] = False
+    """Whether descriptors have the first dimension of all local tokens, then their second, and so
+    on, as public ones; if not, token after token."""
     learns: ClassVar[bool] = True
     """Whether its parameters train; if not, no part of the model does."""
     fixed_grid: ClassVar[bool] = False
@@ -102,9 +107,9 @@ class Aggregator(Part, abc.ABC):
             key: draws dropout, one for all or one an image; None means inference.
         """
 
-    def order(self, local: Float[Array, "token dim"]) -> Array:
+    def order(self, local: Float[Array, "*batch token dim"]) -> Array:
         """Return the local tokens in the published order of the descriptor's numbers."""
-        return local
+        return jnp.swapaxes(local, -2, -1) if self.dimension_first else local
 
     def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
         """Raise InputError where an image with this grid is too small; by default never."""

@@ -66,6 +66,7 @@ class Boq:
 class BoqConfig(Aggregator):
     """Bag of queries (Ali-bey et al., CVPR 2024)."""
 
+    dimension_first: ClassVar[bool] = True
     width_field: ClassVar[str] = "channels"
     channels: int = 384
     """Number of channels after the 3 x 3 convolution."""
@@ -127,10 +128,6 @@ class BoqConfig(Aggregator):
             answers.append(ask(block, x, self.heads))
         rows = linear(params.fc, jnp.concatenate(answers, axis=-2).swapaxes(-2, -1))
         return Tokens.of_local(at_least_float32(rows).swapaxes(-2, -1))
-
-    def order(self, local: Float[Array, "token dim"]) -> Array:
-        """Return all rows' first channel, then all their second."""
-        return local.T
 
 
 def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:

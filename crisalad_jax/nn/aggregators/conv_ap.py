@@ -26,6 +26,7 @@ class ConvAp:
 class ConvApConfig(Aggregator):
     """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
+    dimension_first: ClassVar[bool] = True
     width_field: ClassVar[str] = "channels"
     channels: int = 1024
     """Channels of the 1 x 1 convolution."""
@@ -60,10 +61,6 @@ class ConvApConfig(Aggregator):
         means = adaptive_means(at_least_float32(features.patches), grid, self.side)
         tokens = linear(params.channel_pool, means.astype(features.patches.dtype))
         return Tokens.of_local(at_least_float32(tokens))
-
-    def order(self, local: Float[Array, "token dim"]) -> Array:
-        """Return all regions' first channel, then all their second."""
-        return local.T
 
 
 def adaptive_means(

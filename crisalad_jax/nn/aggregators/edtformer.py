@@ -68,6 +68,7 @@ class EdtFormerConfig(Aggregator):
         4096
     """
 
+    dimension_first: ClassVar[bool] = True
     width_field: ClassVar[str] = "channels"
     width: int = 768
     """Width of the decoder."""
@@ -121,10 +122,6 @@ class EdtFormerConfig(Aggregator):
         answers = decode(params, features, self.heads)
         channels = linear(params.channel_proj, answers).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
-
-    def order(self, local: Float[Array, "token dim"]) -> Array:
-        """Return all rows' first channel, then all their second."""
-        return local.T
 
 
 def _init_layer(key: PRNGKeyArray, width: int) -> DecoderLayer:

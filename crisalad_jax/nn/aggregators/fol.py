@@ -66,6 +66,7 @@ class FolConfig(Aggregator):
         8448
     """
 
+    dimension_first: ClassVar[bool] = True
     width_field: ClassVar[str] = "cluster_dim"
     clusters: int = 64
     cluster_dim: int = 128
@@ -137,10 +138,6 @@ class FolConfig(Aggregator):
     def plan(self, params: Fol, features: Features) -> Float[Array, "*batch patch column"]:
         """Return the mass that each patch sends to each cluster and to the dustbin."""
         return jnp.exp(self.transport(params, features, key=None).log_plan)
-
-    def order(self, local: Float[Array, "token dim"]) -> Array:
-        """Return all clusters' first dimension, then all their second, as public descriptors."""
-        return local.T
 
 
 def dustbin_scores(attention: Float[Array, "*batch patch"]) -> Float[Array, "*batch patch"]:

@@ -53,6 +53,7 @@ class MixVpr:
 class MixVprConfig(Aggregator):
     """MixVPR (Ali-bey et al., WACV 2023)."""
 
+    dimension_first: ClassVar[bool] = True
     fixed_grid: ClassVar[bool] = True
     width_field: ClassVar[str] = "channels"
     channels: int = 1024
@@ -101,10 +102,6 @@ class MixVprConfig(Aggregator):
             maps = feature_mixer(mixer, maps)
         channels = linear(params.channel_proj, maps.swapaxes(-2, -1)).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
-
-    def order(self, local: Float[Array, "token dim"]) -> Array:
-        """Return all rows' first channel, then all their second."""
-        return local.T
 
 
 def _init_mixer(key: PRNGKeyArray, patches: int) -> FeatureMixer:

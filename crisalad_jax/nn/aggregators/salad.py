@@ -71,6 +71,7 @@ class Salad:
 class SaladConfig(Aggregator):
     """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
 
+    dimension_first: ClassVar[bool] = True
     width_field: ClassVar[str] = "cluster_dim"
     clusters: int = 64
     cluster_dim: int = 128
@@ -179,10 +180,6 @@ class SaladConfig(Aggregator):
     def plan(self, params: Salad, features: Features) -> Float[Array, "*batch patch column"]:
         """Return the mass that each patch sends to each cluster and to the dustbin."""
         return jnp.exp(self.transport(params, features.patches, key=None).log_plan)
-
-    def order(self, local: Float[Array, "token dim"]) -> Array:
-        """Return all clusters' first dimension, then all their second, as public descriptors."""
-        return local.T
 
 
 def require_more_patches(clusters: int, grid: tuple[int, int], patch_size: int) -> None:

@@ -7,10 +7,12 @@ from typing import Any, ClassVar, Literal, NamedTuple
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.config.concise import brief, concise
 from crisalad_jax.config.parts import Part, Registry
 from crisalad_jax.nn.layers import split_statistics
 
 
+@brief
 class Features(NamedTuple):
     """The features of a batch, or of one of its images."""
 
@@ -25,6 +27,7 @@ class Features(NamedTuple):
     float32 at least; None where `FeatureRequest.class_attention` does not ask for it."""
 
 
+@concise()
 @dataclasses.dataclass(frozen=True)
 class FeatureRequest:
     """The features that an aggregator requests; by default those after the last layer."""

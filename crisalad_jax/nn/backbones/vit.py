@@ -97,13 +97,13 @@ class ViT:
 
     A tuple of such stacks runs in sequence. Training uses it to exclude frozen blocks from the
     gradient where only the last ones train. Rotary positions have no parameters: `pos_embed_cls`
-    and `pos_embed` are None.
+    and `pos_embed` are None. Without registers `register_tokens` is None.
     """
 
     patch_embed: Linear
     """Linear layer whose weight's rows are a patch's pixels in (row, column, channel) order."""
     cls_token: Float[Array, " dim"]
-    register_tokens: Float[Array, "register dim"]
+    register_tokens: Float[Array, "register dim"] | None
     pos_embed_cls: Float[Array, " dim"] | None
     pos_embed: Float[Array, "grid grid dim"] | None
     blocks: Block | tuple[Block, ...]
@@ -292,7 +292,9 @@ def init_vit(key: PRNGKeyArray, config: VisionTransformer) -> ViT:
     return ViT(
         patch_embed=init_small_linear(patch_key, 3 * config.patch_size**2, dim),
         cls_token=draw.normal(class_key, (dim,), scale=deviation),
-        register_tokens=draw.normal(register_key, (config.registers, dim), scale=deviation),
+        register_tokens=draw.normal(register_key, (config.registers, dim), scale=deviation)
+        if config.registers
+        else None,
         pos_embed_cls=pos_embed_cls,
         pos_embed=pos_embed,
         blocks=draw.stacked(
@@ -566,7 +568,9 @@ def embed(
     pixels = images.reshape(*batch, rows, size, columns, size, 3).swapaxes(-4, -3)
     patches = linear(params.patch_embed, pixels.reshape(*batch, rows * columns, 3 * size**2))
     class_token, placed = config.add_positions(params, patches, (rows, columns))
-    first = jnp.concatenate([class_token[None], params.register_tokens])
+    first = class_token[None]
+    if params.register_tokens is not None:
+        first = jnp.concatenate([first, params.register_tokens])
     first = jnp.broadcast_to(first, (*batch, *first.shape))
     return jnp.concatenate([first, placed], axis=-2).astype(images.dtype)
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from crisalad_jax.config.checks import choose
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.loader import OnBadImage
@@ -40,6 +41,7 @@ SEGMENT = 256
 """Number of images appended together, and so described again at most after a kill."""
 
 
+@brief
 class Indexed(NamedTuple):
     """Counts and names of a folder's images after indexing it."""
 

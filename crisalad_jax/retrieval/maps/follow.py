@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.metres import continuous, to_metres
 from crisalad_jax.data.moments import moment_of
 from crisalad_jax.data.positions import AXES, utm_position
@@ -25,6 +26,7 @@ _Spot = tuple[str, tuple[float, ...]]
 """A clock and the seconds on it, when an image was taken; or nothing, and the metres where."""
 
 
+@brief
 class Followed(NamedTuple):
     """Images of a map at each of some frames, the most probable first."""
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count
+from crisalad_jax.config.checks import check_count, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.live import Frame
 from crisalad_jax.retrieval.maps.follow import Follower
@@ -33,6 +34,7 @@ class FrameSource(Protocol):
         ...
 
 
+@brief
 class LiveAnswer(NamedTuple):
     """The answer to one frame."""
 
@@ -50,6 +52,7 @@ class LiveAnswer(NamedTuple):
         return json_text({"query": row.pop("query")} | more | row)
 
 
+@takes(places=Map)
 def query_live(
     places: Map,
     params: "Crisalad | Runtime",

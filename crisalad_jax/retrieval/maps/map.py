@@ -19,7 +19,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
-from crisalad_jax.config.checks import check_count
+from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.metres import Zone
@@ -152,6 +152,7 @@ class Map:
         store.check([(first, count) for first, count, _ in self._segments])
 
     @classmethod
+    @takes(folder=PATH)
     def open(
         cls, folder: str | os.PathLike[str], *, verify: bool = True, calibrated: bool = True
     ) -> Self:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count
+from crisalad_jax.config.checks import check_count, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.sources import check_rate_used, open_source
@@ -36,6 +37,7 @@ AT_ONCE = 1024
 """Number of queries that are searched for together: the map is read once for so many."""
 
 
+@brief
 class Answers(NamedTuple):
     """The answers to some queries, by query."""
 
@@ -88,6 +90,7 @@ class Answers(NamedTuple):
         return position_fields(image, self.axes)
 
 
+@takes(places=Map)
 def query(
     places: Map,
     params: "Crisalad | Runtime",

@@ -117,7 +117,7 @@ def spatial_scores(
     config: ModelConfig,
 ) -> Float[np.ndarray, "candidate size"]:
     """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
-    return np.asarray(_spatial_scores(query, candidates, config))
+    return np.asarray(_spatial_scores(jnp.asarray(query), jnp.asarray(candidates), config))
 
 
 @functools.partial(compiler.jit, static_argnames="config")
@@ -146,7 +146,7 @@ def inlier_scores(
 
     As in the authors' code the homography maps the candidate's windows to the query's.
     """
-    by_size = jax.device_get(_matches_to(query, candidates, config))
+    by_size = jax.device_get(_matches_to(jnp.asarray(query), jnp.asarray(candidates), config))
     scores = [
         [inliers(each, grid) / len(each) for each in matches]
         for matches, (_, grid) in zip(by_size, _parts(config), strict=True)

@@ -38,7 +38,7 @@ def score(
     config: ModelConfig,
 ) -> Float[np.ndarray, " candidate"]:
     """Count the mutual matches (paper section 3.4)."""
-    return np.asarray(_counts(query, candidates))
+    return np.asarray(_counts(jnp.asarray(query), jnp.asarray(candidates)))
 
 
 @compiler.jit

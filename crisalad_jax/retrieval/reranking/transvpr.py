@@ -37,7 +37,7 @@ def score(
     config: ModelConfig,
 ) -> Float[np.ndarray, " candidate"]:
     """Count the mutual matches of key patches that are inliers of RANSAC (paper section 3.3)."""
-    matches = np.asarray(_matches(query, candidates))
+    matches = np.asarray(_matches(jnp.asarray(query), jnp.asarray(candidates)))
     return np.array([inliers(each, config.grid) for each in matches], np.float32)
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import choose, takes
 from crisalad_jax.config.parts import REGISTRIES, Part
 from crisalad_jax.config.plugins import load_entry_points
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
@@ -61,6 +61,7 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
     return decorate
 
 
+@takes(preset=str)
 def recipe(preset: str, name: str | None = None) -> TrainConfig:
     """Look up how a model is trained, and which parts it has for that.
 
@@ -262,6 +263,7 @@ _PLACES: Mapping[str, Callable[[TrainConfig, Any], TrainConfig]] = {
 """Functions that put a part in place, by its kind."""
 
 
+@takes(config=TrainConfig)
 def from_scratch(config: TrainConfig) -> TrainConfig:
     """Make another recipe's model and loss train from random weights, as `scratch` does.
 

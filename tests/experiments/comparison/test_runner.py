@@ -90,7 +90,17 @@ def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
         assert found[f"R@{k}"]["spread"] == pytest.approx(statistics.stdev(values), abs=1e-15)
     leaves = sum(leaf.size for leaf in jax.tree.leaves(params))
     assert (row["dimension"], row["parameters"]) == (model.descriptor_dim, leaves)
-    assert (row["speed"], row["training"], row["images_per_second"]) == (1, 1, None)
+    assert (row["speed"], row["images_per_second"]) == (1, None)
+    # To itself: either run over either, so that its range is the runs' own.
+    seconds = []
+    for seed in (0, 1):
+        record = read_json(finished / "crisalad" / f"seed-{seed}" / "training.json", "a record")
+        seconds.append(record["steps"] * record["step_seconds"])
+    ratio = max(seconds) / min(seconds)
+    assert row["training"] == pytest.approx([1, 1 / ratio, ratio])
+    assert row["training_seconds"] == pytest.approx(
+        [statistics.mean(seconds), min(seconds), max(seconds)]
+    )
 
 
 def test_what_it_leaves(finished):
@@ -311,7 +321,32 @@ def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
     assert seen == [(0, "parsed by-name:5"), (1, "parsed by-name:5")]
     first, second = summary.rows
     assert first.recalls == second.recalls
-    assert (first.speed, second.speed, second.training) == (1, 1, 1)
+    assert (first.speed, second.speed, second.training) == (1, 1, first.training)
+    assert second.differences["town"][1].interval == (0, 0)
+
+
+def test_rows_draw_seeds_together_where_they_share_them(finished, settings, shared):
+    """A row that hits the same queries as the reference in each run, and a model from a file."""
+    weights = (f"ours={shared / 'weights.safetensors'}",)
+    names = ("crisalad", "salad", "ours")
+    prepared = comparison.prepare(
+        ComparisonConfig(**settings | {"names": names, "weights": weights})
+    )
+    ranks = {0: [1] * 5, 1: [0] * 5}
+    record = read_json(finished / "crisalad" / "seed-0" / "test-0.json", "a result")
+    trained = read_json(finished / "crisalad" / "seed-0" / "training.json", "a record")
+    for variant, seed in prepared.units:
+        folder = runner.folder_of(finished, variant.name, seed)
+        write_json(folder / "training.json", trained)
+        write_json(folder / "test-0.json", record | {"groupings": {"single": ranks[seed]}})
+    speed = read_json(finished / "speed.json", "times")
+    write_json(finished / "speed.json", speed | {"rounds": {name: [1.0] for name in names}})
+    _, same, alone = comparison.summarise(prepared, finished).rows
+    assert same.differences["town"][1].interval == (0, 0)
+    # All queries hit or miss with their seed: two seeds miss both in a quarter of the resamples.
+    assert alone.differences["town"][1].interval == (0, 1)
+    notes = " ".join(comparison.summarise(prepared, finished).notes)
+    assert "runs of one seed share initial values and batches; a model from a file shares" in notes
 
 
 def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
@@ -387,7 +422,7 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     assert not lock.exists()
 
 
-def test_a_run_beside_others_tells_no_training_time(finished, flags, capfd):
+def test_a_training_time_is_of_runs_with_a_device_of_their_own(finished, flags, capfd):
     """Of a process of this host; another host's is no neighbour."""
     with locks.one_writer(finished / "crisalad" / "seed-1"):
         lock = finished / "crisalad" / "seed-1" / temporaries.LOCK
@@ -397,24 +432,14 @@ def test_a_run_beside_others_tells_no_training_time(finished, flags, capfd):
         lock.write_text("process 1 on elsewhere\n")
         assert not runner._has_neighbours(finished)
     paths = [finished / "crisalad" / f"seed-{seed}" / "training.json" for seed in (0, 1)]
-    first, second = (read_json(path, "a record") for path in paths)
+    second = read_json(paths[1], "a record")
     write_json(paths[1], second | {"beside": True, "step_seconds": 1e6})
-    # The other run was alone: its time stays, and nothing of the disturbed one is in it.
+    # One run is left, whose time has no spread.
     told = succeeds(capfd, *flags, "--out", finished)
-    words = "Training time of the runs that had their device to themselves: CriSALAD 1 of 2."
-    assert words in told
-    assert "beside others" not in told
+    assert "median and range of the runs that had their device to themselves, where these" in told
     (row,) = json.loads((finished / "results.json").read_text())["rows"]
-    assert (row["training"], row["beside"], row["alone"]) == (1, False, [1, 2])
-    assert row["training_seconds"] == pytest.approx(first["steps"] * first["step_seconds"])
-    write_json(paths[0], first | {"beside": True})
-    told = succeeds(capfd, *flags, "--out", finished)
-    assert (
-        "Trained beside others on one device, so that no training time is told: CriSALAD." in told
-    )
-    assert "| beside others |" in (finished / "table.md").read_text()
-    (row,) = json.loads((finished / "results.json").read_text())["rows"]
-    assert (row["training"], row["training_seconds"], row["beside"]) == (None, None, True)
+    assert (row["training"], row["training_seconds"]) == (None, None)
+    assert (finished / "table.md").read_text().splitlines()[2].endswith("| - |")
 
 
 def test_the_time_left_is_told_by_runs_of_the_same_method(tmp_path):

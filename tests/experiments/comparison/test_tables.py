@@ -13,7 +13,7 @@ from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.experiments.comparison import AdapterCost, Recall, Row, Summary, tables
 from crisalad_jax.experiments.comparison.page import write_page
 from crisalad_jax.experiments.comparison.paired import Difference
-from crisalad_jax.experiments.comparison.summary import recall_of
+from crisalad_jax.experiments.comparison.summary import Spread, recall_of
 from crisalad_jax.experiments.comparison.timing import Race, race
 from crisalad_jax.utils.errors import InputError
 
@@ -53,8 +53,8 @@ def row(name, grouping, recall, **changes):
         "images_per_second": None,
         "parameters": 1_000_000,
         "trained": 10_000,
-        "training": 0.5,
-        "training_seconds": 90.0,
+        "training": Spread(0.5, 0.4, 0.75),
+        "training_seconds": Spread(90.0, 84.0, 120.0),
         "sittings": 1,
     }
     return Row(name=name, grouping=grouping, **values | changes)
@@ -80,10 +80,10 @@ def test_markdown():
     assert tables.markdown(SUMMARY).splitlines()[2:] == [
         "| First, single | 8,448 "
         + "| 62.5 ± 12.5 (40.0-80.0) " * 3
-        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x |",
+        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x (0.40 to 0.75) |",
         "| First, shuffled | 8,448 "
         + "| 62.5 ± 12.5 (40.0-80.0) " * 3
-        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x |",
+        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x (0.40 to 0.75) |",
         r"| A\|B | 8,448 " + "| 25.0 (10.0-40.0) " * 3 + "| 1.25 x | 1,000,000 | - | - |",
         "",
         "A note.",
@@ -92,8 +92,14 @@ def test_markdown():
 
 def test_on_a_gpu_times_are_absolute():
     assert tables.costs_of(row("first", "single", ONE, images_per_second=427.4)) == [
-        *("8,448", "427", "1,000,000", "10,000", "1.5 min")
+        *("8,448", "427", "1,000,000", "10,000", "1.5 min (1.4 to 2.0)")
     ]
+
+
+@pytest.mark.parametrize("images_per_second", [None, 427.4])
+def test_a_training_time_without_a_spread_is_not_shown(images_per_second):
+    once = row("a", "any", ONE, images_per_second=images_per_second, training=None)
+    assert tables.costs_of(once._replace(training_seconds=None))[-1] == "-"
 
 
 def test_csv_has_a_line_for_each_number():
@@ -105,7 +111,9 @@ def test_csv_has_a_line_for_each_number():
         **{"recall": "0.625", "standard_deviation": "0.125", "low": "0.4", "high": "0.8"},
         **{"seeds": "2", "dimension": "8448", "speed": "1.25", "images_per_second": ""},
         **{"parameters": "1000000", "trained": "10000", "training": "0.5"},
-        "training_seconds": "",  # on a CPU
+        **{"training_least": "0.4", "training_most": "0.75"},
+        # On a CPU.
+        **dict.fromkeys((f"training_seconds{end}" for end in ("", "_least", "_most")), ""),
         **dict.fromkeys(("difference", "difference_low", "difference_high", "verdict"), ""),
     }
     assert lines[-1]["standard_deviation"] == lines[-1]["training"] == ""
@@ -238,8 +246,3 @@ def test_no_differences_of_a_single_row():
     alone = SUMMARY._replace(rows=SUMMARY.rows[:1])
     assert len(tables.terminal_tables(alone)) == 2
     assert "less" not in tables.markdown(alone)
-
-
-def test_a_run_beside_others_has_a_word_for_its_time():
-    beside = row("first", "single", ONE, training=None, training_seconds=None, beside=True)
-    assert tables.costs_of(beside)[-1] == "beside others"

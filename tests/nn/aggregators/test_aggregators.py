@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.nn.aggregators.base import to_descriptor
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid, GemPyramidConfig, gem_pyramid
@@ -24,6 +25,17 @@ def test_salads_descriptor_is_the_global_token_then_clusters_by_dimension() -> N
     expected = np.array([3, 4, 1, 5, 7, 2, 6, 8]) / np.sqrt(204)
     # One rounding of a square root and of a product, of numbers below 1.
     np.testing.assert_allclose(to_descriptor(tokens, SaladConfig(clusters=3)), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", REGISTRIES["aggregator"])
+def test_a_batch_has_each_images_order(name: str) -> None:
+    """`local.T` of a batch swapped its images with its dimensions."""
+    aggregator = REGISTRIES["aggregator"].make(name)
+    batch = np.arange(24.0).reshape(2, 3, 4)
+    expected = np.stack([aggregator.order(jnp.asarray(tokens)) for tokens in batch])
+    np.testing.assert_array_equal(aggregator.order(jnp.asarray(batch)), expected)
+    first = [0, 4, 8, 1] if aggregator.dimension_first else [0, 1, 2, 3]
+    assert expected[0].ravel()[:4].tolist() == first
 
 
 def test_a_pyramids_descriptor_is_region_after_region() -> None:

@@ -1,0 +1,103 @@
+"""Swapped and wrong arguments of public functions: one line that names them, and no traceback."""
+
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+
+import crisalad_jax as cj
+from crisalad_jax.experiments.comparison import compare
+from crisalad_jax.nn.model import parameter_shapes
+
+PRESET = cj.PRESETS["tiny"]
+PARAMS = parameter_shapes(PRESET)
+TRAINING = cj.recipe("tiny")
+IMAGES = np.zeros((1, 28, 28, 3), np.uint8)
+KEY = jax.random.key(0)
+NO_CONFIG = "config: found Crisalad, expected ModelConfig"
+NO_PATH = "found ModelConfig, expected a path"
+CALLS = {
+    "train a preset": (
+        lambda: cj.train(PRESET, "d", "r"),
+        "config: found ModelConfig, expected TrainConfig",
+    ),
+    "train swapped": (
+        lambda: cj.train("d", TRAINING, "r"),
+        "config: found 'd', expected TrainConfig",
+    ),
+    "train in a config": (lambda: cj.train(TRAINING, "d", PRESET), f"out: {NO_PATH}"),
+    "fit a preset": (
+        lambda: cj.fit(PRESET, "d", "r"),
+        "config: found ModelConfig, expected TrainConfig",
+    ),
+    "fit a path": (
+        lambda: cj.fit(TRAINING, "d", "r"),
+        "places: found 'd', expected Places, or QuerySet",
+    ),
+    "describe": (
+        lambda: cj.describe(PARAMS, PRESET, IMAGES),
+        "config: found ndarray, expected Model",
+    ),
+    "describe_files": (
+        lambda: cj.describe_files(PARAMS, ["a"], PRESET),
+        "config: found list, expected",
+    ),
+    "describe_images": (
+        lambda: cj.describe_images(PARAMS, [IMAGES], PRESET),
+        "config: found list, exp",
+    ),
+    "evaluate": (lambda: cj.evaluate(PRESET, PARAMS, "set"), NO_CONFIG),
+    "evaluate a path": (
+        lambda: cj.evaluate(PARAMS, PRESET, "set"),
+        "benchmark: found 'set', expected B",
+    ),
+    "load": (lambda: cj.load(PRESET), f"path: {NO_PATH}"),
+    "save_weights": (
+        lambda: cj.save_weights(PARAMS, "w", PRESET),
+        "params: found str, expected Crisalad",
+    ),
+    "init_crisalad": (
+        lambda: cj.init_crisalad(PRESET, KEY),
+        "config: found PRNGKeyArray, expected ModelConfig",
+    ),
+    "prepare_image": (
+        lambda: cj.prepare_image(PRESET, IMAGES[0]),
+        "config: found ndarray, expected",
+    ),
+    "query": (lambda: cj.query(PARAMS, "m.map", "f"), "places: found Crisalad, expected Map"),
+    "calibrate": (
+        lambda: cj.calibrate("m.map", PARAMS, "s"),
+        "places: found 'm.map', expected Map",
+    ),
+    "open": (lambda: cj.Map.open(PRESET), f"folder: {NO_PATH}"),
+    "open_benchmark": (lambda: cj.open_benchmark(PRESET), f"root: {NO_PATH}"),
+    "read_places": (lambda: cj.read_places(PRESET), f"root: {NO_PATH}"),
+    "recipe": (lambda: cj.recipe(PRESET), "preset: found ModelConfig, expected text"),
+    "from_scratch": (
+        lambda: cj.from_scratch(PRESET),
+        "config: found ModelConfig, expected TrainConfig",
+    ),
+    "step_config": (
+        lambda: cj.step_config(PRESET, steps=3),
+        "config: found ModelConfig, expected Train",
+    ),
+    "metric_loss": (
+        lambda: cj.metric_loss(IMAGES, IMAGES, PRESET),
+        "config: found ModelConfig, expect",
+    ),
+    "write_export": (lambda: cj.write_export(PRESET, PARAMS, "o"), f"out: {NO_PATH}"),
+    "compare": (lambda: compare("out", TRAINING), "config: found 'out', expected ComparisonConfig"),
+}
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("name", CALLS)
+def test_a_wrong_argument_is_named(name: str, tmp_path: pathlib.Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    call, words = CALLS[name]
+    with pytest.raises(cj.InputError) as caught:
+        call()
+    assert str(caught.value).startswith(words)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
