@@ -12,12 +12,13 @@ _SWITCH = "__concise_switch__"
 _ALWAYS = "__concise_always__"
 
 
-def concise(*always: str, switch: tuple[str, Any] | None = None) -> Callable[[type[_T]], type[_T]]:
+def concise(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]], type[_T]]:
     """Return a decorator that gives a dataclass the `repr` of `concise_repr`.
 
     Args:
         *always: fields that are printed at their defaults too.
-        switch: a field and its value with which no other field is in use; these are left out.
+        switch: a field, its value with which others are not in use, and the names of these; by
+            default of all others. They are left out, and not compared (`config.io.differences`).
     """
 
     def decorate(cls: type[_T]) -> type[_T]:
@@ -74,16 +75,28 @@ def _write(value: Any, before: str, indent: int, width: float) -> str:
 
 def _shown(config: Any) -> list[tuple[Any, str]]:
     """Return the values of the fields that are printed, each with `name=`."""
-    always, switch = getattr(config, _ALWAYS, ()), getattr(config, _SWITCH, None)
-    fields = dataclasses.fields(config)
-    if switch is not None and getattr(config, switch[0]) == switch[1]:
-        fields = [field for field in fields if field.name == switch[0]]
-    values = [(field, getattr(config, field.name)) for field in fields]
+    always = getattr(config, _ALWAYS, ())
+    values = [(field, getattr(config, field.name)) for field in fields_in_use(config)]
     return [
         (value, f"{field.name}=")
         for field, value in values
         if field.name in always or not _is_default(field, value)
     ]
+
+
+def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
+    """List a configuration's fields without those that its switch puts out of use.
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig
+        >>> [field.name for field in fields_in_use(CrossImageConfig(layers=0))]
+        ['layers']
+    """
+    fields, switch = list(dataclasses.fields(config)), getattr(config, _SWITCH, ())
+    if not switch or getattr(config, switch[0]) != switch[1]:
+        return fields
+    name, _, *unused = switch
+    return [f for f in fields if f.name not in unused and (unused or f.name == name)]
 
 
 def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
