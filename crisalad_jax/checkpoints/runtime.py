@@ -11,7 +11,7 @@ import json
 import os
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from crisalad_jax.utils.files import cache_folder, read_json
 from crisalad_jax.utils.locks import next_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.version import VERSION
+
+if TYPE_CHECKING:
+    from crisalad_jax.nn.config import ModelConfig
 
 FORMAT = "crisalad-jax export 1"
 MANIFEST = "manifest.json"
@@ -333,6 +336,23 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any] | None:
             if isinstance(value, dict) and {"model_sha256", "config"} <= value.keys():
                 return value
     return None
+
+
+def read_model(weights: str | os.PathLike[str]) -> "ModelConfig":
+    """Read the configuration in a file of weights, without its arrays where it has metadata.
+
+    Raises:
+        InputError: what `load_weights` raises, for a file without `read_header`.
+    """
+    from crisalad_jax.config.io import from_plain
+    from crisalad_jax.nn.config import ModelConfig
+
+    header = read_header(weights)
+    if header is None:
+        from crisalad_jax.checkpoints.weights import load_weights
+
+        return load_weights(weights)[1]
+    return from_plain(ModelConfig, header["config"], source=f"{weights} (metadata)")
 
 
 def _export(weights: pathlib.Path, settings: Mapping[str, Any]) -> pathlib.Path:

@@ -128,6 +128,8 @@ def _run(name: str, given: list[str], keep_programs: bool) -> None:
     _load_plugins(given)
     arguments = renamed.today(given, lambda line: print(f"crisalad: note: {line}", file=sys.stderr))
     module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
+    if hasattr(module, "prepare"):
+        arguments = module.prepare(arguments)
     chosen = _parse(name, module, arguments)
     _check_numbers(chosen)
     if not hasattr(module, "needs_jax") or module.needs_jax(chosen):

@@ -167,7 +167,7 @@ def open_model(
     if runtime == "jax":
         options |= {"compute_dtype": compute_dtype, "verify": verify, "quiet": quiet}
         return load_model(weights, **options)
-    from crisalad_jax.checkpoints.runtime import open_runtime, read_header
+    from crisalad_jax.checkpoints.runtime import open_runtime, read_model
     from crisalad_jax.config.io import from_plain
     from crisalad_jax.nn.config import ModelConfig
 
@@ -177,13 +177,7 @@ def open_model(
         config = dataclasses.replace(config, compute_dtype=compute_dtype or "float32")
         return model, config.resized(image_size, resize), str(weights)
     file = find_weights(weights, quiet=quiet)
-    header = read_header(file)
-    if header is None:
-        _, config, name = load_model(file, **options, verify=verify)
-    else:
-        name = _name(file)
-        config = from_plain(ModelConfig, header["config"], source=f"{file} (metadata)")
-        config = config.resized(image_size, resize)
+    name, config = _name(file), read_model(file).resized(image_size, resize)
     config = dataclasses.replace(config, compute_dtype=compute_dtype or config.compute_dtype)
     if config.compute_dtype == "float64":
         raise InputError(f"--runtime: found {runtime} with a model of float64, expected jax")

@@ -1,15 +1,20 @@
 """`crisalad train`."""
 
 import dataclasses
+import os
 import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
+from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.runtime import read_model
 from crisalad_jax.cli.common import console, give_json, prepare_json
+from crisalad_jax.cli.help import asked_for
 from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
 from crisalad_jax.config.io import read_config
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,6 +24,9 @@ if TYPE_CHECKING:
 COMMON = (
     "data",
     "out",
+    "place-radius",
+    "place-frames",
+    "positions",
     "val",
     "weights",
     "backbone",
@@ -52,6 +60,17 @@ class Train:
     out: pathlib.Path
     """Folder of the run."""
     settings: Any
+    place_radius: float | None = None
+    """Make places of --data, a source of images with positions (docs/how-to/image-sources.md):
+    images within so many metres of a centre are one. Batches have no two that are near."""
+    place_frames: int | None = None
+    """Make a place of every so many images in order, of a folder or video as --data. Batches have
+    no two that are neighbours."""
+    positions: pathlib.Path | None = None
+    """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for --place-radius; by default
+    what a table as --data says, or @UTM names, or EXIF data."""
+    fps: float | None = None
+    """Frames a second taken of a video as --data."""
     data_images: pathlib.Path | None = None
     """Folder of the images that a .mat file at --data names; by default beside it."""
     val: pathlib.Path | None = None
@@ -59,13 +78,14 @@ class Train:
     val_images: pathlib.Path | None = None
     """Folder of the images that a .mat file or .npy lists at --val name; by default beside them."""
     weights: pathlib.Path | None = None
-    """Weights of a whole model to start from, or a published model's name (`crisalad models`); none
-    starts from random ones."""
+    """Weights of a whole model to start from: a file, starter, or a published model's name. The run
+    has the file's model, preprocessing and image size, unless flags or --config say otherwise."""
     backbone: pathlib.Path | None = None
     """Start from this backbone alone: a file of this package, any checkpoint that `convert` reads,
     or a published model's name, as in dinov2-vitb14."""
     preset: str = "b14"
-    """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from."""
+    """tiny, s14, b14, l14 or g14: the size of the model that the other flags start from. Of
+    --weights the size is the file's."""
     recipe: str | None = None
     """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
@@ -116,13 +136,46 @@ def parse(program: str, arguments: Sequence[str]) -> Train:
     return parse_settings(Train, program, arguments, defaults(arguments), ("data", "out"))
 
 
+def prepare(arguments: Sequence[str]) -> Sequence[str]:
+    """Find the file of --weights, whose model says which flags there are, and give that.
+
+    Raises:
+        InputError: what `find_weights` and `read_model` raise; or several processes would download
+            and convert, which uses JAX before they have met.
+    """
+    given = find_flag(arguments, "--weights")
+    if given is None or asked_for(arguments):
+        return arguments
+    compiler.set_up()
+    if find_flag(arguments, "--coordinator-address") is not None:
+        _check_cached(given)
+    weights = find_weights(given, quiet="--quiet" in arguments)
+    read_model(weights)
+    return [*arguments, "--weights", str(weights)]
+
+
+def _check_cached(weights: str) -> None:
+    """Raise InputError for the name of a published model that would be downloaded."""
+    from crisalad_jax.checkpoints.cache import is_cached
+    from crisalad_jax.checkpoints.published import PUBLISHED
+
+    if weights in PUBLISHED and not is_cached(PUBLISHED[weights]):
+        raise InputError(
+            f"--weights: found {weights}, which is not in the cache, expected it there before "
+            f"several processes start: crisalad info --weights {weights}"
+        )
+
+
 def command(arguments: Sequence[str]) -> type:
     """Return the class that these arguments are parsed into, for help and completion."""
     return with_settings(Train, arguments, defaults(arguments), ("data", "out"))[0]
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
-    """Read the configuration that flags start from: --config, or --preset and --recipe.
+    """Read the configuration that flags start from.
+
+    It is that of --config; or of --preset and --recipe, with the model of --weights if there
+    is such a file (`prepare` finds it).
 
     Raises:
         InputError: both are given, or one names nothing.
@@ -133,7 +186,10 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
             if find_flag(arguments, flag) is not None:
                 raise InputError(f"{flag}: found beside --config, expected only one of the two")
         return read_config(TrainConfig, pathlib.Path(given), quiet=True)
-    return recipe(find_flag(arguments, "--preset") or "b14", find_flag(arguments, "--recipe"))
+    weights = find_flag(arguments, "--weights")
+    model = read_model(weights) if weights is not None and os.path.isfile(weights) else None
+    preset = find_flag(arguments, "--preset") or "b14"
+    return recipe(preset, find_flag(arguments, "--recipe"), model=model)
 
 
 def run(arguments: Train) -> None:
@@ -163,6 +219,10 @@ def run(arguments: Train) -> None:
         config,
         arguments.data,
         arguments.out,
+        place_radius=arguments.place_radius,
+        place_frames=arguments.place_frames,
+        positions=arguments.positions,
+        fps=arguments.fps,
         images=arguments.data_images,
         validation=arguments.val,
         validation_images=arguments.val_images,

@@ -19,14 +19,15 @@ _ALWAYS = "__concise_always__"
 _BRIEF = "__concise_brief__"
 
 
-def concise(*always: str, switch: tuple[str, Any] | None = None) -> Callable[[type[_T]], type[_T]]:
+def concise(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]], type[_T]]:
     """Return a decorator that gives a configuration the `repr` of `concise_repr`.
 
     Its `help` shows the texts below its fields.
 
     Args:
         *always: fields that are printed at their defaults too.
-        switch: a field and its value with which no other field is in use; these are left out.
+        switch: a field, its value with which others are not in use, and the names of these; by
+            default of all others. They are left out, and not compared (`config.io.differences`).
     """
 
     def decorate(cls: type[_T]) -> type[_T]:
@@ -162,14 +163,26 @@ def _shown(value: Any) -> Iterator[tuple[str, Any]]:
             if getattr(value, name) is not value._field_defaults.get(name, dataclasses.MISSING):
                 yield name, getattr(value, name)
         return
-    always, switch = getattr(value, _ALWAYS, ()), getattr(value, _SWITCH, None)
-    fields = dataclasses.fields(value)
-    if switch is not None and getattr(value, switch[0]) == switch[1]:
-        fields = [field for field in fields if field.name == switch[0]]
-    for field in fields:
+    always = getattr(value, _ALWAYS, ())
+    for field in fields_in_use(value):
         each = getattr(value, field.name)
         if field.name in always or not _is_default(field, each):
             yield field.name, each
+
+
+def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
+    """List a configuration's fields without those that its switch puts out of use.
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig
+        >>> [field.name for field in fields_in_use(CrossImageConfig(layers=0))]
+        ['layers']
+    """
+    fields, switch = list(dataclasses.fields(config)), getattr(config, _SWITCH, ())
+    if not switch or getattr(config, switch[0]) != switch[1]:
+        return fields
+    name, _, *unused = switch
+    return [f for f in fields if f.name not in unused and (unused or f.name == name)]
 
 
 def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:

@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from crisalad_jax.config.aliases import upgrade
+from crisalad_jax.config.concise import fields_in_use
 from crisalad_jax.config.parts import Part
 from crisalad_jax.config.plugins import home_of
 from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
@@ -179,11 +180,15 @@ def read_config(kind: type[_T], path: pathlib.Path, *, quiet: bool = False) -> _
 
 
 def differences(found: Any, expected: Any, prefix: str = "") -> list[str]:
-    """Return the fields in which two configurations differ, as `name: found, expected`."""
+    """Return the fields in which two configurations differ, as `name: found, expected`.
+
+    Fields that one of them does not use do not count.
+    """
     if dataclasses.is_dataclass(found) and type(found) is type(expected):
+        fields = min(fields_in_use(found), fields_in_use(expected), key=len)
         return [
             line
-            for field in dataclasses.fields(found)
+            for field in fields
             for line in differences(
                 getattr(found, field.name), getattr(expected, field.name), f"{prefix}.{field.name}"
             )

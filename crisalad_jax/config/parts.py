@@ -273,6 +273,34 @@ class Registry(Generic[P]):
         part = self.find(name)
         return part(**{**self._presets[name].get(preset or "", {}), **fields})
 
+    def resolve(self, value: Any, where: str) -> P:
+        """Return a part as it is, and make one that is given by its name.
+
+        Args:
+            value: a part or its name.
+            where: what messages call the value.
+
+        Raises:
+            InputError: a name that is not registered, or a value that is no part of this kind.
+        """
+        if isinstance(value, str):
+            try:
+                return self.make(value)
+            except InputError as error:
+                # `where` says what kind of part it is for.
+                words = str(error).removeprefix(f"{self.kind}: ")
+                raise InputError(f"{where}: {words}") from error
+        if not isinstance(value, self.base):
+            raise InputError(
+                f"{where}: found {in_one_line(value)}, expected a {self.kind} or its name"
+            )
+        if "part_name" not in vars(type(value)):
+            raise InputError(
+                f"{where}: found {type(value).__qualname__}, which is not registered, expected "
+                f"@register_{self.kind}(NAME) above it: files keep parts by name"
+            )
+        return value
+
 
 def part_field(registry: Registry[P], default: str | type[P]) -> Any:
     """Return a dataclass field for a part, by default the one with this name, or of this class."""
@@ -290,27 +318,10 @@ def resolve_names(config: Any) -> None:
     check_types(config)
     for field in dataclasses.fields(config):
         registry = field.metadata.get(REGISTRY)
-        if registry is None:
-            continue
-        value = getattr(config, field.name)
-        where = f"{type(config).__name__}.{field.name}"
-        if isinstance(value, str):
-            try:
-                value = registry.make(value)
-            except InputError as error:
-                # The field's name says what kind of part it is for.
-                words = str(error).removeprefix(f"{registry.kind}: ")
-                raise InputError(f"{where}: {words}") from error
-            object.__setattr__(config, field.name, value)
-        elif not isinstance(value, registry.base):
-            raise InputError(
-                f"{where}: found {in_one_line(value)}, expected a {registry.kind} or its name"
-            )
-        elif "part_name" not in vars(type(value)):
-            raise InputError(
-                f"{where}: found {type(value).__qualname__}, which is not registered, expected "
-                f"@register_{registry.kind}(NAME) above it: files keep parts by name"
-            )
+        if registry is not None:
+            where = f"{type(config).__name__}.{field.name}"
+            part = registry.resolve(getattr(config, field.name), where)
+            object.__setattr__(config, field.name, part)
 
 
 def count_arguments(function: Callable[..., Any], *offered: str) -> int:

@@ -25,7 +25,7 @@ WORDS: Mapping[str, Mapping[str, Any]] = {
 """Words of the flag --resize, and the fields that they set."""
 
 
-@concise()
+@concise(switch=("normalisation", "local-contrast", "mean", "deviation"))
 @dataclasses.dataclass(frozen=True)
 class PreprocessingConfig:
     """How a photograph becomes a network's input.
@@ -69,6 +69,13 @@ class PreprocessingConfig:
     def __post_init__(self) -> None:
         """Check the values."""
         check_types(self)
+        if self.normalisation == "local-contrast":
+            require(
+                self.pixels == "bytes",
+                f"PreprocessingConfig.pixels: found {self.pixels} with normalisation "
+                f"{self.normalisation}, which is of bytes alone, expected bytes",
+            )
+            return
         require(
             all(0 < value < math.inf for value in self.deviation),
             f"PreprocessingConfig.deviation: found {self.deviation}, expected numbers above 0",
@@ -76,11 +83,6 @@ class PreprocessingConfig:
         require(
             all(map(math.isfinite, self.mean)),
             f"PreprocessingConfig.mean: found {self.mean}, expected finite numbers",
-        )
-        require(
-            self.normalisation == "mean-deviation" or self.pixels == "bytes",
-            f"PreprocessingConfig.pixels: found {self.pixels} with normalisation "
-            f"{self.normalisation}, which is of bytes alone, expected bytes",
         )
 
     @property

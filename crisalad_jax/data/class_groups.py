@@ -190,8 +190,10 @@ def _place_classes(places: Places, config: ClassesConfig, min_images: int) -> Cl
     group = np.full(len(places.place_id), -1)
     for city in range(len(places.cities)):
         here = large[places.place_city[large] == city]
-        if views.known[city]:
-            group[here] = _apart(_centres(places, views)[here], config)
+        if places.near is not None:
+            _deal(group, here, [places.near[place] for place in here], config)
+        elif views.known[city]:
+            _deal(group, here, _near(_centres(places, views), here, config), config)
         else:
             group[here] = np.arange(len(here)) % config.groups
     grouped = np.flatnonzero(group >= 0)
@@ -215,21 +217,32 @@ def _centres(places: Places, views: Views) -> Float64[np.ndarray, "places 2"]:
     return sums / places.image_counts[:, None]
 
 
-def _apart(
-    centres: Float64[np.ndarray, "places 2"], config: ClassesConfig
-) -> Int64[np.ndarray, " places"]:
-    """Assign each place to the smallest group without a place as near as CosPlace forbids."""
+def _near(
+    centres: Float64[np.ndarray, "places 2"],
+    here: Int64[np.ndarray, " some"],
+    config: ClassesConfig,
+) -> list[Int64[np.ndarray, " _"]]:
+    """Find the places that are as near each of these as CosPlace forbids."""
     from scipy.spatial import KDTree
 
-    near = KDTree(centres).query_ball_point(centres, config.cell * (config.spacing - 1))
-    group, sizes = np.full(len(centres), -1), np.zeros(config.groups, np.int64)
-    for place, others in enumerate(near):
-        taken = group[others]
-        free = np.setdiff1d(np.arange(config.groups), taken)
+    tree = KDTree(centres[here])
+    found = tree.query_ball_point(centres[here], config.cell * (config.spacing - 1))
+    return [here[others] for others in found]
+
+
+def _deal(
+    group: Int64[np.ndarray, " places"],
+    here: Int64[np.ndarray, " some"],
+    near: Sequence[Int64[np.ndarray, " _"]],
+    config: ClassesConfig,
+) -> None:
+    """Put each of these places into the smallest group that has none near it, if there is one."""
+    sizes = np.zeros(config.groups, np.int64)
+    for place, others in zip(here, near, strict=True):
+        free = np.setdiff1d(np.arange(config.groups), group[others])
         if len(free):
             group[place] = free[sizes[free].argmin()]
             sizes[group[place]] += 1
-    return group
 
 
 def _cells(views: Views, config: ClassesConfig) -> Int64[np.ndarray, "2 images"]:
@@ -315,5 +328,6 @@ def _regrouped(places: Places, classes: Classes, group: int) -> Places:
         place_id=places.place_id[old],
         place_start=start,
         names=None if places.names is None else tuple(places.names[place] for place in old),
+        near=None,
         views=None if places.views is None else places.views[images],
     )

@@ -90,6 +90,13 @@ class ImageCache:
                     self._room -= image.nbytes
         return image
 
+    def fill(self, paths: Iterable[str | os.PathLike[str]], how: Preparation) -> None:
+        """Read images in this order, as far as there is room; `read` tells of unreadable ones."""
+        for path in paths:
+            with contextlib.suppress(InputError):
+                if self.read(path, how, quickly=True).nbytes > self._room:
+                    return
+
 
 def _read(
     path: str | os.PathLike[str],
@@ -113,7 +120,7 @@ def training_batches(
     places_per_batch: int,
     images_per_place: int,
     order: Order,
-    augmentation: "Augmentation",
+    augmentation: "Augmentation | str",
     seed: int,
     epoch: int,
     preprocessing: PreprocessingConfig = PreprocessingConfig(),
@@ -138,7 +145,7 @@ def training_batches(
         places_per_batch: number of places of a batch.
         images_per_place: number of images of each.
         order: "within-city" draws a batch from one city, "shuffled" from all.
-        augmentation: changes each image.
+        augmentation: changes each image; a registered augmentation, or its name.
         seed: draws everything, together with the epoch and the step.
         epoch: from 0.
         preprocessing: whose filter resizes bytes. Every image gets the same size, whatever its
@@ -161,14 +168,13 @@ def training_batches(
 
     Example:
         >>> from crisalad_jax import read_places
-        >>> from crisalad_jax.data.augmentations import NoAugmentation
         >>> batches = training_batches(
         ...     read_places(places, min_images=3),
         ...     image_size=(98, 98),
         ...     places_per_batch=2,
         ...     images_per_place=3,
         ...     order="shuffled",
-        ...     augmentation=NoAugmentation(),
+        ...     augmentation="none",
         ...     seed=0,
         ...     epoch=0,
         ... )
@@ -204,6 +210,11 @@ def training_batches(
 class ImageFiles(Protocol):
     """Numbered images: `Places`, or a `QuerySet`."""
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Paths of the images, as text."""
+        ...
+
     def path(self, image: int | np.integer) -> pathlib.Path:
         """Return the path of one image."""
         ...
@@ -215,7 +226,7 @@ def batches_of_groups(
     labels: Int[np.ndarray, "steps groups images"],
     *,
     image_size: tuple[int, int],
-    augmentation: "Augmentation",
+    augmentation: "Augmentation | str",
     seed: tuple[int, ...],
     preprocessing: PreprocessingConfig = PreprocessingConfig(),
     start_step: int = 0,
@@ -256,6 +267,13 @@ def batches_of_groups(
     if not 0 <= number < parts or batch_size % parts:
         raise InputError(f"part: found {part}, expected the i-th of n, which divides {batch_size}")
     how = Preparation(image_size, preprocessing.for_training())
+    from crisalad_jax.data.augmentations import AUGMENTATIONS
+
+    if any("#t=" in file for file in files.files):
+        threads = min(threads, 1)  # more would read a video each, from its beginning
+        if cache is not None and not num_workers:
+            # In order: the frames of a batch are far from each other, with all others in between.
+            cache.fill(map(files.path, np.unique(chosen)), how)
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
     images = _TrainingImages(
@@ -265,7 +283,7 @@ def batches_of_groups(
         how=how,
         batch_size=batch_size,
         images_per_group=images_per_group,
-        augmentation=augmentation,
+        augmentation=AUGMENTATIONS.resolve(augmentation, "augmentation"),
         seed=seed,
     )
     return _batches(

@@ -10,12 +10,14 @@ import numpy as np
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, has_sides, has_split, listing
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.named_table import NamedRow, named_rows
+from crisalad_jax.data.video import is_video
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64
 
 TABLE = "places.csv"
 _COLUMNS = "name,place[,lat,lon[,heading]]"
 _LAYOUTS = f"the layout of GSV-Cities (Dataframes/, Images/), {TABLE}, or one folder a place"
+_GROUPED = "--place-radius METRES makes places by positions, --place-frames N of images in order"
 _VIEW = ("lat", "lon", "heading")
 
 
@@ -27,6 +29,8 @@ class OwnPlaces(NamedTuple):
     """Place -> paths relative to `root`."""
     views: dict[str, tuple[float, float, float]] | None
     """Image -> latitude, longitude and heading, NaN where unknown; None without positions."""
+    near: dict[str, list[str]] | None = None
+    """Place -> places too near to be in a batch with it; None where any two may be."""
 
 
 def read_own_places(root: pathlib.Path) -> OwnPlaces:
@@ -35,6 +39,8 @@ def read_own_places(root: pathlib.Path) -> OwnPlaces:
     Raises:
         InputError: it is none of these, or what is there does not fit.
     """
+    if is_video(root):
+        raise InputError(f"{root}: found a video, expected places: {_GROUPED}")
     if root.is_file():
         return _read_table(root)
     if (root / TABLE).is_file():
@@ -59,13 +65,14 @@ def _read_folders(root: pathlib.Path) -> OwnPlaces:
         not path.name.startswith(".") and path.is_dir() for path in root.iterdir()
     )
     if not inside:
-        raise InputError(f"{root}: found {listing(root)}, expected {_LAYOUTS}")
+        raise InputError(f"{root}: found {listing(root)}, expected {_LAYOUTS}; {_GROUPED}")
     images: dict[str, list[str]] = {}
     for path in list_images(root):
         name = path.relative_to(root)
         if name.parent == pathlib.Path():
             raise InputError(
-                f"{path}: found an image beside the folders, expected it in the folder of its place"
+                f"{path}: found an image beside the folders, expected it in the folder of its "
+                f"place; {_GROUPED}"
             )
         images.setdefault(name.parent.as_posix(), []).append(name.as_posix())
     return OwnPlaces(root, images, None)
@@ -99,6 +106,7 @@ def _check_header(table: pathlib.Path, header: Sequence[str]) -> None:
     if twice or halves or not {"name", "place"} <= set(header):
         raise InputError(
             f"{table}: found columns {', '.join(header) or 'none'}, expected {_COLUMNS}"
+            + f"; {_GROUPED}" * ("name" in header and "place" not in header)
         )
 
 

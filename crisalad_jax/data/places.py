@@ -6,6 +6,7 @@ The layout of GSV-Cities: `Dataframes/{city}.csv` with one row per image, and
 
 import csv
 import dataclasses
+import itertools
 import math
 import operator
 import os
@@ -17,8 +18,9 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.concise import brief
+from crisalad_jax.data.grouped_places import places_by_order, places_by_position
 from crisalad_jax.data.names import Disk, plain
-from crisalad_jax.data.own_places import read_own_places, views_in_order
+from crisalad_jax.data.own_places import OwnPlaces, read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
 from crisalad_jax.utils.notes import tell
@@ -26,6 +28,8 @@ from crisalad_jax.utils.shapes import Float64, Int, Int32, Int64
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
 IDS_PER_CITY = 10**5
+_TURNS = 20
+"""Draws of all places after which no batch of places that are far from each other is expected."""
 
 Order = Literal["within-city", "shuffled"]
 
@@ -54,6 +58,8 @@ class Places:
     tell where they were taken."""
     views: Float64[np.ndarray, "images 3"] | None = None
     """Image -> latitude, longitude and heading of a table, NaN where it has no heading."""
+    near: tuple[Int64[np.ndarray, " _"], ...] | None = None
+    """Place -> other places that are too near to be in a batch with it; None where any two may."""
 
     @property
     def image_counts(self) -> Int64[np.ndarray, " places"]:
@@ -74,9 +80,19 @@ class Places:
 
 @takes(root=PATH)
 def read_places(
-    root: str | os.PathLike[str], *, cities: Sequence[str] | None = None, min_images: int = 4
+    root: str | os.PathLike[str],
+    *,
+    cities: Sequence[str] | None = None,
+    min_images: int = 4,
+    place_radius: float | None = None,
+    place_frames: int | None = None,
+    positions: str | os.PathLike[str] | None = None,
+    fps: float | None = None,
 ) -> Places:
     """Read a folder in the layout of GSV-Cities or of one's own; every image named must exist.
+
+    Or make places of any source of images, by their positions or their order. Then places that are
+    too near to tell apart, `Places.near`, never meet in a batch.
 
     A layout of one's own is a folder in which each folder with images is a place; or a table with
     the columns `name,place`, and `lat,lon` and `heading` in degrees where they are known: a file,
@@ -87,24 +103,54 @@ def read_places(
     second view.
 
     Args:
-        root: folder that holds `Dataframes/` and `Images/`, or a layout of one's own.
+        root: folder that holds `Dataframes/` and `Images/`, or a layout of one's own; with
+            `place_radius` or `place_frames` a source of images (`open_source`).
         cities: names of CSV files without the suffix; None reads all, in alphabetical order.
         min_images: places with fewer images are left out.
+        place_radius: metres from a place's centre, within which its images are. In the order of the
+            images, one that is farther from all centres becomes a centre; then each image is of the
+            place with the nearest. Centres of a batch are more than four radii apart.
+        place_frames: number of consecutive images of a folder, or frames of a video, that are a
+            place. The next place is not in a batch with it.
+        positions: table of positions (`read_positions`) for `place_radius`. None is what the source
+            says, if that is a table, else what @UTM names say, else the EXIF data of JPEGs.
+        fps: frames a second taken of videos; None is one.
 
     Returns:
         The places, with their images' files.
 
     Raises:
         InputError: none of these layouts, an unknown or repeated city, a CSV without a column or
-            with a field that is not a number, a missing image, no place large enough.
+            with a field that is not a number, a missing image, no place large enough, no position,
+            or arguments that do not fit each other.
 
     Example:
         >>> read_places(places, min_images=3).image_counts.tolist()
         [3, 3, 3, 3, 3, 3, 3, 3]
     """
     root = pathlib.Path(root)
-    if not (root / "Dataframes").is_dir():
-        return _own_places(root, cities, min_images)
+    if place_radius is not None and place_frames is not None:
+        raise InputError(
+            "--place-frames: found beside --place-radius, expected only one of the two"
+        )
+    if place_radius is None and positions is not None:
+        raise InputError("--positions: found without --place-radius, expected both")
+    is_grouped = (place_radius, place_frames) != (None, None)
+    if fps is not None and not is_grouped:
+        raise InputError("--fps: found without --place-radius or --place-frames, expected one")
+    if is_grouped or not (root / "Dataframes").is_dir():
+        if cities is not None:
+            raise InputError(
+                f"cities: found {', '.join(cities)} for {root}, expected none: it is not in the "
+                "layout of GSV-Cities"
+            )
+        if place_radius is not None:
+            found = places_by_position(root, place_radius, positions, fps)
+            return _own_places(root, found, min_images, f" within {place_radius:g} m")
+        if place_frames is not None:
+            found = places_by_order(root, place_frames, fps)
+            return _own_places(root, found, min_images, f" of every {place_frames}")
+        return _own_places(root, read_own_places(root), min_images)
     tables = _find_tables(root, cities)
     listings: _Listings = {}
     files: list[str] = []
@@ -135,24 +181,27 @@ def read_places(
     )
 
 
-def _own_places(root: pathlib.Path, cities: Sequence[str] | None, min_images: int) -> Places:
-    """Read places of one's own, which are of one city."""
-    if cities is not None:
-        raise InputError(
-            f"cities: found {', '.join(cities)} for {root}, expected none: it is not in the layout "
-            "of GSV-Cities"
-        )
-    found = read_own_places(root)
+def _own_places(root: pathlib.Path, found: OwnPlaces, min_images: int, words: str = "") -> Places:
+    """Take the places of one's own that are large enough; they are of one city."""
     kept = {name: files for name, files in found.images.items() if len(files) >= min_images}
     if not kept:
         largest = max(map(len, found.images.values()))
+        flags = " (--place-radius, --place-frames, --min-images)" if words else ""
         raise InputError(
-            f"{root}: found no place with at least {min_images} images; the largest has {largest}"
+            f"{root}: found no place with at least {min_images} images{words}; the largest has "
+            f"{largest}, of {len(found.images)} places{flags}"
         )
     if len(kept) < len(found.images):
         tell(
             f"{root}: left out {len(found.images) - len(kept)} of {len(found.images)} places, with "
-            f"fewer than {min_images} images"
+            f"fewer than {min_images} images{words}"
+        )
+    number = {name: place for place, name in enumerate(kept)}
+    near = None
+    if found.near is not None:
+        near = tuple(
+            np.array(sorted(number[other] for other in found.near[name] if other in number), int)
+            for name in kept
         )
     files = [file for place in kept.values() for file in place]
     counts = [len(place) for place in kept.values()]
@@ -166,6 +215,7 @@ def _own_places(root: pathlib.Path, cities: Sequence[str] | None, min_images: in
         place_id=np.arange(len(kept), dtype=np.int64),
         names=tuple(kept),
         views=views_in_order(found, files),
+        near=near,
     )
 
 
@@ -320,9 +370,14 @@ def epoch_batches(
     With `steps` the epoch has exactly this number of batches: it is cut short, or continued with
     new draws of all places.
 
+    Places that are `Places.near` each other are never in one batch: in its turn, a place goes into
+    the first unfinished batch without a place that is near. Then epochs without `steps` may differ
+    in length.
+
     Raises:
         InputError: a place has fewer than `images_per_place` images, there are fewer places than
-            `places_per_batch`, an unknown order, a negative seed or epoch, less than one step.
+            `places_per_batch` (or too few that are not near each other), an unknown order, a
+            negative seed or epoch, less than one step.
     """
     for name, value, least in (
         ("places_per_batch", places_per_batch, 1),
@@ -343,16 +398,24 @@ def epoch_batches(
     if len(counts) < places_per_batch:
         raise InputError(
             f"{places.root}: found {len(counts)} places, expected at least places_per_batch "
-            f"{places_per_batch}"
+            f"{places_per_batch} (--places-per-batch)"
         )
-    once = len(counts) // places_per_batch
-    drawn = []
-    for turn in range(1 if steps is None else -(-steps // once)):
+    drawn: list[np.ndarray] = []
+    for turn in itertools.count():
         # The spawn key makes this stream independent of the loader's from (seed, epoch). The
         # first turn draws the same as an epoch without `steps`.
         entropy = (seed, epoch, turn) if turn else (seed, epoch)
         generator = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(0,)))
         drawn.append(_draw(places, places_per_batch, images_per_place, order, generator))
+        found = sum(map(len, drawn))
+        if not found and turn == _TURNS - 1:
+            raise InputError(
+                f"{places.root}: found {len(counts)} places, of which no {places_per_batch} are "
+                "far enough from each other for a batch (places_per_batch, --places-per-batch), "
+                "expected fewer in a batch, or smaller places"
+            )
+        if found >= (steps or 1):
+            break
     return np.concatenate(drawn)[:steps]
 
 
@@ -372,8 +435,30 @@ def _draw(
     else:
         raise InputError(f"order: found {order!r}, expected one of shuffled, within-city")
     place_order = np.lexsort((generator.random(len(counts)), city_rank))
-    steps = len(counts) // places_per_batch
-    chosen = place_order[: steps * places_per_batch].reshape(steps, places_per_batch)
+    if places.near is None:
+        steps = len(counts) // places_per_batch
+        chosen = place_order[: steps * places_per_batch].reshape(steps, places_per_batch)
+    else:
+        chosen = _apart(place_order.tolist(), places.near, places_per_batch)
     # Sorting all images by (place, random key) shuffles the images within each place.
     shuffled = np.lexsort((generator.random(len(places.files)), places.image_place))
     return shuffled[places.place_start[chosen][..., None] + np.arange(images_per_place)]
+
+
+def _apart(
+    order: Sequence[int], near: Sequence[Int64[np.ndarray, " _"]], size: int
+) -> Int64[np.ndarray, "steps places"]:
+    """Fill batches with places in this order, so that none is near another of its batch."""
+    full: list[list[int]] = []
+    unfinished: list[tuple[list[int], set[int]]] = []
+    for place in order:
+        fitting = (number for number, (_, near_it) in enumerate(unfinished) if place not in near_it)
+        number = next(fitting, len(unfinished))
+        if number == len(unfinished):
+            unfinished.append(([], set()))
+        batch, near_it = unfinished[number]
+        batch.append(place)
+        near_it.update(near[place].tolist())
+        if len(batch) == size:
+            full.append(unfinished.pop(number)[0])
+    return np.array(full, np.int64).reshape(-1, size)

@@ -2,7 +2,8 @@
 
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.benchmarks import open_benchmark
@@ -28,6 +29,10 @@ def train(
     data: Path,
     out: Path,
     *,
+    place_radius: float | None = None,
+    place_frames: int | None = None,
+    positions: Path | None = None,
+    fps: float | None = None,
     images: Path | None = None,
     validation: Path | None = None,
     validation_images: Path | None = None,
@@ -46,11 +51,17 @@ def train(
         config: how to train.
         data: places, in a layout that `read_places` reads; for a recipe that mines tuples, a set
             that `open_benchmark` reads, such as pitts30k_train.mat.
+        place_radius: metres within which images of a source with positions are a place; see
+            `read_places`, as for the three that follow.
+        place_frames: number of consecutive images that are a place.
+        positions: table of positions.
+        fps: frames a second taken of videos.
         images: folder of the images that such a file names.
         out: folder of the run; see `fit`.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
         validation_images: folder of the images that a .mat file or .npy lists at `validation` name.
-        weights: a whole model to start from, or a published one's name.
+        weights: a whole model to start from, or a published one's name. `config.model` is what is
+            trained and saved; `recipe(model=load(weights).config)` has the file's.
         backbone: a checkpoint to start the backbone from, or a published model's name.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
         num_workers: number of processes that read the training images; 0 for threads.
@@ -79,6 +90,13 @@ def train(
     if validation is None and validation_images is not None:
         raise InputError("--val-images: found no --val, expected it beside --val")
 
+    grouping = {
+        "place_radius": place_radius,
+        "place_frames": place_frames,
+        "positions": positions,
+        "fps": fps,
+    }
+
     def read() -> tuple:
         initial = read_start(
             config,
@@ -86,7 +104,7 @@ def train(
             backbone=backbone,
             quiet=quiet or not distributed.is_primary(),
         )
-        places = _read_set(config, data, images)
+        places = _read_set(config, data, images, grouping)
         if validation is None:
             return initial, places, None
         return initial, places, open_benchmark(validation, images=validation_images)
@@ -128,15 +146,23 @@ def train(
     return result
 
 
-def _read_set(config: TrainConfig, data: Path, images: Path | None) -> Places | QuerySet:
+def _read_set(
+    config: TrainConfig, data: Path, images: Path | None, grouping: Mapping[str, Any]
+) -> Places | QuerySet:
     """Read the training set: places, or queries of which tuples are mined."""
     mining = config.mining
     if not config.mines:
         if images is not None:
             raise InputError("--data-images: found for places, expected it for queries alone")
         return read_places(
-            pathlib.Path(data), cities=config.cities, min_images=config.min_images_of_place
+            data, cities=config.cities, min_images=config.min_images_of_place, **grouping
         )
+    for name, value in grouping.items():
+        if value is not None:
+            raise InputError(
+                f"--{name.replace('_', '-')}: found for a recipe that mines tuples, expected it "
+                "for one that trains on places"
+            )
     if images is not None and pathlib.Path(data).is_dir():
         raise InputError(f"--data-images: found beside the folder {data}, expected it for a file")
     folder = pathlib.Path(data)

@@ -66,13 +66,16 @@ class AdapterConfig:
     The paper prints the count of parameters alone (Table 3), which is 741,504 in both readings."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the ranges of the fields in use."""
         check_types(self)
-        require_positive(self, "bottleneck", "kernel_size")
-        require(
-            self.kernel_size % 2 == 1,
-            f"AdapterConfig.kernel_size: found {self.kernel_size}, expected an odd number",
-        )
+        if self.kind != "none":
+            require_positive(self, "bottleneck")
+        if self.kind == "depthwise":
+            require_positive(self, "kernel_size")
+            require(
+                self.kernel_size % 2 == 1,
+                f"AdapterConfig.kernel_size: found {self.kernel_size}, expected an odd number",
+            )
 
     def width(self, dim: int) -> int:
         """Return the width of the bottleneck beside a backbone of width `dim`.

@@ -60,13 +60,14 @@ class CrossImageConfig:
     """Whether the global token takes part too, cut into tokens of the clusters' width."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the ranges of the fields in use."""
         check_types(self)
-        require_positive(self, "heads", "feedforward")
         require(
             self.layers >= 0, f"CrossImageConfig.layers: found {self.layers}, expected at least 0"
         )
-        require_fraction(self, "dropout")
+        if self.layers:
+            require_positive(self, "heads", "feedforward")
+            require_fraction(self, "dropout")
 
 
 @pytree_dataclass

@@ -140,7 +140,9 @@ class MiningConfig:
     hardest in any case."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the ranges, where tuples are mined."""
+        if self.kind == "none":
+            return
         require_positive(self, "negatives", "candidates", "queries_per_round")
         for name in ("queries_per_epoch", "margin"):
             if getattr(self, name) is not None:

@@ -16,6 +16,7 @@ from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.notes import tell
 
 
 def read_start(
@@ -27,8 +28,10 @@ def read_start(
 ) -> Crisalad | None:
     """Read the parameters that a run starts from.
 
+    A note tells of weights that were made for images of another size, or resized in another way.
+
     Args:
-        config: the run's.
+        config: the run's; `recipe` takes the model of weights.
         weights: a whole model of this package, or a published model's name.
         backbone: a checkpoint of which the backbone alone is taken, public or of this package, or a
             published model's name.
@@ -43,7 +46,12 @@ def read_start(
     if weights is not None:
         if backbone is not None:
             raise InputError("--backbone: found beside --weights, expected only one of the two")
-        params, _ = load_weights(find_weights(weights, quiet=quiet), expected=config.model)
+        params, theirs = load_weights(find_weights(weights, quiet=quiet), expected=config.model)
+        if theirs.images_in_words != config.model.images_in_words:
+            tell(
+                f"{weights}: found weights for images at {theirs.images_in_words}; this run trains "
+                f"and is saved with {config.model.images_in_words}"
+            )
         return params
     if backbone is None:
         return None

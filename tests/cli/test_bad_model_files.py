@@ -181,7 +181,7 @@ def test_training_from_another_size_or_kind(capfd: Capture, tmp_path: pathlib.Pa
     train = ("train", "--preset", "tiny", "--data", tmp_path, "--out", tmp_path / "run")
     fails(
         capfd,
-        *(*train, "--weights", ours),
+        *(*train, "--weights", ours, "--model.backbone.dim", 128),
         words=(
             f"{ours}: these weights are of another model: ",
             "backbone.dim: found 64, expected 128",

@@ -16,7 +16,7 @@ import pytest
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data import loader
-from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.data.augmentations import AUGMENTATIONS, NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig, rand_augment
 from crisalad_jax.data.images import read_image
@@ -127,6 +127,35 @@ def test_threads_restarts_and_caches_do_not_change_a_bit(places, augmentation):
     cache = ImageCache()
     for _ in range(2):
         assert_same(train(places, augmentation=augmentation, cache=cache), whole)
+
+
+@pytest.mark.parametrize("name", sorted(AUGMENTATIONS))
+def test_an_augmentation_goes_by_its_name(places, name):
+    assert_same(
+        train(places, augmentation=name), train(places, augmentation=AUGMENTATIONS.make(name))
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("nonne", r"^augmentation: found 'nonne', expected one of .*none"),
+        (None, r"^augmentation: found None, expected .* or its name$"),
+        (RandAugmentConfig, r"^augmentation: found .*, expected .* or its name$"),
+    ],
+)
+def test_what_is_no_augmentation_is_told_at_once(places, wrong, words):
+    with pytest.raises(InputError, match=words):
+        training_batches(
+            places,
+            image_size=SIZE,
+            places_per_batch=2,
+            images_per_place=3,
+            order="shuffled",
+            augmentation=wrong,
+            seed=0,
+            epoch=0,
+        )
 
 
 def test_opencv_has_one_thread_while_batches_are_read(places):

@@ -18,7 +18,6 @@ from crisalad_jax.config.io import differences
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
@@ -159,18 +158,14 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
 
 def _told(config: ModelConfig) -> ModelConfig:
     """Return a configuration with all fields reset that a trained model's arrays do not show."""
-    encoder = config.cross_image if config.cross_image.layers else CrossImageConfig(layers=0)
-    config = dataclasses.replace(config, cross_image=encoder)
     backbone = config.backbone
     if not isinstance(backbone, VisionTransformer):
         return config
     adapter = backbone.adapter
-    if adapter.kind == "none":
-        adapter = AdapterConfig(kind="none")
-    elif adapter.kind != "depthwise":
-        adapter = dataclasses.replace(adapter, kernel_size=AdapterConfig.kernel_size)
     if adapter.kind != "none":
-        adapter = dataclasses.replace(adapter, bottleneck=backbone.adapter_dim / backbone.dim)
+        kernel = {} if adapter.kind == "depthwise" else {"kernel_size": AdapterConfig.kernel_size}
+        bottleneck = backbone.adapter_dim / backbone.dim
+        adapter = dataclasses.replace(adapter, bottleneck=bottleneck, **kernel)
     backbone = dataclasses.replace(
         backbone, mlp_ratio=backbone.hidden / backbone.dim, adapter=adapter
     )

@@ -9,7 +9,8 @@ from crisalad_jax.config.parts import REGISTRIES, Part
 from crisalad_jax.config.plugins import load_entry_points
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
+from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 
@@ -62,7 +63,9 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
 
 
 @takes(preset=str)
-def recipe(preset: str, name: str | None = None) -> TrainConfig:
+def recipe(
+    preset: str = "b14", name: str | None = None, *, model: ModelConfig | None = None
+) -> TrainConfig:
     """Look up how a model is trained, and which parts it has for that.
 
     Args:
@@ -70,6 +73,9 @@ def recipe(preset: str, name: str | None = None) -> TrainConfig:
         name: what to reproduce (`RECIPES`), or RECIPE+PART: a recipe with a registered part, as
             NAME or KIND:NAME, in the place of its own. A part alone stands for crisalad+PART. None
             is the paper's way, except for `tiny`, which starts from nothing.
+        model: that of weights to start from, in place of the preset's and the recipe's. It is
+            trained and validated at its own image size. Where the recipe trains adapters too and it
+            has none, its head alone trains.
 
     Returns:
         The configuration of a training run.
@@ -82,24 +88,40 @@ def recipe(preset: str, name: str | None = None) -> TrainConfig:
         6e-05
         >>> recipe("b14", "crisalad+gem").model.descriptor_dim
         768
+        >>> from crisalad_jax import load
+        >>> recipe(name="salad", model=load("starter").config).model.image_size
+        (192, 256)
     """
     if preset not in PRESETS and preset.partition("+")[0] in RECIPES:
         raise InputError(
             f"preset: found {preset!r}, which is a recipe (--recipe {preset}), expected a size of "
             f"the model: {', '.join(sorted(PRESETS))}"
         )
-    model = choose("preset", preset, PRESETS)
+    size = choose("preset", preset, PRESETS)
     name = ("scratch" if preset == "tiny" else "crisalad") if name is None else name
     if name in RENAMED:
         tell(f"recipe: found {name}, which is called {RENAMED[name]}")
         name = RENAMED[name]
     if name in RECIPES:
-        return RECIPES[name](model, preset)
+        return _of_model(RECIPES[name](size, preset), model)
     base, part = split_name(name)
     found = find_part(part, preset)
     if base is None:
         tell(f"recipe: found {name}, which is a part: crisalad+{name}, CriSALAD with it in place")
-    return with_part(RECIPES[base or "crisalad"](model, preset), found)
+    return with_part(_of_model(RECIPES[base or "crisalad"](size, preset), model), found)
+
+
+def _of_model(config: TrainConfig, model: ModelConfig | None) -> TrainConfig:
+    """Return a recipe for another model than its own, if there is one."""
+    if model is None:
+        return config
+    fits = config.trainable != ADAPTERS_AND_HEAD or has_adapters(model)
+    return dataclasses.replace(
+        config,
+        model=model,
+        trainable=config.trainable if fits else HEAD,
+        validation_size=None,
+    )
 
 
 def with_resizing(config: TrainConfig, **fields: Any) -> TrainConfig:

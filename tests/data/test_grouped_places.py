@@ -1,0 +1,256 @@
+"""Places of images with positions or in order, against groupings by hand."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+import crisalad_jax as cj
+from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.data.class_groups import class_groups
+from crisalad_jax.data.loader import ImageCache, training_batches
+from crisalad_jax.data.places import epoch_batches, read_places
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
+from tests.conftest import RECIPE, write_picture, write_video
+
+
+def _street(folder, xs, *, table="gps.csv", name="{:02d}.jpg"):
+    """Images along a line, without a picture in them, and a table of their positions."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["name,x,y"]
+    for number, x in enumerate(xs):
+        (folder / name.format(number)).write_bytes(b"")
+        lines.append(f"{name.format(number)},{x},0")
+    (folder / table).write_text("\n".join(lines))
+    return folder
+
+
+def _near(places):
+    assert places.near is not None
+    return [each.tolist() for each in places.near]
+
+
+# By hand, radius 10: image 0 is a centre; 4 and 10 are within 10 m of it; 11 is a centre; 15 is
+# within 10 m of it; 30 is a centre; so is 5000. Then 4 is nearer 0 and 10 nearer 11 than 0.
+XS = (0, 4, 10, 11, 15, 30, 5000)
+BY_HAND = {"00.jpg": [0, 1], "03.jpg": [2, 3, 4], "05.jpg": [5], "06.jpg": [6]}
+
+
+def test_a_radius_makes_places_as_by_hand(tmp_path):
+    root = _street(tmp_path / "walk", XS)
+    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=1)
+    assert places.names == tuple(BY_HAND)
+    groups = [list(group) for group in BY_HAND.values()]
+    assert places.files == tuple(f"{image:02d}.jpg" for image in itertools.chain(*groups))
+    assert places.image_counts.tolist() == [2, 3, 1, 1]
+    assert places.root == root
+    # Centres at 0, 11, 30 and 5000: up to 40 m apart they are near.
+    assert _near(places) == [[1, 2], [0, 2], [0, 1], []]
+
+
+def test_places_with_few_images_are_left_out_and_counted(tmp_path):
+    root = _street(tmp_path / "walk", XS)
+    given = {"place_radius": 10, "positions": root / "gps.csv"}
+    words = r"left out 2 of 4 places, with fewer than 2 images within 10 m$"
+    with pytest.warns(Note, match=words):
+        places = read_places(root, min_images=2, **given)
+    assert places.names == ("00.jpg", "03.jpg")
+    assert _near(places) == [[1], [0]]  # by their new numbers
+    words = (
+        r"walk: found no place with at least 4 images within 10 m; the largest has 3, of 4 places "
+        r"\(--place-radius, .*--min-images\)$"
+    )
+    with pytest.raises(InputError, match=words):
+        read_places(root, **given)
+
+
+def test_degrees_are_metres_of_utm(tmp_path):
+    # One degree of latitude is 110.6 km at the equator, and 111.7 km at the poles.
+    root = tmp_path / "walk"
+    root.mkdir()
+    lines = ["name,lat,lon"]
+    for number, metres in enumerate((0, 9, 12, 100)):
+        (root / f"{number}.jpg").write_bytes(b"")
+        lines.append(f"{number}.jpg,{47 + metres / 111_170:.8f},8.5")
+    (root / "t.csv").write_text("\n".join(lines))
+    places = read_places(root / "t.csv", place_radius=10, min_images=1)  # a table is a source
+    assert places.names == ("0.jpg", "2.jpg", "3.jpg")
+    assert places.image_counts.tolist() == [1, 2, 1]  # 9 is nearer 12 than 0
+    assert _near(places) == [[1], [0], []]
+
+
+def test_names_say_where(tmp_path):
+    for east in (500_000, 500_003, 500_500):
+        write_picture(tmp_path / f"@{east}.00@5000000.00@10@T@@@@@@@@@@@.jpg", 0)
+    places = read_places(tmp_path, place_radius=5, min_images=1)
+    assert places.image_counts.tolist() == [2, 1]
+
+
+def _near_pairs(places, batch, points):
+    """The smallest distance of two images of different places, and the largest of one place's."""
+    place = places.image_place[batch.ravel()]
+    where = points[[places.files[image] for image in batch.ravel()]]
+    distance = np.linalg.norm(where[:, None] - where[None], axis=-1)
+    same = place[:, None] == place[None]
+    return distance[~same].min(), distance[same].max()
+
+
+class _Points(dict):
+    def __getitem__(self, names):
+        return np.array([dict.__getitem__(self, name) for name in names])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_negatives_of_a_batch_are_farther_than_its_positives(tmp_path, seed):
+    # Two loops through the same square of streets, at random steps.
+    rng = np.random.default_rng(seed)
+    corners = [(0, 0), (300, 0), (300, 200), (0, 200), (0, 0)]
+    points, lines = _Points(), ["name,x,y"]
+    for loop in range(2):
+        along = np.sort(rng.uniform(0, 4, 300))
+        for number, t in enumerate(along):
+            (x0, y0), (x1, y1) = corners[int(t)], corners[int(t) + 1]
+            part = t - int(t)
+            x, y = x0 + part * (x1 - x0), y0 + part * (y1 - y0) + rng.uniform(-2, 2)
+            name = f"{loop}/{number:03d}.jpg"
+            points[name] = (x, y)
+            lines.append(f"{name},{x},{y}")
+            (tmp_path / str(loop)).mkdir(exist_ok=True)
+            (tmp_path / name).write_bytes(b"")
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    places = read_places(tmp_path / "t.csv", place_radius=10, min_images=4)
+    draw = {"places_per_batch": 8, "images_per_place": 4, "order": "shuffled", "seed": seed}
+    batches = epoch_batches(places, epoch=0, **draw)
+    for batch in batches:
+        apart, together = _near_pairs(places, batch, points)
+        assert together <= 20 < apart  # two radii
+    # An epoch uses nearly all places: of 100 m of street there are some nine.
+    assert len(batches) * 8 >= 0.7 * len(places.place_id)
+    assert len(np.unique(places.image_place[batches[..., 0]])) == len(batches) * 8  # each once
+    np.testing.assert_array_equal(batches, epoch_batches(places, epoch=0, **draw))
+    longer = epoch_batches(places, epoch=0, steps=3 * len(batches), **draw)
+    assert len(longer) == 3 * len(batches)
+    np.testing.assert_array_equal(longer[: len(batches)], batches)
+
+
+def test_too_many_places_for_a_batch(tmp_path):
+    root = _street(tmp_path / "walk", range(0, 100, 2))  # 100 m hold at most three 40 m apart
+    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=2)
+    draw = {"images_per_place": 2, "order": "shuffled", "seed": 0, "epoch": 0}
+    assert len(epoch_batches(places, places_per_batch=2, **draw))
+    with pytest.raises(InputError, match=r"places, of which no 5 are far enough .*--places-per-b"):
+        epoch_batches(places, places_per_batch=5, **draw)
+
+
+def test_every_n_frames_in_order(tmp_path):
+    for name in ("a/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg", "a/5.jpg", "b/1.jpg", "b/2.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    places = read_places(tmp_path, place_frames=2, min_images=1)
+    assert places.names == ("a/1.jpg", "a/3.jpg", "a/5.jpg", "b/1.jpg")
+    assert places.image_counts.tolist() == [2, 2, 1, 2]
+    # The last of one folder is no neighbour of the first of the next.
+    assert _near(places) == [[1], [0, 2], [1], []]
+
+
+@pytest.mark.parametrize("cache", [None, ImageCache(), ImageCache(40_000)])
+def test_a_video_trains_as_its_frames(tmp_path, cache):
+    video = write_video(tmp_path / "walk.avi", 16, rate=10)
+    places = read_places(video, place_frames=4, fps=10, min_images=4)
+    seconds = ("0.000", "0.400", "0.800", "1.200")
+    assert places.names == tuple(f"walk.avi#t={second}" for second in seconds)
+    batches = training_batches(
+        places,
+        image_size=(48, 64),
+        places_per_batch=2,
+        images_per_place=2,
+        order="shuffled",
+        augmentation="none",
+        seed=0,
+        epoch=0,
+        cache=cache,
+    )
+    for batch in batches:
+        # Frame i is grey of level 10 i; MJPG and the resize to the same size leave it to a level.
+        frames = np.rint(batch.images.mean(axis=(1, 2, 3)) / 10).astype(int)
+        assert (frames // 4).tolist() == batch.labels.tolist()
+        first, second = batch.labels[0], batch.labels[2]
+        assert abs(first - second) > 1
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"place_radius": 0}, r"^--place-radius: found 0, expected metres above 0$"),
+        ({"place_radius": math.nan}, r"^--place-radius: found nan"),
+        ({"place_frames": 1}, r"^--place-frames: found 1, expected at least 2$"),
+        ({"place_radius": 5, "place_frames": 4}, r"^--place-frames: found beside --place-radius"),
+        ({"positions": "gps.csv"}, r"^--positions: found without --place-radius, expected both$"),
+        ({"fps": 2.0}, r"^--fps: found without --place-radius or --place-frames"),
+        ({"place_frames": 4, "fps": 2.0}, r"^--fps: found 2 without a video"),
+        ({"place_frames": 4, "cities": ["a"]}, r"^cities: found a for .*walk, expected none"),
+        (
+            {"place_radius": 5},
+            r"walk: found no position of 7 images, which --place-radius asks for, expected "
+            r"--positions TABLE",
+        ),
+        ({}, r"walk: found .*, expected the layout of .*; --place-radius METRES makes places by"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_told(tmp_path, given, words):
+    with pytest.raises(InputError, match=words):
+        read_places(_street(tmp_path / "walk", XS), **given)
+
+
+def test_a_source_that_has_no_places_says_which_flags_make_them(tmp_path, shared):
+    root = _street(tmp_path / "walk", XS)
+    video = write_video(tmp_path / "walk.avi", 3)
+    for source in (root / "gps.csv", video):
+        with pytest.raises(InputError, match=r"; --place-radius|: --place-radius"):
+            read_places(source)
+    (tmp_path / "other.csv").write_text("name,x,y\nz.jpg,1,2\n")
+    with pytest.raises(InputError, match=r"found none of the 7 images of .*, expected names such"):
+        read_places(root, place_radius=5, positions=tmp_path / "other.csv")
+    with pytest.raises(InputError, match="found the layout of GSV-Cities, which has places"):
+        read_places(shared / "city", place_radius=5)
+
+
+def test_images_without_a_position_are_left_out_with_a_note(tmp_path):
+    root = _street(tmp_path / "walk", XS)
+    (root / "99.jpg").write_bytes(b"")
+    with pytest.warns(Note, match=r"left out 1 of 8 images, which have no position"):
+        places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=1)
+    assert places.names == tuple(BY_HAND)
+
+
+def test_classes_of_a_group_are_not_near(tmp_path):
+    root = _street(tmp_path / "walk", range(0, 400, 2))
+    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=2)
+    config = ClassesConfig(kind="places", groups=5)
+    groups = class_groups(places, config, min_images=2, places_per_batch=2)
+    assert len(groups) == 5
+    for group in groups:
+        assert group.near is None
+        assert group.names is not None
+        numbers = [list(places.names or ()).index(name) for name in group.names]
+        assert not any(set(_near(places)[number]) & set(numbers) for number in numbers)
+
+
+def test_training_takes_a_folder_and_a_table(tmp_path):
+    lines = ["name,x,y"]
+    for place, view in itertools.product(range(6), range(3)):
+        name = f"{place}-{view}.jpg"
+        write_picture(tmp_path / "walk" / name, place, noise=10.0 * (1 + view))
+        lines.append(f"{name},{100 * place + view},0")
+    (tmp_path / "gps.csv").write_text("\n".join(lines))
+    result = cj.train(
+        RECIPE,
+        tmp_path / "walk",
+        tmp_path / "run",
+        place_radius=10,
+        positions=tmp_path / "gps.csv",
+        quiet=True,
+    )
+    assert result.steps == 3 * 2  # six places, three a batch, three epochs
