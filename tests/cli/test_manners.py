@@ -4,11 +4,13 @@ import csv
 import dataclasses
 import importlib
 import json
+import os
 import pathlib
 import re
 import shlex
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -24,14 +26,41 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import to_json
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
-from tests.cli.test_cli import fails, spoil, succeeds, train
+from tests.cli.test_cli import fails, files_in, spoil, succeeds, train
 from tests.conftest import BATCH, MODEL, RECIPE, STEPS
 
+ROOT = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
 COMMANDS = list(crisalad_jax.cli._COMMANDS)
 
 
 def module_of(command):
     return importlib.import_module(f"crisalad_jax.cli.{command.replace('-', '_')}")
+
+
+# Platforms
+
+
+@pytest.mark.parametrize("platforms", ["gpuu", "rocm", "cpu,gpuu"])
+def test_platforms_that_jax_lacks_are_one_line(tmp_path, shared, platforms):
+    """JAX raises a RuntimeError of the first, and an AssertionError without words of the second."""
+    images = shared / "town" / "images" / "test" / "database"
+    verbs = (
+        ("info", "--weights", shared / "weights.safetensors"),
+        ("index", "--images", images, "--weights", shared / "weights.safetensors", "--out", "m"),
+    )
+    for verb in verbs:
+        done = subprocess.run(
+            [sys.executable, "-m", "crisalad_jax", *map(str, verb)],
+            cwd=tmp_path,
+            env=os.environ | {"JAX_PLATFORMS": platforms, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        start = f"crisalad: JAX_PLATFORMS: found '{platforms}', expected platforms that this JAX"
+        assert done.stderr.startswith(start), done.stderr
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert "cpu" in done.stderr.rpartition("has: ")[2]  # which every jaxlib has
+    assert files_in(tmp_path) == set()
 
 
 # Help
