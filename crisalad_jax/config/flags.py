@@ -231,25 +231,33 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
             said.append(f"{found[1]}: found {found[2]}, expected a whole number")
         elif found := re.match(r"Error parsing (\S+): could not convert .* float: (.*)", text):
             said.append(f"{found[1]}: found {found[2]}, expected a number")
-        elif found := re.match(r"Error parsing (\S+): no type matching (.+) could .* (\[.*\])", text):
+        elif found := re.match(
+            r"Error parsing (\S+): no type matching (.+) could .*? (\[.*\])", text
+        ):
             values = " ".join(ast.literal_eval(found[3]))
-            said.append(f"{found[1]}: found {values!r}, expected {_expected(found[2])}")
+            said.append(f"{found[1]}: found {_or_none(values)}, expected {_expected(found[2])}")
         elif found := re.match(r"invalid choice (.*) for argument '(.*)'\. .* one of (.*)\.", text):
             names = ", ".join(name for name in ast.literal_eval(found[3]) if name != "None")
             said.append(f"{found[2]}: found {found[1]}, expected one of {names}")
         elif found := re.match(r"Missing value for argument '(.*)'. Expected (\d+) values", text):
             values = " ".join(_values_after(found[1], arguments))
             words = "a value" if found[2] == "1" else f"{found[2]} values"
-            said.append(f"{found[1]}: found {repr(values) if values else 'none'}, expected {words}")
+            said.append(f"{found[1]}: found {_or_none(values)}, expected {words}")
         elif found := re.match(r"Missing from .*?: (-.*|[A-Z].*)", text):
             said.append(f"missing {plain_metavar(found[1])}")
         elif found := re.match(r"Unrecognized options: (.*)", text):
-            said.insert(0, _unknown(found[1].split(", "), arguments))
+            # Tyro puts commas between them, and none where a flag is missing too.
+            tokens = [each for each in re.split(", | ", found[1]) if each in arguments]
+            said.insert(0, _unknown(tokens, arguments))
         elif found := re.match(r"(?:Perhaps you meant|Arguments similar to \S+): (.*)", text):
             said.append(f"did you mean {plain_metavar(found[1])}?")
         else:
             said.append(text)
     return "; ".join(said)
+
+
+def _or_none(values: str) -> str:
+    return repr(values) if values else "none"
 
 
 def _values_after(flag: str, arguments: Sequence[str]) -> list[str]:
@@ -261,16 +269,17 @@ def _values_after(flag: str, arguments: Sequence[str]) -> list[str]:
 
 def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
     """Say what is wrong with arguments that tyro does not take: flags, or values too many."""
+    if not tokens:  # with commas or spaces in them
+        return "found values without a flag before them"
     flags = [token.partition("=")[0] for token in tokens if token.startswith("-")]
     if flags:
         return f"{', '.join(flags)}: found no such flag{'s' if len(flags) > 1 else ''}"
-    value = tokens[0].split()[0] if tokens[0] not in arguments else tokens[0]
-    before = arguments[: arguments.index(value)] if value in arguments else ()
-    flag = next((each for each in reversed(before) if each.startswith("--")), None)
+    before = itertools.takewhile(lambda each: each != tokens[0], arguments)
+    flag = next((each for each in reversed(list(before)) if each.startswith("--")), None)
     if flag is None:
-        return f"found {value!r} without a flag before it"
+        return f"found {tokens[0]!r} without a flag before it"
     values = _values_after(flag, arguments)
-    most = values.index(value) if value in values else 0
+    most = len(values) - sum(each in values for each in tokens)
     words = ("no value", "one value")[most] if most < 2 else f"{most} values"
     return f"{flag}: found {' '.join(values)!r}, expected {words}"
 
