@@ -142,6 +142,21 @@ def test_bash_completes_commands_flags_and_choices(bash):
     assert {"megaloc", "megaloc-v1"} == bash("models", "mega")
 
 
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+def test_bash_completes_weights_by_models_and_files(bash, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "megabytes").mkdir()
+    (tmp_path / "megabytes" / "best.safetensors").touch()
+    expected = {"megaloc", "megaloc-v1", "megabytes"}
+    for command, flag in (
+        *((name, "--weights") for name in ("evaluate", "extract", "index", "query", "compare")),
+        *(("train", "--weights"), ("train", "--backbone"), ("evaluate", "--rerank-weights")),
+    ):
+        assert bash(command, flag, "mega") == expected, (command, flag)
+    assert bash("index", "--weights", "start") == {"starter"}
+    assert bash("index", "--weights", "megabytes/b") == {"megabytes/best.safetensors"}
+
+
 @pytest.mark.parametrize(("shell", "first"), [("zsh", "#compdef crisalad"), ("fish", "")])
 def test_other_shells_have_a_script_of_every_command(capfd, shell, first):
     assert main(["completion", shell]) == 0
