@@ -11,6 +11,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import pytest
 import crisalad_jax.cli
 from crisalad_jax.cli import help as helping
 from crisalad_jax.cli import main
+from crisalad_jax.cli.common import console
 from crisalad_jax.cli.completion import completion_script
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
@@ -166,7 +168,61 @@ def test_other_shells_have_a_script_of_every_command(capfd, shell, first):
     assert "help-all" in out
 
 
+# Tables
+
+
+@pytest.mark.parametrize("width", [80, 60])
+def test_no_number_and_no_path_breaks_on_a_narrow_terminal(
+    capfd, tmp_path, shared, monkeypatch, width
+):
+    """What a table has on a wide terminal, it has on a narrow one, in as many whole words."""
+    monkeypatch.chdir(tmp_path)
+    set_ = pathlib.Path("data", *["a_folder_with_a_long_name"] * 4, "town")
+    shutil.copytree(shared / "town", set_)
+    weights = set_.parent / "weights.safetensors"
+    shutil.copy(shared / "weights.safetensors", weights)
+    own = ("--weights", weights, "--quiet", "--batch-size", BATCH)
+    database, queries = (set_ / "images" / "test" / side for side in ("database", "queries"))
+    succeeds(capfd, "index", *own, "--images", database, "--out", set_.parent / "map")
+
+    def printed(*arguments: object) -> str:
+        assert main([str(each) for each in arguments]) == 0
+        return capfd.readouterr().out
+
+    verbs = (
+        ("query", queries, "--map", set_.parent / "map", "--quiet"),
+        ("evaluate", "--data", set_, *own, "--seeds", 2, "--precision", 0.6),
+        ("info", "--weights", weights),
+        ("info", "--map", set_.parent / "map"),
+        ("compare", "--test", set_, "--weights", f"own={weights}", "--out", "out", "--quiet"),
+    )
+    for verb in verbs:
+        wide = printed(*verb)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(console, "_width", width)
+            narrow = printed(*verb)
+        left = Counter(narrow.split())
+        for word, count in Counter(wide.split()).items():
+            if any(letter.isalnum() for letter in word):
+                assert left[word] >= count, (verb[0], word)
+        frames = [line for line in narrow.splitlines() if line.startswith(tuple("┏┃┡│├└"))]
+        assert all(len(line) <= width for line in frames), verb[0]
+
+
 # JSON
+
+
+@pytest.mark.parametrize("name", ["x.csv", "x.kml", "x.jsonl", "x.JSN"])
+def test_json_is_never_written_under_the_name_of_another_format(capfd, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    for command in COMMANDS:
+        if command in ("completion", "serve") or (command, name) == ("query", "x.jsonl"):
+            continue
+        _, verb, *given = shlex.split(module_of(command).EXAMPLE.partition(" >")[0])
+        given = [each for each in given if each not in ("--json", "-")]
+        words = (f"--json: found {name}, expected a name that ends in .json",)
+        fails(capfd, verb, *given, "--json", name, words=words)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -306,7 +362,7 @@ def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, shared, spoilt):
     assert main([*map(str, given), "--on-bad-image", "skip"]) == 0
     out, err = capfd.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
-    assert [line["query"] for line in lines] == [p.as_posix() for p in asked if p != asked[1]]
+    assert [line["query"] for line in lines] == [p.name for p in asked if p != asked[1]]
     assert f"1 unreadable left out, {asked[1]} the first" in " ".join(err.split())
     fails(capfd, *given, words=("found an image cut short",))
     fails(

@@ -55,6 +55,16 @@ class Answers(NamedTuple):
     best: Float32[np.ndarray, " query"] | None = None
     """Similarity of the most similar image of the map, where a filter may have chosen another; None
     without a filter, where it is the first answer's."""
+    root: pathlib.Path | None = None
+    """Folder that names of queries are relative to: of their source or, of several, the one that
+    holds all; None where names are whole paths."""
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each query, a posix path below `root`."""
+        root = self.root
+        named = self.queries if root is None else [path.relative_to(root) for path in self.queries]
+        return [path.as_posix() for path in named]
 
     @property
     def known(self) -> Bool[np.ndarray, " query"]:
@@ -143,7 +153,7 @@ def query(
     check_grouping((), batch_size, seed=0)
     check_count("k", k)
     min_similarity = asked_similarity(places, min_similarity)
-    sources = _listed(images, fps)
+    root, sources = _listed(images, fps)
     paths = [path for source in sources for path in source]
     check_rate_used(fps, paths)
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -177,9 +187,8 @@ def query(
     neighbours = Neighbours(indices, similarities)
     lost = set(unreadable)
     readable = [path for path in paths if path not in lost]
-    return Answers(
-        readable, neighbours, places.images, places.axes, unreadable, min_similarity, *filtered
-    )
+    given = (places.images, places.axes, unreadable, min_similarity)
+    return Answers(readable, neighbours, *given, *filtered, root=root)
 
 
 def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
@@ -238,11 +247,18 @@ def _described(
     )
 
 
-def _listed(images: Any, fps: float | None) -> list[list[pathlib.Path]]:
+def _listed(images: Any, fps: float | None) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
+    """List the images of each source, below a folder that holds all."""
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
-    return [open_source(each, fps=fps).paths for each in given]
+    sources = [open_source(each, fps=fps) for each in given]
+    roots = {source.root for source in sources}
+    if len(roots) == 1:
+        return roots.pop(), [source.paths for source in sources]
+    # Written out, as relative and absolute ones have no folder in common.
+    paths = [[pathlib.Path(os.path.abspath(path)) for path in source.paths] for source in sources]
+    return pathlib.Path(os.path.commonpath([os.path.abspath(root) for root in roots])), paths
 
 
 def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, float] | None:
@@ -267,6 +283,7 @@ def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
+    Names of queries are relative to their source, as those of a map's images are.
     Frames of videos have a `time` in seconds, too. Where answers must have a similarity, the line
     says whether the query is of a `known` place; the answers of an unknown one are listed all the
     same. Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
@@ -276,11 +293,13 @@ def json_lines(answers: Answers) -> Iterator[str]:
 
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     """Yield what `json_lines` writes of each query."""
-    for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
+    for name, known, (path, ranked) in zip(
+        answers.names, answers.known, answers.rows(), strict=True
+    ):
         neighbours = [
             answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in ranked
         ]
-        row = {"query": path.as_posix(), **_time(path), "neighbours": neighbours}
+        row = {"query": name, **_time(path), "neighbours": neighbours}
         yield row if answers.min_similarity is None else row | {"known": bool(known)}
 
 
@@ -296,7 +315,7 @@ def json_text(row: dict[str, Any]) -> str:
 
 
 def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
-    """Write answers as JSON, a line for each query.
+    """Write answers as JSON: a line for each query or, in a file .json, a list of them.
 
     Args:
         path: the file.
@@ -309,4 +328,8 @@ def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
         atomic_path(path) as temporary,
         temporary.open("w", encoding="utf-8") as file,
     ):
-        file.writelines(f"{line}\n" for line in json_lines(answers))
+        if pathlib.Path(path).suffix.lower() == ".json":
+            rows = ",\n".join(json_lines(answers))
+            file.write(f"[\n{rows}\n]\n")
+        else:
+            file.writelines(f"{line}\n" for line in json_lines(answers))
