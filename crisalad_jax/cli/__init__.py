@@ -10,6 +10,7 @@ import importlib
 import itertools
 import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ from typing import Any
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.plugins import has_plugins, load_entry_points, load_plugin, plugin_failure
-from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.errors import InputError, Stopped, how_ended
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.notes import Note
 from crisalad_jax.utils.output import one_line, printable
@@ -208,8 +209,8 @@ def _exit_code(given: list[str], keep_programs: bool) -> int:
         print(f"crisalad: {stopped}", file=sys.stderr)
         return 128 + stopped.number
     except KeyboardInterrupt:
-        print("crisalad: interrupted", file=sys.stderr)
-        return 130
+        print(f"crisalad: {how_ended(signal.SIGINT)}", file=sys.stderr)
+        return 128 + signal.SIGINT
     except Exception as error:
         if (code := _tell_of_plugin(error)) is not None:
             return code

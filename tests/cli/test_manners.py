@@ -65,6 +65,32 @@ def test_platforms_that_jax_lacks_are_one_line(tmp_path, shared, platforms):
     assert files_in(tmp_path) == set()
 
 
+# The cache
+
+
+def test_all_that_is_cached_is_in_one_folder(tmp_path, shared):
+    """A process of its own, as of a user: the tests' set-up keeps no programs."""
+    environment = {k: v for k, v in os.environ.items() if k not in OWN_CACHES}
+    home, cache = tmp_path / "home", tmp_path / "cache"
+    environment |= {"HOME": str(home), "CRISALAD_CACHE": str(cache), "PYTHONPATH": str(ROOT)}
+    images = shared / "town" / "images" / "test"
+    given = ("--images", images, "--weights", shared / "weights.safetensors", "--out", "d.npy")
+    resizes = "from crisalad_jax.data import resize; resize._compiled()"  # as for many images
+    for program in (["-m", "crisalad_jax", "extract", *map(str, given)], ["-c", resizes]):
+        command = [sys.executable, *program]
+        subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert {path.name for path in cache.iterdir()} == {"numba", "programs", "xla"}
+    assert {path.relative_to(cache).parts[0] for path in files(cache)} >= {"numba", "programs"}
+    assert files(home) == []
+
+
+OWN_CACHES = ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR", "NUMBA_CACHE_DIR")
+
+
+def files(folder):
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
 # Help
 
 
