@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, write_json
+from crisalad_jax.utils.files import check_format, check_target, write_json
 from crisalad_jax.utils.output import printable
 
 if TYPE_CHECKING:  # commands that load no model of a file start without these
@@ -105,10 +105,7 @@ def check_json(path: pathlib.Path | None, suffixes: Sequence[str] = (".json",)) 
     """
     if path is None or path == STDOUT:
         return
-    if path.suffix and path.suffix.lower() not in suffixes:
-        raise InputError(
-            f"--json: found {path}, expected a name that ends in {' or '.join(suffixes)}"
-        )
+    check_format("--json", path, *suffixes)
     check_target(path)
 
 

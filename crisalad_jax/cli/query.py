@@ -15,7 +15,7 @@ from crisalad_jax.retrieval.maps.calibration import Calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_target, real_path
+from crisalad_jax.utils.files import atomic_path, check_format, check_target, real_path
 from crisalad_jax.utils.output import counted
 
 _ROWS = 24
@@ -185,6 +185,7 @@ def _check_files(file: pathlib.Path | None, arguments: Query) -> None:
     check_json(file, (".json", ".jsonl"))
     if gallery is not None:
         importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
+        check_format("--gallery", gallery, ".png")
         check_target(gallery)
     elif arguments.map_images is not None:
         raise InputError("--map-images: found without --gallery, expected both")

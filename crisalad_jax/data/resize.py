@@ -240,7 +240,7 @@ def _machine_code(
     result = (getattr(types, new)[:, ::1], *(getattr(types, each) for each in more))
     options = {"nogil": True, "fastmath": {"contract"}}
     signature = types.void(pixels, *taps, *taps, *result)
-    config: Any = numba.config
+    config: Any = numba.config  # pyright: ignore
     told = config.CACHE_DIR
     try:
         config.CACHE_DIR = told or str(user_cache() / "numba")

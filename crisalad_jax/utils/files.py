@@ -243,6 +243,23 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         )
 
 
+def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> None:
+    """Check that a file's name says no other format than the file will have.
+
+    Args:
+        what: the flag, for the message.
+        path: the file; a name without a suffix says nothing.
+        suffixes: what it may end with, as in ".json".
+
+    Raises:
+        InputError: it ends with another suffix.
+    """
+    suffix = pathlib.Path(path).suffix.lower()
+    if suffix and suffix not in suffixes:
+        ends = " or ".join(suffixes)
+        raise InputError(f"{what}: found {path}, expected a name that ends in {ends}")
+
+
 @contextlib.contextmanager
 def told_of(path: pathlib.Path) -> Iterator[None]:
     """Turn an error of the disk in this block into one line that names the file.

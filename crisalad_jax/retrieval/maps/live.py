@@ -132,6 +132,7 @@ def query_live(
                 (),
                 least,
                 *filtered,
+                root=None,
             )
             latency = time.perf_counter() - frame.taken
             yield LiveAnswer(found, frame.time, 1000 * latency)
