@@ -1,6 +1,6 @@
 """The cache of published models: each is downloaded once, checked, and kept as a weight file.
 
-A model has a folder in `cache_folder() / "models"`, with the published file, the file of weights
+A model has a folder in `user_cache() / "models"`, with the published file, the file of weights
 that was made of it, and a record of the published file's size and SHA-256 after its first download.
 """
 
@@ -21,7 +21,7 @@ from crisalad_jax.checkpoints.weights import CACHE_RECORD, save_weights
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import cache_folder, read_json, write_json
+from crisalad_jax.utils.files import read_json, user_cache, write_json
 from crisalad_jax.utils.locks import next_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.version import VERSION
@@ -77,7 +77,7 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
 
 
 def _folder(model: Published) -> pathlib.Path:
-    return cache_folder() / "models" / model.name
+    return user_cache() / "models" / model.name
 
 
 def _weights(model: Published) -> pathlib.Path:
@@ -135,7 +135,7 @@ def _check_obtainable(model: Published) -> None:
     """Check that a file may be downloaded, before a folder is made for it."""
     if is_offline():
         raise InputError(
-            f"{model.name}: found none in the cache {cache_folder()}, expected it there: {OFFLINE} "
+            f"{model.name}: found none in the cache {user_cache()}, expected it there: {OFFLINE} "
             "forbids the network"
         )
     if not _addresses(model):

@@ -23,7 +23,7 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import cache_folder, read_json
+from crisalad_jax.utils.files import read_json, user_cache
 from crisalad_jax.utils.locks import next_writer
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.version import VERSION
@@ -312,7 +312,7 @@ def _exported(
 
 def _cached(digest: str, settings: Mapping[str, Any]) -> pathlib.Path:
     key = json.dumps({"model": digest, **settings}, sort_keys=True)
-    return cache_folder() / "exports" / hashlib.sha256(key.encode()).hexdigest()[:32]
+    return user_cache() / "exports" / hashlib.sha256(key.encode()).hexdigest()[:32]
 
 
 def read_header(weights: str | os.PathLike[str]) -> dict[str, Any] | None:

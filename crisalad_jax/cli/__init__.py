@@ -4,20 +4,21 @@ Exit codes: 0 done, 2 bad arguments or input (one line on stderr), 130 interrupt
 SIGTERM, 129 by SIGHUP, 1 anything else.
 """
 
-import contextlib
 import dataclasses
+import difflib
 import importlib
-import io
 import itertools
 import os
+import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from crisalad_jax.config.checks import choose, require
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.plugins import has_plugins, load_entry_points, load_plugin, plugin_failure
-from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.errors import InputError, Stopped, how_ended
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.notes import Note
 from crisalad_jax.utils.output import one_line, printable
@@ -53,35 +54,29 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
 
     from crisalad_jax.cli import help as helping
     from crisalad_jax.cli.quick_types import quicken
-    from crisalad_jax.config.flags import unboxed
+    from crisalad_jax.config.flags import refusals
 
     program = f"crisalad {name}"
-    complaint = io.StringIO()
+    asked = helping.asked_for(given)
     try:
-        if helping.asked_for(given) == helping.SHORT:
+        if asked == helping.SHORT:
             kind = helping.class_of(name, module, given)
             print(helping.short_help(name, module, kind))
             raise SystemExit(0)
         given = [helping.SHORT if each == helping.ALL else each for each in given]
-        with contextlib.redirect_stderr(complaint):
+        with refusals(given, wide=asked is None):
             if hasattr(module, "parse"):
                 return module.parse(program, given)
             kind = quicken(helping.class_of(name, module, given))
             return tyro.cli(kind, prog=program, args=given)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        error: BaseException | None = stop
-        while error is not None and not isinstance(error, InputError):
-            error = error.__context__
-        reason = unboxed(complaint.getvalue()) if error is None else str(error)
-        raise InputError(f"{reason} (see {program} --help)") from stop
     except InputError as error:
-        raise InputError(f"{error} (see {program} --help)") from error
+        several = getattr(module, "SEVERAL", "")
+        hint = f" ({several})" if re.match("--images: .* expected one value$", str(error)) else ""
+        raise InputError(f"{error}{hint} (see {program} --help)") from error
 
 
 def _usage() -> str:
-    usage = "usage: crisalad COMMAND [--help | --help-all] ... | --version"
+    usage = "usage: crisalad COMMAND [--help | --help-all] ... | help [COMMAND] | --version"
     lines = [usage, "", "commands:"]
     lines += [f"  {name:<15}{summary}" for name, summary in _COMMANDS.items()]
     return "\n".join(lines)
@@ -183,6 +178,8 @@ def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False)
     A process of its own may `keep_programs` (`utils.kept`): nothing else changes the code there.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if given[:1] == ["help"]:  # as of git
+        given = [*given[1:], "--help"]
     if not given or given[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if given else sys.stderr)
         return 0 if given else 2
@@ -197,7 +194,7 @@ def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False)
 
 def _exit_code(given: list[str], keep_programs: bool) -> int:
     try:
-        choose("command", given[0], _COMMANDS)
+        _check_command(given[0])
         _run(given[0], given[1:], keep_programs)
     except ModuleNotFoundError as error:
         print(f"crisalad: {missing_extra(error, f'crisalad {given[0]}')}", file=sys.stderr)
@@ -214,17 +211,24 @@ def _exit_code(given: list[str], keep_programs: bool) -> int:
         print(f"crisalad: {stopped}", file=sys.stderr)
         return 128 + stopped.number
     except KeyboardInterrupt:
-        print("crisalad: interrupted", file=sys.stderr)
-        return 130
+        print(f"crisalad: {how_ended(signal.SIGINT)}", file=sys.stderr)
+        return 128 + signal.SIGINT
     except Exception as error:
-        code = _tell_of_plugin(error)
-        if code is None and _is_out_of_memory(error):
-            print(f"crisalad: {_OUT_OF_MEMORY}", file=sys.stderr)
-            return 2
-        if code is None:
+        if (code := _tell_of_plugin(error)) is not None:
+            return code
+        reason = _OUT_OF_MEMORY if _is_out_of_memory(error) else _absent_platforms(error)
+        if reason is None:
             raise
-        return code
+        print(f"crisalad: {reason}", file=sys.stderr)
+        return 2
     return 0
+
+
+def _check_command(name: str) -> None:
+    """Raise InputError where there is no such command, with those of a like name, or else all."""
+    near = difflib.get_close_matches(name, _COMMANDS)
+    words = f"did you mean {' or '.join(near)}?" if near else f"expected {', '.join(_COMMANDS)}"
+    require(name in _COMMANDS, f"found no command {name!r}; {words} (see crisalad --help)")
 
 
 _OUT_OF_MEMORY = (
@@ -243,6 +247,15 @@ _WORDS_OF_MEMORY = (
     "error return without exception set",
 )
 """What XLA, OpenCV, C++, the system, its linker, Python's threads, numpy and code in C say."""
+
+
+def _absent_platforms(error: Exception) -> str | None:
+    """Describe what `JAX_PLATFORMS` names and is not there; None where that is not the fault."""
+    if "jax" not in sys.modules:
+        return None
+    from crisalad_jax.utils.target import absent_platforms
+
+    return absent_platforms(error)
 
 
 def _tell_of_plugin(error: BaseException) -> int | None:

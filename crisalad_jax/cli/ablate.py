@@ -4,6 +4,7 @@ import dataclasses
 
 import tyro
 
+from crisalad_jax.cli.common import prepare_json
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
 COMMON = (
@@ -50,6 +51,7 @@ def run(arguments: Ablate) -> None:
     """Train the rows of the ablation, and print the tables."""
     from crisalad_jax.experiments.comparison import ABLATIONS, ComparisonConfig
 
+    prepare_json(arguments.json)  # before a download
     if arguments.rows is not None:
         names = names_of(arguments.rows)
     else:

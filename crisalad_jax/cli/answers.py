@@ -1,38 +1,46 @@
-"""The table that `crisalad query` prints."""
+"""The lines that `crisalad query` prints."""
 
-from rich.table import Table
-from rich.text import Text
+from collections.abc import Iterator
 
 from crisalad_jax.retrieval.maps.query import Answers
-from crisalad_jax.utils.output import printable
+
+_GAP = "  "
 
 
-def answers_table(answers: Answers, title: str = "") -> Table:
-    """Make a table of answers for the terminal; a query of an unknown place has one row."""
+def answer_lines(answers: Answers) -> Iterator[str]:
+    """Yield the name of each query, and below it its answers; an unknown place has one line.
+
+    Numbers stand in columns, and names at the ends of lines: a name that a terminal has no room for
+    runs on in its next line, and is copied whole.
+    """
     followed = answers.probabilities is not None
-    table = Table(title=printable(title), title_justify="left")
-    table.add_column("query", overflow="fold")
-    table.add_column("rank", justify="right")
-    table.add_column("name", overflow="fold")
-    table.add_column("similarity", justify="right", no_wrap=True)
-    if followed:
-        table.add_column("probability", justify="right", no_wrap=True)
+    probability = ["probability"] if followed else []
     position = ", ".join(answers.axes or ("position",))
     if answers.zone is not None:
         position += f" (zone {answers.zone})"
-    table.add_column(position, justify="right", overflow="fold")
-    for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
-        shown = ranked if known else ranked[:1]
-        for answer in shown:
-            position = answers.position(answer.image) if known else None
-            cells = (
-                path.as_posix() if answer.rank == 1 else "",
-                str(answer.rank) if known else "-",
-                answer.image.name if known else "unknown",
-                f"{answer.similarity:.3f}",
-                *([f"{answer.probability:.3f}"] if followed else []),
-                "-" if position is None else ", ".join(f"{v:.9g}" for v in position.values()),
+    head = ["rank", "similarity", *probability, position, "name"]
+    asked: list[str | None] = []
+    rows = [head]
+    for name, known, (_, ranked) in zip(answers.names, answers.known, answers.rows(), strict=True):
+        for answer in ranked if known else ranked[:1]:
+            at = answers.position(answer.image) if known else None
+            asked.append(name if answer.rank == 1 else None)
+            rows.append(
+                [
+                    str(answer.rank) if known else "-",
+                    f"{answer.similarity:.3f}",
+                    *([f"{answer.probability:.3f}"] if followed else []),
+                    "-" if at is None else ", ".join(f"{value:.9g}" for value in at.values()),
+                    answer.image.name if known else "unknown",
+                ]
             )
-            # `Text` keeps square brackets in a name from being markup.
-            table.add_row(*map(Text, map(printable, cells)), end_section=answer.rank == len(shown))
-    return table
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
+    lines = (
+        _GAP.join((*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[-1]))
+        for row in rows
+    )
+    yield next(lines)
+    for query, line in zip(asked, lines, strict=True):
+        if query is not None:
+            yield query
+        yield line

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
-from crisalad_jax.cli.common import console, find_given, give_json, open_set, prepare_json, say
+from crisalad_jax.cli.common import find_given, give_json, open_set, prepare_json, say, show
 from crisalad_jax.cli.tables import points_table
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
@@ -85,7 +85,7 @@ def run(arguments: Calibrate) -> None:
             quiet=arguments.quiet,
         )
     point = operating_point_of(calibration)
-    console.print(points_table({"single": point}))
+    show(points_table({"single": point}))
     for words in caveats(point):
         say(words)
     say(

@@ -4,16 +4,17 @@ import dataclasses
 import json
 import pathlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import rich.console
+import rich.table
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, write_json
+from crisalad_jax.utils.files import check_format, check_target, write_json
 from crisalad_jax.utils.output import printable
 
 if TYPE_CHECKING:  # commands that load no model of a file start without these
@@ -25,15 +26,54 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
 RuntimeName = Literal["jax", "onnxruntime", "openvino"]
 """What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
 
-# Into a file or a pipe, wide enough that tables do not wrap. Brackets and colons in names are text.
+_WIDE = 10_000
+"""Columns that no table fills."""
+# A file or a pipe has room for all columns. Brackets and colons in names are text.
 console = rich.console.Console(
-    width=None if sys.stdout.isatty() else 120, markup=False, emoji=False
+    width=None if sys.stdout.isatty() else _WIDE, markup=False, emoji=False
 )
 
 
 def say(line: str) -> None:
     """Print a line without wrapping it to the terminal's width."""
     console.print(printable(line), soft_wrap=True, highlight=False)
+
+
+def show(table: rich.table.Table) -> None:
+    """Print a table so that nothing in it breaks; a wide one in parts, each with the first column.
+
+    A terminal has no room for a column that is wider than itself, and breaks its lines.
+    """
+    if table.title:
+        say(str(table.title))
+        table.title = None
+    for part in _parts(table):
+        console.print(part, crop=False)
+
+
+def _parts(table: rich.table.Table) -> Iterator[rich.table.Table]:
+    first, *rest = table.columns
+    while True:
+        count = len(rest)
+        while (part := _part(table, [first, *rest[:count]]))[1] > console.width and count > 1:
+            count -= 1
+        yield part[0]
+        rest = rest[count:]
+        if not rest:
+            return
+
+
+def _part(
+    table: rich.table.Table, columns: Sequence[rich.table.Column]
+) -> tuple[rich.table.Table, int]:
+    """Make a table of some columns that breaks no line, and return its width too."""
+    part = rich.table.Table(show_lines=table.show_lines)
+    for column in columns:
+        part.add_column(column.header, justify=column.justify, no_wrap=True)
+    for row, cells in zip(table.rows, zip(*(c.cells for c in columns), strict=True), strict=True):
+        part.add_row(*cells, end_section=row.end_section)
+    part.width = console.measure(part, options=console.options.update(max_width=_WIDE)).maximum
+    return part, part.width
 
 
 STDOUT = pathlib.Path("-")
@@ -57,14 +97,16 @@ def write_or_print_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
         write_json(path, value)
 
 
-def check_json(path: pathlib.Path | None) -> None:
+def check_json(path: pathlib.Path | None, suffixes: Sequence[str] = (".json",)) -> None:
     """Check that `write_or_print_json` can write the file, before any work.
 
     Raises:
-        InputError: it cannot.
+        InputError: it cannot, or the name says another format than those of `suffixes`.
     """
-    if path is not None and path != STDOUT:
-        check_target(path)
+    if path is None or path == STDOUT:
+        return
+    check_format("--json", path, *suffixes)
+    check_target(path)
 
 
 def prepare_json(file: pathlib.Path | None) -> None:

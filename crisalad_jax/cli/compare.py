@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from crisalad_jax.cli.common import prepare_json
 from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
 
 COMMON = (
@@ -50,6 +51,7 @@ def run(arguments: Compare) -> None:
     """Compare the methods, and print the tables."""
     from crisalad_jax.experiments.comparison import ComparisonConfig, names_to_compare
 
+    prepare_json(arguments.json)  # before a download
     methods = None if arguments.methods is None else names_of(arguments.methods)
     config = ComparisonConfig(
         "compare",

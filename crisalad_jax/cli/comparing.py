@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import rich.console
 
-from crisalad_jax.cli.common import console, find_given, give_json, prepare_json, say
+from crisalad_jax.cli.common import find_given, give_json, say, show
 
 if TYPE_CHECKING:
     from crisalad_jax.experiments.comparison import ComparisonConfig
@@ -94,7 +94,6 @@ def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
     from crisalad_jax.experiments.comparison import compare
     from crisalad_jax.experiments.comparison.tables import as_json, terminal_tables
 
-    prepare_json(flags.json)
     notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=flags.quiet)
     summary = compare(
         config,
@@ -106,7 +105,7 @@ def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
         quiet=flags.quiet,
     )
     for table in terminal_tables(summary):
-        console.print(table)
+        show(table)
     for note in summary.notes:
         say(note)
     say(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from crisalad_jax.cli.common import check_json, console, talk_beside, write_or_print_json
+from crisalad_jax.cli.common import check_json, show, talk_beside, write_or_print_json
 from crisalad_jax.cli.train import defaults
 from crisalad_jax.config.flags import parse_settings, with_settings
 from crisalad_jax.utils.errors import InputError
@@ -96,7 +96,7 @@ def run(arguments: CompileCheck) -> None:
         quiet=arguments.quiet,
     )
     for table in check_tables(check) if check.programs else ():
-        console.print(table)
+        show(table)
     if arguments.json is not None:
         write_or_print_json(arguments.json, check.as_json())
     lines = check.failures if expected is None else differences(check, expected)

@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from crisalad_jax.checkpoints import starter
+from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.cli import help as helping
 from crisalad_jax.config.plugins import load_entry_points
 
@@ -60,14 +62,29 @@ def _parser(name: str) -> argparse.ArgumentParser:
     parser = helping.flags_parser(helping.class_of(name, module, ()), f"crisalad {name}")
     for action in parser._actions:
         action.choices = _choices(name, action)
+        if action.dest in ("weights", "rerank-weights", "backbone"):
+            action.complete = _models_and_files()  # pyright: ignore
         action.help = " ".join((action.help or "").partition(". ")[0].split())
     return parser
 
 
+def _models_and_files() -> dict[str, Any]:
+    """Return how each shell completes weights: by the names of models, and by files."""
+    names = " ".join((starter.NAME, *PUBLISHED))
+    function = "_crisalad_models_and_files"  # of shtab's own names, bash takes _file as of files
+    return {
+        "bash": function,
+        "zsh": function,
+        "fish": f"{names} (__fish_complete_path (commandline -ct))",
+        "preamble": {
+            "bash": f'{function}() {{ compgen -W "{names}" -- "$1"; compgen -f -- "$1"; }}',
+            "zsh": f"{function}() {{ _alternative 'models:model:({names})' 'files:file:_files'; }}",
+        },
+    }
+
+
 def _choices(command: str, action: argparse.Action) -> Any:
     """Return the values that a flag takes, or None where they are not a few names."""
-    from crisalad_jax.checkpoints import starter
-    from crisalad_jax.checkpoints.published import PUBLISHED
     from crisalad_jax.nn.config import PRESETS
     from crisalad_jax.training.recipes import RECIPES
 

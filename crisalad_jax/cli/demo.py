@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 
-from crisalad_jax.cli.common import console, give_json, prepare_json, say
+from crisalad_jax.cli.common import give_json, prepare_json, say, show
 from crisalad_jax.retrieval.grouping import grouping_words
 
 EXAMPLE = "crisalad demo --out demo"
@@ -30,7 +30,7 @@ def run(arguments: Demo) -> None:
 
     prepare_json(arguments.json)
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
-    console.print(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
+    show(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
     say(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
     say(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "

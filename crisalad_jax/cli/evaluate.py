@@ -12,11 +12,11 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     RuntimeName,
     check_json,
-    console,
     load_model,
     open_model,
     open_set,
     say,
+    show,
     talk_beside,
     write_or_print_json,
 )
@@ -206,9 +206,9 @@ def run(arguments: Evaluate) -> None:
         rerank=arguments.rerank,
         rerank_weights=arguments.rerank_weights,
     )
-    console.print(grouping_table(results))
+    show(grouping_table(results))
     if points := {each.label: each.operating_point for each in results if each.operating_point}:
-        console.print(points_table(points))
+        show(points_table(points))
     for note in table_notes(results, settings):
         say(note)
     readable = results[0].skipped.rest_of(benchmark)

@@ -30,6 +30,8 @@ COMMON = (
     "quiet",
 )
 EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
+SEVERAL = "quote a pattern, or list the images in a .txt"
+"""What to do in place of several values of --images."""
 
 
 @dataclasses.dataclass(frozen=True)

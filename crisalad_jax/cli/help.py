@@ -12,6 +12,8 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+from crisalad_jax.config.flags import plain_metavar
+
 SHORT, ALL = "--help", "--help-all"
 _WIDTH = 100
 _COLUMN = 28
@@ -102,10 +104,7 @@ def _value(action: argparse.Action) -> str:
     """Return what stands for a flag's value, without what means no value."""
     if _has_many_choices(action):
         return "NAME"
-    text = action.metavar if isinstance(action.metavar, str) else ""
-    text = text.replace("{None}|", "").replace("{None,", "{")
-    text = re.sub(r"\[(\w+) \[\1 \.\.\.\]\]|(\w+) \[\2 \.\.\.\]", r"\1\2...", text)
-    return re.sub(r"^\{(\w+ \w+)\}$", r"\1", text)
+    return plain_metavar(action.metavar if isinstance(action.metavar, str) else "")
 
 
 def _has_many_choices(action: argparse.Action) -> bool:

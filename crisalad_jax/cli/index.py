@@ -38,6 +38,8 @@ COMMON = (
     "quiet",
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
+SEVERAL = "quote a pattern; other folders are added by the same command again"
+"""What to do in place of several values of --images."""
 
 
 @dataclasses.dataclass(frozen=True)

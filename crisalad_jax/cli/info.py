@@ -10,8 +10,8 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     check_json,
     check_one_model,
-    console,
     say,
+    show,
     talk_beside,
     write_or_print_json,
 )
@@ -80,7 +80,7 @@ def _model(arguments: Info) -> dict[str, Any]:
         trainable = arguments.trainable or defaults.trainable
     config = config.resized(arguments.image_size, arguments.resize)
     summary = model_summary(config, trainable, images=arguments.batch_size)
-    console.print(summary_table(summary, name))
+    show(summary_table(summary, name))
     say("\n".join(summary_lines(summary)))
     return summary_json(summary, name)
 

@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_m
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
 from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
-from crisalad_jax.utils.files import cache_folder
+from crisalad_jax.utils.files import user_cache
 
 EXAMPLE = "crisalad models salad"
 
@@ -41,14 +41,14 @@ def run(arguments: Models) -> None:
         hidden = MODEL_COLUMNS[len(table.columns) :]
         if hidden:
             say(f"left out in {width} columns: {', '.join(hidden)} (crisalad models | less -S)")
-        say(f"{len(models)} models; * in the cache, {cache_folder()}")
+        say(f"{len(models)} models; * in the cache, {user_cache()}")
         say(
             f"{starter.NAME}: the small model in this package, which extract, index and evaluate "
             "take by default"
         )
         say("hog: histograms of oriented gradients, a baseline without parameters, by its name too")
         say("crisalad models NAME tells all of one: its images, paper, file and address")
-        values = {"cache": str(cache_folder()), "models": [_facts(model) for model in models]}
+        values = {"cache": str(user_cache()), "models": [_facts(model) for model in models]}
     else:
         name = arguments.name
         own = name in starter.FILES

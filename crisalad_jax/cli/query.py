@@ -9,13 +9,13 @@ from typing import Annotated, Literal
 import tyro
 
 from crisalad_jax.cli import live
-from crisalad_jax.cli.answers import answers_table
-from crisalad_jax.cli.common import STDOUT, RuntimeName, console, say, talk_beside
+from crisalad_jax.cli.answers import answer_lines
+from crisalad_jax.cli.common import STDOUT, RuntimeName, check_json, say, talk_beside
 from crisalad_jax.retrieval.maps.calibration import Calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_target, real_path
+from crisalad_jax.utils.files import atomic_path, check_format, check_target, real_path
 from crisalad_jax.utils.output import counted
 
 _ROWS = 24
@@ -83,7 +83,8 @@ class Query:
     exact: bool = False
     """Search exactly, although the map has an approximate search."""
     json: pathlib.Path | None = None
-    """File for the answers, a line of JSON for each query; - prints them."""
+    """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints
+    lines."""
     gallery: pathlib.Path | None = None
     """PNG of up to 24 queries beside up to 8 answers each."""
     map_images: pathlib.Path | None = None
@@ -141,8 +142,8 @@ def run(arguments: Query) -> None:
     asked = f"{len(answers.queries)} {'query' if len(answers.queries) == 1 else 'queries'}"
     of = f"in a map of {counted(len(answers.images), 'image')}{unknown}"
     if arguments.json is None:
-        title = f"{arguments.map}, {counted(len(answers.images), 'image')}{unknown}"
-        console.print(answers_table(answers, title))
+        say(f"{arguments.map}, {counted(len(answers.images), 'image')}{unknown}")
+        say("\n".join(answer_lines(answers)))
     elif file is None:
         for line in json_lines(answers):
             print(line)
@@ -182,10 +183,10 @@ def _unknown(answers: Answers, measured: Calibration | None) -> str:
 def _check_files(file: pathlib.Path | None, arguments: Query) -> None:
     """Check before any work that the files can be written."""
     gallery = arguments.gallery
-    if file is not None:
-        check_target(file)
+    check_json(file, (".json", ".jsonl"))
     if gallery is not None:
         importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
+        check_format("--gallery", gallery, ".png")
         check_target(gallery)
     elif arguments.map_images is not None:
         raise InputError("--map-images: found without --gallery, expected both")

@@ -2,22 +2,19 @@
 
 import dataclasses
 import pathlib
-from typing import Annotated
-
-import tyro
 
 from crisalad_jax.cli.common import find_given, say
 from crisalad_jax.serve import serve_map
 from crisalad_jax.serve.access import read_token
 
-EXAMPLE = "crisalad serve corridor.map --port 8000"
+EXAMPLE = "crisalad serve --map corridor.map --port 8000"
 
 
 @dataclasses.dataclass(frozen=True)
 class Serve:
     """Answer over HTTP, and in a browser, where photographs were taken."""
 
-    map: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
+    map: pathlib.Path
     """Folder that `crisalad index` wrote."""
     weights: pathlib.Path | None = None
     """The model that made the map, as a file or a published name; by default where it was then."""

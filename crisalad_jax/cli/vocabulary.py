@@ -41,6 +41,8 @@ EXAMPLE = (
     "crisalad vocabulary --images photos --backbone dinov2-vitg14 --preset "
     "g14 --out anyloc.safetensors"
 )
+SEVERAL = "quote a pattern, or list the images in a .txt"
+"""What to do in place of several values of --images."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,10 +4,14 @@
 fields.
 """
 
+import ast
 import contextlib
 import dataclasses
 import io
-from collections.abc import Sequence
+import itertools
+import os
+import re
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
@@ -119,11 +123,10 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
     Raises:
         InputError: no such flag or part, or a value that does not fit; one line.
     """
-    complaint = io.StringIO()
     try:
         flags = choose_parts(flags_of(config), arguments, preset)
         kind, default = type_of(flags)
-        with contextlib.redirect_stderr(complaint):
+        with refusals(arguments):
             parsed = tyro.cli(
                 kind,
                 prog=what,
@@ -133,18 +136,52 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
                 config=(tyro.conf.FlagConversionOff,),
             )
         return config_of(flags, parsed)
-    except SystemExit as stop:
-        raise InputError(f"{what}: {unboxed(complaint.getvalue())}") from stop
     except InputError as error:
         raise InputError(f"{what}: {error}") from error
+
+
+_WIDE = "100000"
+"""Columns that no line of tyro's boxes fills: a narrower one breaks names inside."""
+
+
+@contextlib.contextmanager
+def refusals(arguments: Sequence[str], *, wide: bool = True) -> Iterator[None]:
+    """Raise what tyro says in a box on standard error, before it ends the program, as InputError.
+
+    Args:
+        arguments: the command line's, to find a value's flag.
+        wide: whether nothing but a box is printed in the block: a help fits the terminal.
+
+    Raises:
+        InputError: one line; or the one that a configuration's own check raised.
+    """
+    box, columns = io.StringIO(), os.environ.get("COLUMNS")
+    if wide:
+        os.environ["COLUMNS"] = _WIDE
+    try:
+        with contextlib.redirect_stderr(box):
+            yield
+    except SystemExit as stop:
+        if not stop.code:  # after a help
+            raise
+        error: BaseException | None = stop
+        while error is not None and not isinstance(error, InputError):
+            error = error.__context__
+        reason = _refusal(_unboxed(box.getvalue()), arguments) if error is None else str(error)
+        raise InputError(reason) from stop
+    finally:
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
+        elif wide:
+            del os.environ["COLUMNS"]
 
 
 # Beginnings of the parts of tyro's boxes that repeat the first one.
 _ASIDES = ("Argument help", "Got errors", "For full")
 
 
-def unboxed(box: str) -> str:
-    """Extract the text of tyro's boxes, without frames, help texts and footer."""
+def _unboxed(box: str) -> list[str]:
+    """Extract the texts of tyro's boxes, without frames, help texts and footer."""
     sections = [[]]
     # The title is dropped. Without UTF-8 on stdout, the frame is of spaces and hyphens.
     for line in box.splitlines()[1:]:
@@ -154,7 +191,95 @@ def unboxed(box: str) -> str:
         elif not row.startswith(" " * 5):
             sections[-1].append(row.strip())
     texts = [" ".join(rows) for rows in sections]
-    return "; ".join(t for t in texts if t and not t.startswith(_ASIDES))
+    return [text for text in texts if text and not text.startswith(_ASIDES)]
+
+
+def plain_metavar(text: str) -> str:
+    """Write what tyro puts in place of a flag's value as we do, without what means no value."""
+    text = text.replace("{None}|", "").replace("{None,", "{")
+    text = re.sub(r"\[(\w+) \[\1 \.\.\.\]\]|(\w+) \[\2 \.\.\.\]", r"\1\2...", text)
+    return re.sub(r"^\{(\w+ .*|\w+\.\.\.)\}$", r"\1", text)
+
+
+_KINDS = {"INT": "whole number", "FLOAT": "number"}
+
+
+def _expected(metavar: str) -> str:
+    """Describe values in words, as far as they are numbers or choices."""
+    parts = plain_metavar(metavar).split()
+    kind = _KINDS.get(parts[0].removesuffix("..."))
+    if kind is None:
+        names = re.fullmatch(r"\{(.*)\}", plain_metavar(metavar))
+        return plain_metavar(metavar) if names is None else f"one of {names[1].replace(',', ', ')}"
+    if parts[0].endswith("..."):
+        return f"{kind}s"
+    return f"a {kind}" if len(parts) == 1 else f"{len(parts)} {kind}s"
+
+
+def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
+    """Say in our words what tyro says; what we do not know stays as it is.
+
+    Args:
+        texts: the parts of its box.
+        arguments: the command line's.
+    """
+    said: list[str] = []
+    for text in texts:
+        if found := re.match(r"Error parsing (\S+): invalid literal for int\(\).*?: (.*)", text):
+            said.append(f"{found[1]}: found {found[2]}, expected a whole number")
+        elif found := re.match(r"Error parsing (\S+): could not convert .* float: (.*)", text):
+            said.append(f"{found[1]}: found {found[2]}, expected a number")
+        elif found := re.match(
+            r"Error parsing (\S+): no type matching (.+) could .*? (\[.*\])", text
+        ):
+            values = " ".join(ast.literal_eval(found[3]))
+            said.append(f"{found[1]}: found {_or_none(values)}, expected {_expected(found[2])}")
+        elif found := re.match(r"invalid choice (.*) for argument '(.*)'\. .* one of (.*)\.", text):
+            names = ", ".join(name for name in ast.literal_eval(found[3]) if name != "None")
+            said.append(f"{found[2]}: found {found[1]}, expected one of {names}")
+        elif found := re.match(r"Missing value for argument '(.*)'. Expected (\d+) values", text):
+            values = " ".join(_values_after(found[1], arguments))
+            words = "a value" if found[2] == "1" else f"{found[2]} values"
+            said.append(f"{found[1]}: found {_or_none(values)}, expected {words}")
+        elif found := re.match(r"Missing from .*?: (-.*|[A-Z].*)", text):
+            said.append(f"missing {plain_metavar(found[1])}")
+        elif found := re.match(r"Unrecognized options: (.*)", text):
+            # Tyro puts commas between them, and none where a flag is missing too.
+            tokens = [each for each in re.split(", | ", found[1]) if each in arguments]
+            said.insert(0, _unknown(tokens, arguments))
+        elif found := re.match(r"(?:Perhaps you meant|Arguments similar to \S+): (.*)", text):
+            said.append(f"did you mean {plain_metavar(found[1])}?")
+        else:
+            said.append(text)
+    return "; ".join(said)
+
+
+def _or_none(values: str) -> str:
+    return repr(values) if values else "none"
+
+
+def _values_after(flag: str, arguments: Sequence[str]) -> list[str]:
+    """Return the values after the last occurrence of a flag."""
+    places = [place for place, each in enumerate(arguments) if _same_flag(each, flag)]
+    after = arguments[places[-1] + 1 :] if places else ()
+    return list(itertools.takewhile(lambda each: not each.startswith("--"), after))
+
+
+def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
+    """Say what is wrong with arguments that tyro does not take: flags, or values too many."""
+    if not tokens:  # with commas or spaces in them
+        return "found values without a flag before them"
+    flags = [token.partition("=")[0] for token in tokens if token.startswith("-")]
+    if flags:
+        return f"{', '.join(flags)}: found no such flag{'s' if len(flags) > 1 else ''}"
+    before = itertools.takewhile(lambda each: each != tokens[0], arguments)
+    flag = next((each for each in reversed(list(before)) if each.startswith("--")), None)
+    if flag is None:
+        return f"found {tokens[0]!r} without a flag before it"
+    values = _values_after(flag, arguments)
+    most = len(values) - sum(each in values for each in tokens)
+    words = ("no value", "one value")[most] if most < 2 else f"{most} values"
+    return f"{flag}: found {' '.join(values)!r}, expected {words}"
 
 
 def parse_settings(

@@ -38,7 +38,7 @@ class Frame(NamedTuple):
     """A picture with its moment."""
 
     name: str
-    """The file's path, or the camera and the time."""
+    """The file's path in its folder, or the camera, or a video's name, and the time."""
     time: float
     """Seconds: into a video; else since 1970, of the file's last change or the camera's frame."""
     image: UInt8[np.ndarray, "h w 3"]
@@ -129,7 +129,8 @@ class FolderWatch:
                     continue
                 self._done.add(path)
                 del waiting[path]
-                yield Frame(path.as_posix(), changed, image, taken)
+                name = path.relative_to(self._folder).as_posix()
+                yield Frame(name, changed, image, taken)
             time.sleep(max(_POLL, 4 * (time.monotonic() - begun)) if not found else 0)
 
     def close(self) -> None:
@@ -194,7 +195,8 @@ class Camera:
         given = os.fspath(camera) if isinstance(camera, os.PathLike) else str(camera)
         self._is_file = pathlib.Path(given).is_file()
         self.name = _name(given)
-        """What names of frames begin with: no user or password of a URL."""
+        """What messages call it: no user or password of a URL."""
+        self._begins = pathlib.Path(given).name if self._is_file else self.name
         is_number = given.isdecimal() and not self._is_file
         if not (self._is_file or is_number or "://" in given):
             raise InputError(
@@ -274,7 +276,7 @@ class Camera:
             when = at if self._is_file else round(1000 * time.time())
             if found:
                 image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                frame = Frame(frame_name(self.name, when), when / 1000, image, taken)
+                frame = Frame(frame_name(self._begins, when), when / 1000, image, taken)
                 with self._lock:
                     self.dropped += self._newest is not None
                     self._newest = frame

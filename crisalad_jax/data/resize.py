@@ -11,6 +11,7 @@ import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.shapes import Float32, Int64, UInt8
 
 Pixels = UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]
@@ -223,8 +224,8 @@ def _machine_code(
 ) -> Callable[..., None] | None:
     """Compile a function of pixels, taps and result, which then releases Python's global lock.
 
-    It compiles in about a second, and is cached on disk (beside this file, or for the user). The
-    result is None without numba.
+    It compiles in about a second, and is cached in the `user_cache`, or where NUMBA_CACHE_DIR says.
+    The result is None without numba.
     """
     try:
         import numba
@@ -239,10 +240,15 @@ def _machine_code(
     result = (getattr(types, new)[:, ::1], *(getattr(types, each) for each in more))
     options = {"nogil": True, "fastmath": {"contract"}}
     signature = types.void(pixels, *taps, *taps, *result)
+    config: Any = numba.config  # pyright: ignore
+    told = config.CACHE_DIR
     try:
+        config.CACHE_DIR = told or str(user_cache() / "numba")
         return numba.njit(signature, cache=True, **options)(function)
-    except (RuntimeError, OSError):  # no writable cache folder, or a full disk
+    except (RuntimeError, OSError):  # no home or no writable cache folder, or a full disk
         return numba.njit(signature, **options)(function)
+    finally:
+        config.CACHE_DIR = told
 
 
 def _resample(

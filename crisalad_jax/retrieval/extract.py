@@ -37,7 +37,7 @@ from crisalad_jax.retrieval.sets import (
 )
 from crisalad_jax.retrieval.shares import Share, digest_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_target, real_path
+from crisalad_jax.utils.files import atomic_path, check_format, check_target, real_path
 
 StrPath = str | os.PathLike[str]
 
@@ -226,6 +226,8 @@ def check_extraction(
         check_target(target)
     if pairs is not None and pathlib.Path(pairs) in files:
         raise InputError(f"--pairs: found {pairs}, which --out writes, expected another")
+    if pairs is not None:
+        check_format("--pairs", pairs, ".txt")
     if database is not None and pairs is None:
         raise InputError("--database: found without --pairs, expected both")
     check_grouping([grouping], batch_size, seed)

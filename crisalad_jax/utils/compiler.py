@@ -127,8 +127,8 @@ def set_up() -> None:
 
     The CPU becomes one device for each core, so that a batch can be sharded over them
     (`devices_for`). That is faster than using all cores for every product. Compiled programs are
-    stored in `~/.cache/crisalad-jax` (or under XDG_CACHE_HOME), if it is writable. The environment
-    variables JAX_NUM_CPU_DEVICES, XLA_FLAGS and JAX_COMPILATION_CACHE_DIR take precedence.
+    stored in the `user_cache`, if it is writable. The environment variables JAX_NUM_CPU_DEVICES,
+    XLA_FLAGS and JAX_COMPILATION_CACHE_DIR take precedence.
     """
     told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get(
         "XLA_FLAGS", ""
@@ -138,7 +138,7 @@ def set_up() -> None:
             jax.config.update("jax_num_cpu_devices", usable_cores())
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore
         with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
-            cache = user_cache() / "crisalad-jax"
+            cache = user_cache() / "xla"
             cache.mkdir(parents=True, exist_ok=True)
             if os.access(cache, os.W_OK):
                 jax.config.update("jax_compilation_cache_dir", str(cache))

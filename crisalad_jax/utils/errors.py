@@ -11,10 +11,15 @@ class InputError(ValueError):
     """
 
 
+def how_ended(number: int) -> str:
+    """Say by which signal a program ends, in the words of every command."""
+    return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+
+
 class Stopped(Exception):
     """A signal asked the program to end, and its work is saved."""
 
     def __init__(self, number: int, where: str = "") -> None:
         """Take the signal's number, and `where`: in a few words how far the work is."""
-        super().__init__(f"stopped by {signal.Signals(number).name} {where}".rstrip())
+        super().__init__(f"{how_ended(number)} {where}".rstrip())
         self.number = number

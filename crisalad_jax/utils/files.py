@@ -87,29 +87,26 @@ def _no_file(path: str | os.PathLike[str]) -> str | None:
     return next((words for is_kind, words in _KINDS if is_kind(mode)), None)
 
 
-def user_cache() -> pathlib.Path:
-    """Return the folder of the user's caches, which `XDG_CACHE_HOME` may name.
-
-    A relative name there is ignored, as the XDG Base Directory Specification has it.
-    """
-    named = pathlib.Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return named if named.is_absolute() else pathlib.Path.home() / ".cache"
-
-
 CACHE = "CRISALAD_CACHE"
-"""Variable of the environment: the folder of models that are kept."""
+"""Variable of the environment: the folder of all that this package caches."""
 
 
-def cache_folder() -> pathlib.Path:
-    """Return the folder of the cache, which need not be there yet.
+def user_cache() -> pathlib.Path:
+    """Return the folder of all that this package caches, which need not be there yet.
 
-    It is what `CRISALAD_CACHE` names, else `crisalad_jax` in the user's cache, which
-    `XDG_CACHE_HOME` may name.
+    It is what `CRISALAD_CACHE` names, else `crisalad-jax` in the user's cache, which
+    `XDG_CACHE_HOME` may name; a relative name there is ignored, as the XDG Base Directory
+    Specification has it. Its folders are models, exports, programs, xla and numba.
+
+    Raises:
+        RuntimeError: the user has no home folder.
     """
     own = os.environ.get(CACHE)
     if own:
         return pathlib.Path(own).expanduser()
-    return user_cache() / "crisalad_jax"
+    named = pathlib.Path(os.environ.get("XDG_CACHE_HOME", ""))
+    caches = named if named.is_absolute() else pathlib.Path.home() / ".cache"
+    return caches / "crisalad-jax"
 
 
 def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
@@ -266,6 +263,23 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         raise InputError(
             f"{path}: cannot be made: found {nearest}, expected a folder that can be written to"
         )
+
+
+def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> None:
+    """Check that a file's name says no other format than the file will have.
+
+    Args:
+        what: the flag, for the message.
+        path: the file; a name without a suffix says nothing.
+        suffixes: what it may end with, as in ".json".
+
+    Raises:
+        InputError: it ends with another suffix.
+    """
+    suffix = pathlib.Path(path).suffix.lower()
+    if suffix and suffix not in suffixes:
+        ends = " or ".join(suffixes)
+        raise InputError(f"{what}: found {path}, expected a name that ends in {ends}")
 
 
 @contextlib.contextmanager

@@ -53,7 +53,7 @@ def keep_programs() -> None:
     in a notebook, is not part of the key. Where there can be no such folder nothing is kept.
     """
     with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
-        folder = user_cache() / "crisalad-jax" / "programs"
+        folder = user_cache() / "programs"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         # What is read from it runs, so nobody else may write there.
         if _is_ones_own(folder):

@@ -29,8 +29,9 @@ def set_up() -> Session:
 
     Call it first in a notebook or a program, before JAX is used. The CPU becomes one device for
     each core, which `describe` shards a batch over. Programs that took long to compile are kept in
-    `~/.cache/crisalad-jax`, so that the next start takes them from there. The environment
-    variables JAX_NUM_CPU_DEVICES, XLA_FLAGS and JAX_COMPILATION_CACHE_DIR take precedence.
+    the folder that CRISALAD_CACHE names (by default `~/.cache/crisalad-jax`), so that the next
+    start takes them from there. The environment variables JAX_NUM_CPU_DEVICES, XLA_FLAGS and
+    JAX_COMPILATION_CACHE_DIR take precedence.
 
     Returns:
         The devices and the cache; once JAX is used, devices stay as they are.

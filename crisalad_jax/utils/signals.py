@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-from crisalad_jax.utils.errors import Stopped
+from crisalad_jax.utils.errors import Stopped, how_ended
 from crisalad_jax.utils.temporaries import remove_all_in_use
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -106,9 +106,10 @@ _leaving = threading.Lock()
 def _leave(number: int) -> None:
     _leaving.acquire()  # for ever: one of the threads ends the process
     remove_all_in_use()
-    how = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
     with contextlib.suppress(OSError):
-        os.write(2, f"{_SHOW_CURSOR if os.isatty(2) else ''}crisalad: {how}\n".encode())
+        os.write(
+            2, f"{_SHOW_CURSOR if os.isatty(2) else ''}crisalad: {how_ended(number)}\n".encode()
+        )
     os._exit(128 + number)
 
 

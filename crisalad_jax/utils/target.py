@@ -3,11 +3,13 @@
 import contextlib
 import dataclasses
 import functools
+import os
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax.extend import backend
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 
 Platform = Literal["cpu", "gpu", "tpu", "portable"]
@@ -66,6 +68,25 @@ def machine() -> Target:
     if platform == "gpu":
         return Target("gpu", cudnn=_compiles_cudnn())
     return TARGETS.get(platform, PORTABLE)
+
+
+def absent_platforms(error: Exception | None = None) -> str | None:
+    """Describe which platforms `JAX_PLATFORMS` names that this JAX lacks; None where it has them.
+
+    Args:
+        error: what JAX raised; after it, JAX gives the devices that it started before it failed.
+    """
+    named = os.environ.get("JAX_PLATFORMS")
+    if not named:
+        return None
+    try:
+        jax.devices()
+        if "Unable to initialize backend" not in str(error):
+            return None
+    except Exception:  # RuntimeError, or an AssertionError without a word
+        jax.config.update("jax_platforms", None)
+    here = ", ".join(sorted(backend.backends()))
+    return f"JAX_PLATFORMS: found {named!r}, expected platforms that this JAX has: {here}"
 
 
 def _compiles_cudnn() -> bool:

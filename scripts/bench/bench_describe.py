@@ -10,8 +10,8 @@ same random weights. Needs torch (the `dev` extra) and the `bench` extra. On a G
 the other side, if both it and jax find one. Before anything is timed, descriptors are checked to be
 equal to rounding. `timing.py` says how contenders are timed.
 
-All get images that are normalised. "over devices" is how the command line runs it: a device for each
-core, the images spread over them. A single image has one device.
+All get normalised images. "over devices" is how the command line runs it: a device for each core,
+the images spread over them. A single image has one device.
 
 Memory is what a call needs at once beyond parameters and images: of jax what the compiled program
 sets aside and its output, of torch the peak of what it allocates; the others do not tell. The share

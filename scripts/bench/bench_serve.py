@@ -64,7 +64,7 @@ def expected_answers(folder: pathlib.Path, images: pathlib.Path) -> dict[pathlib
 @contextlib.contextmanager
 def served(folder: pathlib.Path) -> Iterator[str]:
     """Run the service, and say where it is once it answers."""
-    command = [sys.executable, "-m", "crisalad_jax", "serve", str(folder), "--port", "0"]
+    command = [sys.executable, "-m", "crisalad_jax", "serve", "--map", str(folder), "--port", "0"]
     with subprocess.Popen([*command, "--quiet"], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         line = process.stdout.readline()

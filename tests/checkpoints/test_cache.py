@@ -38,7 +38,7 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.download import Patience
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import CACHE, cache_folder, user_cache
+from crisalad_jax.utils.files import CACHE, user_cache
 from crisalad_jax.utils.notes import Note
 from tests.conftest import assert_equal
 from tests.file_server import FileServer, file_server
@@ -211,13 +211,13 @@ def test_what_is_told_is_of_the_callers_line(model, monkeypatch):
 
 def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
     monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path / "own"))
-    assert cache_folder() == tmp_path / "own"
+    assert user_cache() == tmp_path / "own"
     monkeypatch.delenv("CRISALAD_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cache_folder() == tmp_path / "xdg" / "crisalad_jax"
+    assert user_cache() == tmp_path / "xdg" / "crisalad-jax"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert cache_folder() == tmp_path / "home" / ".cache" / "crisalad_jax"
+    assert user_cache() == tmp_path / "home" / ".cache" / "crisalad-jax"
 
 
 # Faults. Those of single answers are in tests/utils/test_download.py.
@@ -495,6 +495,6 @@ def test_a_relative_cache_of_the_user_is_ignored(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     for named in ("", "cache", "./cache"):
         monkeypatch.setenv("XDG_CACHE_HOME", named)
-        assert user_cache() == tmp_path / ".cache"
+        assert user_cache() == tmp_path / ".cache" / "crisalad-jax"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert user_cache() == tmp_path / "cache"
+    assert user_cache() == tmp_path / "cache" / "crisalad-jax"

@@ -101,13 +101,14 @@ def spoil(path: pathlib.Path, how: str) -> None:
     path.write_bytes({"empty": b"", "cut": data[: len(data) // 2], "text": b"no image"}[how])
 
 
+LONG = "/".join(["folder"] * 20)
+"""A path that no terminal has in a line."""
 POSITIONAL = {
     ("completion", "shell"): "{bash,zsh,fish}",
     ("convert", "source"): "SRC",
     ("convert", "target"): "DST",
     ("models", "name"): "NAME",
     ("query", "images"): "IMAGE",
-    ("serve", "map"): "MAP",
 }
 SPOILT = pytest.mark.parametrize("how", ["empty", "cut", "text"])
 
@@ -135,6 +136,11 @@ def test_help_lists_every_command_and_flag(capfd):
         assert flag in succeeds(capfd, "train", "--help-all")
 
 
+def test_help_is_a_command_too(capfd):
+    assert succeeds(capfd, "help") == succeeds(capfd, "--help")
+    assert succeeds(capfd, "help", "train") == succeeds(capfd, "train", "--help")
+
+
 def test_no_command_prints_the_usage(capfd):
     assert main([]) == 2
     assert capfd.readouterr().err.startswith("usage: crisalad COMMAND")
@@ -145,8 +151,11 @@ def test_no_command_prints_the_usage(capfd):
     [
         (
             "tran --data d --out o",
-            "command: found 'tran', expected one of ablate, calibrate, compare",
+            r"found no command 'tran'; did you mean train\? \(see",
         ),
+        ("querry a.jpg --map m", r"found no command 'querry'; did you mean query\? \("),
+        ("help querry", r"found no command 'querry'; did you mean query\? \("),
+        ("xyz", "found no command 'xyz'; expected demo, render, train, .*, completion"),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
         ("train --data d --out o --preset b16", "preset: found 'b16'"),
         ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
@@ -170,9 +179,30 @@ def test_no_command_prints_the_usage(capfd):
         ("info --colour red", "--colour"),
         ("train --data d --out o --epoch 3", "--epochs"),  # perhaps you meant
         ("train --data d", "--out"),
-        ("extract", "--images PATH --out PATH"),
-        ("train --data d --out o --seed one", "--seed"),
-        ("train --data d --out o --preset", "--preset"),
+        ("extract", "missing --images PATH --out PATH"),
+        ("train --data d --out o --seed one", "--seed: found 'one', expected a whole number"),
+        ("query a --map m --k five", "--k: found 'five', expected a whole number"),
+        ("query a --map m --fps slow", "--fps: found 'slow', expected a number"),
+        (f"query a --map m --k {LONG}", f"--k: found '{LONG}', expected a whole number"),
+        ("train --data d --out o --preset", "--preset: found none, expected a value"),
+        ("evaluate --data d --image-size 200", "--image-size: found '200', expected 2 whole numb"),
+        ("evaluate --data d --image-size 1 x", "--image-size: found '1 x', expected 2 whole numb"),
+        (
+            "train --data d --out o --model.image-size 9",
+            "--model.image-size: found '9', expected 2",
+        ),
+        ("train --data d --out o --model.image-size 9 9 9", "found '9 9 9', expected 2 values"),
+        ("query a --map m --runtime tvm", "--runtime: found 'tvm', expected one of jax, onnxrunt"),
+        ("index --images a --out m --dtype int8", "--dtype: found 'int8', expected one of float"),
+        (
+            "index --images a b --out m",
+            r"--images: found 'a b', expected one value \(quote",
+        ),
+        ("extract --images a --out m --quiet no", "--quiet: found 'no', expected no value"),
+        ("index --image a --out m", "--image: found no such flag; missing --images PATH"),
+        ("query a --map m --kk 3", r"--kk: found no such flag; did you mean --k INT\?"),
+        ("evaluate d", "found 'd' without a flag before it; missing --data PATH"),
+        ("serve city.map", "found 'city.map' without a flag before it; missing --map PATH"),
         ("train --data d --out o --seed -1", "TrainConfig.seed: found -1"),
         ("train --data d --out o --epochs 0", "TrainConfig.epochs: found 0"),
         ("train --data d --out o --trainable half", "trainable: found 'half'"),
@@ -198,8 +228,10 @@ def test_no_command_prints_the_usage(capfd):
 )
 def test_bad_arguments(capfd, tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
     error = fails(capfd, *arguments.split(), words=())
     assert re.search(words, error), error
+    assert os.environ["COLUMNS"] == "80"
     assert list(tmp_path.iterdir()) == []
 
 

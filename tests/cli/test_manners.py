@@ -4,11 +4,14 @@ import csv
 import dataclasses
 import importlib
 import json
+import os
 import pathlib
 import re
 import shlex
 import shutil
 import subprocess
+import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ import pytest
 import crisalad_jax.cli
 from crisalad_jax.cli import help as helping
 from crisalad_jax.cli import main
+from crisalad_jax.cli.common import console
 from crisalad_jax.cli.completion import completion_script
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
@@ -24,14 +28,67 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import to_json
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
-from tests.cli.test_cli import fails, spoil, succeeds, train
+from tests.cli.test_cli import fails, files_in, spoil, succeeds, train
 from tests.conftest import BATCH, MODEL, RECIPE, STEPS
 
+ROOT = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
 COMMANDS = list(crisalad_jax.cli._COMMANDS)
 
 
 def module_of(command):
     return importlib.import_module(f"crisalad_jax.cli.{command.replace('-', '_')}")
+
+
+# Platforms
+
+
+@pytest.mark.parametrize("platforms", ["gpuu", "rocm", "cpu,gpuu"])
+def test_platforms_that_jax_lacks_are_one_line(tmp_path, shared, platforms):
+    """JAX raises a RuntimeError of the first, and an AssertionError without words of the second."""
+    images = shared / "town" / "images" / "test" / "database"
+    verbs = (
+        ("info", "--weights", shared / "weights.safetensors"),
+        ("index", "--images", images, "--weights", shared / "weights.safetensors", "--out", "m"),
+    )
+    for verb in verbs:
+        done = subprocess.run(
+            [sys.executable, "-m", "crisalad_jax", *map(str, verb)],
+            cwd=tmp_path,
+            env=os.environ | {"JAX_PLATFORMS": platforms, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        start = f"crisalad: JAX_PLATFORMS: found '{platforms}', expected platforms that this JAX"
+        assert done.stderr.startswith(start), done.stderr
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert "cpu" in done.stderr.rpartition("has: ")[2]  # which every jaxlib has
+    assert files_in(tmp_path) == set()
+
+
+# The cache
+
+
+def test_all_that_is_cached_is_in_one_folder(tmp_path, shared):
+    """A process of its own, as of a user: the tests' set-up keeps no programs."""
+    environment = {k: v for k, v in os.environ.items() if k not in OWN_CACHES}
+    home, cache = tmp_path / "home", tmp_path / "cache"
+    environment |= {"HOME": str(home), "CRISALAD_CACHE": str(cache), "PYTHONPATH": str(ROOT)}
+    images = shared / "town" / "images" / "test"
+    given = ("--images", images, "--weights", shared / "weights.safetensors", "--out", "d.npy")
+    resizes = "from crisalad_jax.data import resize; resize._compiled()"  # as for many images
+    for program in (["-m", "crisalad_jax", "extract", *map(str, given)], ["-c", resizes]):
+        command = [sys.executable, *program]
+        subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert {path.name for path in cache.iterdir()} == {"numba", "programs", "xla"}
+    assert {path.relative_to(cache).parts[0] for path in files(cache)} >= {"numba", "programs"}
+    assert files(home) == []
+
+
+OWN_CACHES = ("XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR", "NUMBA_CACHE_DIR")
+
+
+def files(folder):
+    return [path for path in folder.rglob("*") if path.is_file()]
 
 
 # Help
@@ -113,6 +170,21 @@ def test_bash_completes_commands_flags_and_choices(bash):
     assert {"megaloc", "megaloc-v1"} == bash("models", "mega")
 
 
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+def test_bash_completes_weights_by_models_and_files(bash, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "megabytes").mkdir()
+    (tmp_path / "megabytes" / "best.safetensors").touch()
+    expected = {"megaloc", "megaloc-v1", "megabytes"}
+    for command, flag in (
+        *((name, "--weights") for name in ("evaluate", "extract", "index", "query", "compare")),
+        *(("train", "--weights"), ("train", "--backbone"), ("evaluate", "--rerank-weights")),
+    ):
+        assert bash(command, flag, "mega") == expected, (command, flag)
+    assert bash("index", "--weights", "start") == {"starter"}
+    assert bash("index", "--weights", "megabytes/b") == {"megabytes/best.safetensors"}
+
+
 @pytest.mark.parametrize(("shell", "first"), [("zsh", "#compdef crisalad"), ("fish", "")])
 def test_other_shells_have_a_script_of_every_command(capfd, shell, first):
     assert main(["completion", shell]) == 0
@@ -122,7 +194,65 @@ def test_other_shells_have_a_script_of_every_command(capfd, shell, first):
     assert "help-all" in out
 
 
+# Tables
+
+
+@pytest.mark.parametrize("width", [80, 60])
+def test_no_number_and_no_path_breaks_on_a_narrow_terminal(
+    capfd, tmp_path, shared, monkeypatch, width
+):
+    """What a table has on a wide terminal, it has on a narrow one, in as many whole words."""
+    monkeypatch.chdir(tmp_path)
+    set_ = pathlib.Path("data", *["a_folder_with_a_long_name"] * 4, "town")
+    shutil.copytree(shared / "town", set_)
+    weights = set_.parent / "weights.safetensors"
+    shutil.copy(shared / "weights.safetensors", weights)
+    own = ("--weights", weights, "--quiet", "--batch-size", BATCH)
+    database, queries = (set_ / "images" / "test" / side for side in ("database", "queries"))
+    succeeds(capfd, "index", *own, "--images", database, "--out", set_.parent / "map")
+
+    def printed(*arguments: object) -> str:
+        assert main([str(each) for each in arguments]) == 0
+        return capfd.readouterr().out
+
+    verbs = (
+        ("query", queries, "--map", set_.parent / "map", "--quiet"),
+        ("evaluate", "--data", set_, *own, "--seeds", 2, "--precision", 0.6),
+        ("info", "--weights", weights),
+        ("info", "--map", set_.parent / "map"),
+        ("compare", "--test", set_, "--weights", f"own={weights}", "--out", "out", "--quiet"),
+    )
+    for verb in verbs:
+        wide = printed(*verb)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(console, "_width", width)
+            narrow = printed(*verb)
+        left = Counter(narrow.split())
+        for word, count in Counter(wide.split()).items():
+            if any(letter.isalnum() for letter in word):
+                assert left[word] >= count, (verb[0], word)
+        frames = [line for line in narrow.splitlines() if line.startswith(tuple("┏┃┡│├└"))]
+        assert all(len(line) <= width for line in frames), verb[0]
+
+
 # JSON
+
+
+@pytest.mark.parametrize("name", ["x.csv", "x.kml", "x.jsonl", "x.JSN"])
+def test_json_is_never_written_under_the_name_of_another_format(capfd, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    for command in COMMANDS:
+        if command in ("completion", "serve") or (command, name) == ("query", "x.jsonl"):
+            continue
+        _, verb, *given = shlex.split(module_of(command).EXAMPLE.partition(" >")[0])
+        given = [each for each in given if each not in ("--json", "-")]
+        words = (f"--json: found {name}, expected a name that ends in .json",)
+        fails(capfd, verb, *given, "--json", name, words=words)
+    gallery = ("query", "a", "--map", "m", "--gallery", name)
+    fails(capfd, *gallery, words=(f"--gallery: found {name}, expected a name that ends in .png",))
+    extract = ("extract", "--images", "a", "--out", "d.npy", "--pairs", name)
+    fails(capfd, *extract, words=(f"--pairs: found {name}, expected a name that ends in .txt",))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -262,7 +392,7 @@ def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, shared, spoilt):
     assert main([*map(str, given), "--on-bad-image", "skip"]) == 0
     out, err = capfd.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
-    assert [line["query"] for line in lines] == [p.as_posix() for p in asked if p != asked[1]]
+    assert [line["query"] for line in lines] == [p.name for p in asked if p != asked[1]]
     assert f"1 unreadable left out, {asked[1]} the first" in " ".join(err.split())
     fails(capfd, *given, words=("found an image cut short",))
     fails(

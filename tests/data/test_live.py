@@ -123,7 +123,7 @@ def test_a_video_plays_as_a_camera(tmp_path):
     assert found[-1].time == 0.7
     assert len(found) + camera.dropped == 8
     for frame in found:
-        assert frame.name == f"{video}#t={frame.time:.3f}"
+        assert frame.name == f"{video.name}#t={frame.time:.3f}"
         assert frame.image.mean() == pytest.approx(100 * frame.time, abs=LEVELS)
         # At its own pace: never before its time. Clocks differ by far less than a frame.
         assert frame.taken - begun > frame.time - 0.01

@@ -81,7 +81,7 @@ def test_the_command_refuses_in_one_line(capfd, monkeypatch, tmp_path):
         (["--host", "no.such.name.invalid"], "crisalad: host: found 'no.such.name.invalid'"),
         (["--port", "0"], "crisalad: no.map: found no map, expected a folder"),
     ):
-        assert main(["serve", "no.map", *given]) == 2
+        assert main(["serve", "--map", "no.map", *given]) == 2
         err = capfd.readouterr().err
         assert err.startswith(words), err
         assert err.count("\n") == 1

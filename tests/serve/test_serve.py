@@ -515,7 +515,7 @@ def test_requests_in_flight_are_answered_at_the_end(folder, params, pictures, mo
     [(signal.SIGTERM, 143, "ended by SIGTERM"), (signal.SIGINT, 130, "interrupted")],
 )
 def test_the_command_says_where_it_is_and_ends_at_a_signal(own_map, pictures, number, code, words):
-    command = [sys.executable, "-m", "crisalad_jax", "serve", str(own_map), "--port", "0"]
+    command = [sys.executable, "-m", "crisalad_jax", "serve", "--map", str(own_map), "--port", "0"]
     with subprocess.Popen(
         [*command, "--append", "--batch-size", "1"],
         stdout=subprocess.PIPE,

@@ -181,7 +181,7 @@ compiler.jit(squared)(jax.numpy.ones((64, 64))).block_until_ready()
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores are not told here")
 @pytest.mark.parametrize("fewer", ["", "yes"], ids=("all cores", "one core"))
 def test_a_device_a_core_and_programs_are_kept(tmp_path: pathlib.Path, fewer: str) -> None:
-    cache = tmp_path / ".cache" / "crisalad-jax"
+    cache = tmp_path / ".cache" / "crisalad-jax" / "xla"
     devices, cores, place = in_a_program(SET_UP, tmp_path, FEWER=fewer).split()
     assert devices == cores
     assert not fewer or cores == "1"

@@ -25,7 +25,7 @@ def test_a_notebook_has_the_devices_and_the_cache_of_the_command_line(
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
     )
-    cache = tmp_path / "crisalad-jax"
+    cache = tmp_path / "crisalad-jax" / "xla"
     assert done.stdout.splitlines() == [
         f"3 cpu devices; compiled programs in {cache}",
         f"3 {cache}",

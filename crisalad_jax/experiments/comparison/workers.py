@@ -20,6 +20,7 @@ from crisalad_jax.experiments.comparison.plan import ComparisonConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.signals import defer_signals
+from crisalad_jax.utils.target import absent_platforms
 
 _MODULE = "crisalad_jax.experiments.comparison.worker"
 _PROBE = "import jax; d = jax.local_devices(); print(d[0].platform, len(d))"
@@ -148,7 +149,8 @@ def _devices() -> tuple[str, int]:
     words = found.stdout.split()
     if found.returncode or len(words) != 2:
         raise InputError(
-            f"--jobs: found no devices, expected some: {found.stderr.strip().splitlines()[-1:]}"
+            absent_platforms()
+            or f"--jobs: found no devices, expected some: {found.stderr.strip().splitlines()[-1:]}"
         )
     return words[0], int(words[1])
 

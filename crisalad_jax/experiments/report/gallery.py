@@ -251,8 +251,8 @@ def answers_figure(
     used, places = np.unique(indices, return_inverse=True)
     images = [answers.images[number] for number in used]
     asked = [
-        path.as_posix() if known else f"unknown: {path.as_posix()}"
-        for path, known in zip(answers.queries, answers.known, strict=True)
+        name if known else f"unknown: {name}"
+        for name, known in zip(answers.names, answers.known, strict=True)
     ]
     return retrieval_figure(
         answers.queries,

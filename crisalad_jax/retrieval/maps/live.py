@@ -137,6 +137,7 @@ def query_live(
                 least,
                 *filtered,
                 zone=places.zone,
+                root=None,
             )
             latency = time.perf_counter() - frame.taken
             yield LiveAnswer(found, frame.time, 1000 * latency)

@@ -60,6 +60,16 @@ class Answers(NamedTuple):
     without a filter, where it is the first answer's."""
     zone: Zone | None = None
     """Zone of UTM of all positions; None where it is unknown."""
+    root: pathlib.Path | None = None
+    """Folder that names of queries are relative to: of their source or, of several, the one that
+    holds all; None where names are whole paths."""
+
+    @property
+    def names(self) -> list[str]:
+        """Name of each query, a posix path below `root`."""
+        root = self.root
+        named = self.queries if root is None else [path.relative_to(root) for path in self.queries]
+        return [path.as_posix() for path in named]
 
     @property
     def known(self) -> Bool[np.ndarray, " query"]:
@@ -150,7 +160,7 @@ def query(
     check_grouping((), batch_size, seed=0)
     check_count("k", k)
     min_similarity = asked_similarity(places, min_similarity)
-    sources = _listed(images, fps)
+    root, sources = _listed(images, fps)
     paths = [path for source in sources for path in source]
     check_rate_used(fps, paths)
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -185,16 +195,8 @@ def query(
     neighbours = Neighbours(indices, similarities)
     lost = set(unreadable)
     readable = [path for path in paths if path not in lost]
-    return Answers(
-        readable,
-        neighbours,
-        places.images,
-        places.axes,
-        unreadable,
-        min_similarity,
-        *filtered,
-        zone=places.zone,
-    )
+    given = (places.images, places.axes, unreadable, min_similarity)
+    return Answers(readable, neighbours, *given, *filtered, zone=places.zone, root=root)
 
 
 def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
@@ -253,21 +255,28 @@ def _described(
     )
 
 
-def _listed(images: Any, fps: float | None) -> list[list[pathlib.Path]]:
+def _listed(images: Any, fps: float | None) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
+    """List the images of each source, below a folder that holds all."""
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
-    sources: list[list[pathlib.Path]] = []
-    is_one = False
-    for each in given:
-        paths = open_source(each, fps=fps).paths
-        # Images named one after the other are one source: a shell writes a pattern out so.
-        if is_one and len(paths) == 1:
-            sources[-1] += paths
-        else:
-            sources.append(paths)
-        is_one = len(paths) == 1
-    return sources
+    sources = [open_source(each, fps=fps) for each in given]
+    roots = {source.root for source in sources}
+    if len(roots) == 1:
+        return roots.pop(), _joined([source.paths for source in sources])
+    # Written out, as relative and absolute ones have no folder in common.
+    paths = [[pathlib.Path(os.path.abspath(path)) for path in source.paths] for source in sources]
+    root = pathlib.Path(os.path.commonpath([os.path.abspath(root) for root in roots]))
+    return root, _joined(paths)
+
+
+def _joined(sources: Sequence[Sequence[pathlib.Path]]) -> list[list[pathlib.Path]]:
+    """Join images named one after the other to one source: a shell writes a pattern out so."""
+    joined: list[list[pathlib.Path]] = []
+    for is_one, run in itertools.groupby(sources, lambda paths: len(paths) == 1):
+        each = [list(paths) for paths in run]
+        joined += [list(itertools.chain(*each))] if is_one else each
+    return joined
 
 
 def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, float] | None:
@@ -292,6 +301,7 @@ def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any
 def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
+    Names of queries are relative to their source, as those of a map's images are.
     Frames of videos have a `time` in seconds, too. Where answers must have a similarity, the line
     says whether the query is of a `known` place; the answers of an unknown one are listed all the
     same. Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
@@ -301,11 +311,13 @@ def json_lines(answers: Answers) -> Iterator[str]:
 
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     """Yield what `json_lines` writes of each query."""
-    for known, (path, ranked) in zip(answers.known, answers.rows(), strict=True):
+    for name, known, (path, ranked) in zip(
+        answers.names, answers.known, answers.rows(), strict=True
+    ):
         neighbours = [
             answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in ranked
         ]
-        row = {"query": path.as_posix(), **_time(path), "neighbours": neighbours}
+        row = {"query": name, **_time(path), "neighbours": neighbours}
         yield row if answers.min_similarity is None else row | {"known": bool(known)}
 
 
@@ -321,7 +333,7 @@ def json_text(row: dict[str, Any]) -> str:
 
 
 def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
-    """Write answers as JSON, a line for each query.
+    """Write answers as JSON: a line for each query or, in a file .json, a list of them.
 
     Args:
         path: the file.
@@ -334,4 +346,8 @@ def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
         atomic_path(path) as temporary,
         temporary.open("w", encoding="utf-8") as file,
     ):
-        file.writelines(f"{line}\n" for line in json_lines(answers))
+        if pathlib.Path(path).suffix.lower() == ".json":
+            rows = ",\n".join(json_lines(answers))
+            file.write(f"[\n{rows}\n]\n")
+        else:
+            file.writelines(f"{line}\n" for line in json_lines(answers))

@@ -7,11 +7,10 @@ import pathlib
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
 import crisalad_jax.retrieval.maps.query
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.cli.answers import answers_table
+from crisalad_jax.cli.answers import answer_lines
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import FolderWatch
 from crisalad_jax.retrieval.maps.build import index
@@ -93,7 +92,7 @@ def test_lines_of_json(answers, tmp_path):
     assert lines == list(json_lines(answers))
     first = json.loads(lines[0])
     ((path, found), *_) = answers.rows()
-    assert first["query"] == path.as_posix()
+    assert first["query"] == path.name  # the source is its folder
     assert first["neighbours"][1] == {
         "rank": 2,
         "name": found[1].image.name,
@@ -102,16 +101,39 @@ def test_lines_of_json(answers, tmp_path):
     }
 
 
-def test_a_table(answers):
-    """Markup in names is text, and what has no position has a dash."""
+def test_a_list_is_written_to_a_file_of_json(answers, tmp_path):
+    write_answers(tmp_path / "a.json", answers)
+    found = json.loads((tmp_path / "a.json").read_text())
+    assert found == list(map(json.loads, json_lines(answers)))
+
+
+def test_names_of_queries_are_relative_to_their_source(folder, params, sides, monkeypatch):
+    """Of several sources, to the folder that holds all, so that no two images have one name."""
+    database, queries = sides
+    one = list_images(queries)[0]
+    assert ask(folder, params, one).names == [one.name]
+    assert ask(folder, params, [one, one]).names == [one.name] * 2
+    found = ask(folder, params, [queries, database])
+    expected = [f"{s.name}/{each.name}" for s in (queries, database) for each in list_images(s)]
+    assert found.names == expected
+    monkeypatch.chdir(queries)
+    assert ask(folder, params, [pathlib.Path(one.name), database]).names == [
+        f"{queries.name}/{one.name}",
+        *(f"{database.name}/{each.name}" for each in list_images(database)),
+    ]
+
+
+def test_lines_for_people(answers):
+    """Names stand whole at the ends of lines, and what has no position has a dash."""
     image = answers.images[0]._replace(name="a[red].jpg", position=None)
     answers = answers._replace(images=[image] * 7)
-    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(answers_table(answers, "title"))
-    text = console.export_text()
-    assert text.count("a[red].jpg") == 15
-    assert "east, north" in text
-    assert "title" in text
+    head, *lines = answer_lines(answers)
+    assert head.split() == ["rank", "similarity", "east,", "north", "name"]
+    assert lines[0] == answers.queries[0].name
+    best = answers.neighbours.similarities[0, 0]
+    assert lines[1].split() == ["1", f"{best:.3f}", "-", "a[red].jpg"]
+    assert sum(line.endswith("  a[red].jpg") for line in lines) == 15
+    assert len({line.index("a[red]") for line in lines if "a[red]" in line}) == 1
 
 
 @pytest.mark.parametrize(
