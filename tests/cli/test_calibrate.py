@@ -95,5 +95,5 @@ def test_frames_of_a_camera_are_followed(folder, shared, tmp_path, capfd):
     assert "probability" in succeeds(capfd, *query(folder, queries, "--sequence", "bayes"))
     words = ("--sequence-reach: found without --sequence bayes",)
     fails(capfd, *query(folder, queries, "--sequence-reach", 1), words=words)
-    words = ("BayesFilter.reach: found 0, expected at least 1",)
+    words = ("BayesFilter.reach: found 0.0, expected at least 1",)
     fails(capfd, *query(folder, queries, "--sequence", "bayes", "--sequence-reach", 0), words=words)
