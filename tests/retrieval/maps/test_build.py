@@ -4,6 +4,7 @@ import pathlib
 import shutil
 
 import numpy as np
+import pyproj
 import pytest
 
 import crisalad_jax.retrieval.maps.build
@@ -162,3 +163,24 @@ def test_a_folder_of_unreadable_images_makes_no_map(params, tmp_path):
     with pytest.raises(InputError, match="found 1 images, none of them readable"):
         index_folder(tmp_path / "map", params, tmp_path / "images", on_bad_image="skip")
     assert not (tmp_path / "map").exists()
+
+
+def test_images_of_several_zones_make_a_map_of_degrees(params, database, tmp_path):
+    """Zones 31 and 32 at their edge: both are near 48.85, 6.0, whatever their numbers."""
+    names = ("@0719985.00@5415018.00@31@U@.png", "@0280015.00@5415018.00@32@U@.png")
+    for name, path in zip(names, list_images(database), strict=False):
+        (tmp_path / "images").mkdir(exist_ok=True)
+        shutil.copy(path, tmp_path / "images" / name)
+    with pytest.warns(UserWarning, match="of several zones of UTM: positions become lat, lon"):
+        first = index_folder(tmp_path / "map", params, tmp_path / "images")
+    assert (first.added, first.positions) == (2, 2)
+    again = index_folder(tmp_path / "map", params, tmp_path / "images")
+    assert (again.added, again.there) == (0, 2)
+    with Map.open(tmp_path / "map") as places:
+        assert places.axes == ("lat", "lon")
+        for image in places.images:
+            number = 31 if "@31@" in image.name else 32
+            into = pyproj.Transformer.from_crs(f"EPSG:326{number}", "EPSG:4326")
+            east, north = (float(field) for field in image.name.split("@")[1:3])
+            # Rounded to 1e-9 degrees.
+            np.testing.assert_allclose(image.position, into.transform(east, north), atol=2e-9)
