@@ -266,7 +266,7 @@ def _read_torch(path: pathlib.Path) -> Any:
             attributes = getattr(value, "__dict__", {})
             made.stands_for = attributes.get("stands_for")
             metadata = attributes.get("_metadata")  # as of any module's state_dict
-            made.settings = metadata.get(_SETTINGS) if isinstance(metadata, Mapping) else None
+            made.settings = dict.get(metadata, _SETTINGS) if isinstance(metadata, dict) else None
             return made
         if not isinstance(value, torch.Tensor):
             return value

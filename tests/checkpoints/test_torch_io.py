@@ -225,7 +225,7 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
     else:
         source = written(tmp_path, layout)
     public = read_checkpoint(source)
-    config = replaced(public.config, ["image_size"], (98, 126))
+    config = replaced(public.config, ["image_size"], (126, 140))
     config = replaced(config, ["compute_dtype"], "bfloat16")
     config = replaced(config, ["precision"], "high")
     config = replaced(config, ["remat"], "none")
