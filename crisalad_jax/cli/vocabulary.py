@@ -101,7 +101,8 @@ def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    source = open_source(arguments.images, fps=arguments.fps)  # drawing parameters takes seconds
+    # Now already, because drawing parameters takes seconds.
+    source = open_source(arguments.images, fps=arguments.fps, on_bad_image=arguments.on_bad_image)
     check_rate_used(arguments.fps, source.paths)
     params, config = _model(arguments)
     built = build_vocabulary(

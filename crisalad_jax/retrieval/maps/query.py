@@ -150,7 +150,7 @@ def query(
     check_grouping((), batch_size, seed=0)
     check_count("k", k)
     min_similarity = asked_similarity(places, min_similarity)
-    sources = _listed(images, fps)
+    sources = _listed(images, fps, on_bad_image)
     paths = [path for source in sources for path in source]
     check_rate_used(fps, paths)
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -253,14 +253,14 @@ def _described(
     )
 
 
-def _listed(images: Any, fps: float | None) -> list[list[pathlib.Path]]:
+def _listed(images: Any, fps: float | None, on_bad_image: OnBadImage) -> list[list[pathlib.Path]]:
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
     sources: list[list[pathlib.Path]] = []
     is_one = False
     for each in given:
-        paths = open_source(each, fps=fps).paths
+        paths = open_source(each, fps=fps, on_bad_image=on_bad_image).paths
         # Images named one after the other are one source: a shell writes a pattern out so.
         if is_one and len(paths) == 1:
             sources[-1] += paths
