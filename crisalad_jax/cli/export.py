@@ -32,7 +32,7 @@ class Export:
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: bilinear, bicubic or area; antialias or no-antialias;
-    bytes or floats; fixed; round (docs/resizing.md)."""
+    bytes or floats; fixed; round; high-byte or contrast-stretch (docs/resizing.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
     """Images in a call, or symbolic: any number."""
     grouping: Literal["single", "batch", "any"] = "single"

@@ -78,7 +78,8 @@ class Vocabulary:
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
+    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     max_images: int = IMAGES
     """Read at most so many images, drawn at random."""
     batch_size: int = 16

@@ -1,5 +1,6 @@
 """Pixels of any depth as 8-bit RGB: grey is repeated, and more than 8 bits become 8."""
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ PERCENTILES = (1, 99)
 camera would take the whole range."""
 _NARROW = 2**14
 """Range of 16-bit values below which an image has less than 64 of 256 grey levels."""
+_NOTING = threading.Lock()
 _noted: set[str] = set()
 """Holds what was said: a set of thermal images has thousands of them, and one note."""
 
@@ -58,7 +60,7 @@ def as_rgb(
         if right and image.dtype.kind in "iuf":
             low, high = _range(image, (0, 100), name)
             found += f", values from {low:,.6g} to {high:,.6g}"
-            expected += "; contrast-stretch spreads such values over 8 bits (--resize)"
+            expected = "uint8 or uint16; --resize contrast-stretch spreads such values over 8 bits"
         raise InputError(f"{found}, expected {expected}")
     return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2) if grey else image
 
@@ -84,10 +86,14 @@ def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
     if _noted:
         return
     low, high = _range(image, PERCENTILES, name)
-    if high - low < _NARROW:
+    if high - low >= _NARROW:
+        return
+    with _NOTING:
+        if _noted:
+            return
         _noted.add(name)
-        levels = int(high) // 256 - int(low) // 256 + 1
-        tell(
-            f"{name}: 16-bit values from {low:,.0f} to {high:,.0f} of 65,535 become {levels} of "
-            "256 grey levels; --resize contrast-stretch spreads them over all"
-        )
+    levels = int(high) // 256 - int(low) // 256 + 1
+    tell(
+        f"{name}: 16-bit values from {low:,.0f} to {high:,.0f} of 65,535 become {levels} of 256 "
+        "grey levels; --resize contrast-stretch spreads them over all"
+    )
