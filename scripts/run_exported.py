@@ -67,7 +67,7 @@ def load(folder: pathlib.Path, manifest: dict[str, Any]) -> Callable[[np.ndarray
 def read_image(path: pathlib.Path, manifest: dict[str, Any]) -> np.ndarray:
     """RGB pixels, upright, resized and, where they are floats, normalised as the manifest says."""
     how, wanted = manifest["model"]["preprocessing"], manifest["images"]
-    if how["filter"] not in FILTERS or not how["antialias"]:
+    if how["filter"] not in FILTERS or not how["antialias"] or how["bit_depth"] != "high-byte":
         raise SystemExit(f"found images resized {wanted['resize']}, which Pillow cannot do")
     with PIL.Image.open(path) as image:
         pixels = np.asarray(PIL.ImageOps.exif_transpose(image).convert("RGB"))

@@ -188,7 +188,7 @@ def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False)
         return 0
     with warnings.catch_warnings():
         warnings.showwarning = _show_note
-        warnings.simplefilter("always", Note)
+        warnings.simplefilter("default", Note)  # the same words once
         return _exit_code(given, keep_programs)
 
 

@@ -168,6 +168,7 @@ def open_set(arguments: Any) -> "Benchmark":
         queries=arguments.queries,
         ignore_zones=arguments.ignore_zones,
         layout=arguments.layout,
+        on_bad_image=arguments.on_bad_image,
     )
     say(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "

@@ -37,7 +37,8 @@ class ComparisonFlags:
     """Height and width, multiples of the patch size; by default the preset's, or a file's."""
     resize: tuple[str, ...] = ()
     """Words in place of every model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
+    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     batch_size: int = 16
     """Images described together, which a grouping lets look at each other."""
     grouping: str = "single"

@@ -74,7 +74,8 @@ class Evaluate:
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
+    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     grouping: str = ",".join(DEFAULT_GROUPINGS)
     """Comma-separated: single, shuffled, sequential, window (an image with those just before it,
     --batch-size in all); QUERIES/DATABASE groups the two sides apart."""

@@ -32,7 +32,7 @@ class Export:
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: bilinear, bicubic or area; antialias or no-antialias;
-    bytes or floats; fixed; round (docs/resizing.md)."""
+    bytes or floats; fixed; round; high-byte or contrast-stretch (docs/resizing.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
     """Images in a call, or symbolic: any number."""
     grouping: Literal["single", "batch", "any"] = "single"
@@ -116,7 +116,7 @@ def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray
     """Read some photographs, evenly spread over all, as the model takes them."""
     import numpy as np
 
-    from crisalad_jax.data.images import read_image
+    from crisalad_jax.data.images import read_pixels
     from crisalad_jax.data.sources import open_source
     from crisalad_jax.retrieval.photographs import prepare_image
     from crisalad_jax.utils.errors import InputError
@@ -128,4 +128,4 @@ def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray
         )
     paths = open_source(images, fps=1.0).paths
     chosen = paths[:: -(-len(paths) // _MOST)]
-    return np.stack([prepare_image(read_image(path), config) for path in chosen])
+    return np.stack([prepare_image(read_pixels(path), config, str(path)) for path in chosen])

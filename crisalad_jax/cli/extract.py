@@ -52,7 +52,8 @@ class Extract:
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
+    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     grouping: str = "single"
     """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
     all): a cross-image model's descriptors depend on it."""

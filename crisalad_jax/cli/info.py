@@ -45,7 +45,8 @@ class Info:
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
+    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     trainable: str | None = None
     """head, adapters+head, last-N-blocks+head or all; by default the recipe's, of
     a file adapters+head, or head where it has no adapter."""

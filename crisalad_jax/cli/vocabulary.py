@@ -80,7 +80,8 @@ class Vocabulary:
     """Height and width, multiples of the patch size; by default the model's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round (docs/resizing.md)."""
+    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     max_images: int = IMAGES
     """Read at most so many images, drawn at random."""
     batch_size: int = 16
@@ -103,7 +104,8 @@ def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    source = open_source(arguments.images, fps=arguments.fps)  # drawing parameters takes seconds
+    # Now already, because drawing parameters takes seconds.
+    source = open_source(arguments.images, fps=arguments.fps, on_bad_image=arguments.on_bad_image)
     check_rate_used(arguments.fps, source.paths)
     params, config = _model(arguments)
     built = build_vocabulary(

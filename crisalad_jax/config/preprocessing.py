@@ -11,6 +11,8 @@ from crisalad_jax.config.fields import free_field
 
 Size = tuple[int, int]
 """Height and width in pixels."""
+BitDepth = Literal["high-byte", "contrast-stretch"]
+"""How more than 8 bits a colour become 8."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 
@@ -21,6 +23,7 @@ WORDS: Mapping[str, Mapping[str, Any]] = {
     "no-antialias": {"antialias": False},
     **{name: {"pixels": name} for name in ("bytes", "floats")},
     "round": {"round_to_patch": True},
+    **{name: {"bit_depth": name} for name in ("high-byte", "contrast-stretch")},
 }
 """Words of the flag --resize, and the fields that they set."""
 
@@ -58,6 +61,11 @@ class PreprocessingConfig:
     round_to_patch: bool = free_field(False)
     """Whether images of a fixed size that is no multiple of the patch size are resized once more,
     to the nearest one (halves to the even number), bilinear and antialiased. MegaLoc does so."""
+    bit_depth: BitDepth = free_field("high-byte")  # noqa: RUF009
+    """How more than 8 bits a colour become 8, before the resize. "high-byte" drops the low byte of
+    16. "contrast-stretch" spreads each image's own values, from the 1st to the 99th percentile,
+    over 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for floats.
+    8-bit images stay as they are."""
     normalisation: Literal["mean-deviation", "local-contrast"] = "mean-deviation"
     """How pixels are normalised: by `mean` and `deviation`, or by those of each neighbourhood."""
     mean: tuple[float, float, float] = IMAGENET_MEAN
@@ -190,4 +198,5 @@ class PreprocessingConfig:
             how = "area"
         else:
             how = f"{self.filter}, {'' if self.antialias else 'not '}antialiased"
-        return f"{size}, {how}, on {self.pixels}"
+        stretched = "" if self.bit_depth == "high-byte" else f", {self.bit_depth}"
+        return f"{size}, {how}, on {self.pixels}{stretched}"

@@ -13,6 +13,7 @@ import pathlib
 import numpy as np
 
 from crisalad_jax.data.exif import exif_positions
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import continuous, to_metres
 from crisalad_jax.data.own_places import OwnPlaces
 from crisalad_jax.data.positions import AXES, Positions, read_positions, utm_positions
@@ -28,7 +29,11 @@ radii apart, and so those of two places are no nearer."""
 
 
 def places_by_position(
-    root: pathlib.Path, radius: float, positions: str | os.PathLike[str] | None, fps: float | None
+    root: pathlib.Path,
+    radius: float,
+    positions: str | os.PathLike[str] | None,
+    fps: float | None,
+    on_bad_image: OnBadImage,
 ) -> OwnPlaces:
     """Group images into places of a radius, each called by the name of the image at its centre.
 
@@ -41,6 +46,7 @@ def places_by_position(
         positions: a table (`read_positions`); None is what the source says, if that is a table,
             else what @UTM names say, else the EXIF data of JPEGs.
         fps: frames a second of videos.
+        on_bad_image: as of `open_source`.
 
     Raises:
         InputError: the radius is not above 0; no image has a position; or what `open_source` and
@@ -48,7 +54,7 @@ def places_by_position(
     """
     if not 0 < radius < math.inf:
         raise InputError(f"--place-radius: found {radius:g}, expected metres above 0")
-    source = _open(root, fps)
+    source = _open(root, fps, on_bad_image)
     found = _positions(source, root, positions)
     names = [name for name in source.names if name in found.of]
     if not names:
@@ -75,7 +81,9 @@ def places_by_position(
     return OwnPlaces(source.root, images, None, neighbours)
 
 
-def places_by_order(root: pathlib.Path, frames: int, fps: float | None) -> OwnPlaces:
+def places_by_order(
+    root: pathlib.Path, frames: int, fps: float | None, on_bad_image: OnBadImage
+) -> OwnPlaces:
     """Make a place of every so many images of a folder or video in order, called by the first one.
 
     A place and the next one of the same folder or video are too near for one batch.
@@ -84,13 +92,14 @@ def places_by_order(root: pathlib.Path, frames: int, fps: float | None) -> OwnPl
         root: a source of images (`open_source`).
         frames: number of images of a place.
         fps: frames a second of videos.
+        on_bad_image: as of `open_source`.
 
     Raises:
         InputError: less than two frames, or what `open_source` raises.
     """
     if frames < 2:
         raise InputError(f"--place-frames: found {frames}, expected at least 2")
-    source = _open(root, fps)
+    source = _open(root, fps, on_bad_image)
     sequences: dict[pathlib.Path, list[str]] = collections.defaultdict(list)
     for path, name in zip(source.paths, source.names, strict=True):
         sequences[path.parent if frame_time(path) is None else file_of(path)].append(name)
@@ -106,13 +115,13 @@ def places_by_order(root: pathlib.Path, frames: int, fps: float | None) -> OwnPl
     return OwnPlaces(source.root, images, None, near)
 
 
-def _open(root: pathlib.Path, fps: float | None) -> ImageSource:
+def _open(root: pathlib.Path, fps: float | None, on_bad_image: OnBadImage) -> ImageSource:
     if (root / "Dataframes").is_dir():
         raise InputError(
             f"{root}: found the layout of GSV-Cities, which has places, expected it without "
             "--place-radius and --place-frames"
         )
-    source = open_source(root, fps=fps)
+    source = open_source(root, fps=fps, on_bad_image=on_bad_image)
     check_rate_used(fps, source.paths)
     return source
 

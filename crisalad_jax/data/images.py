@@ -3,41 +3,56 @@
 JPEG markers are from ITU-T T.81 annex B, PNG chunks from the W3C PNG specification, section 5.
 """
 
+import collections
 import os
 import pathlib
 import re
 import zlib
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import cv2
 import numpy as np
 
+from crisalad_jax.config.preprocessing import BitDepth
+from crisalad_jax.data.depth import as_rgb
 from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.data.video import frame_time, read_frame
+from crisalad_jax.data.video import frame_time, is_video, read_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.shapes import UInt8
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-"""Suffixes of images for `list_images`, in lower case. Decoding goes by content, not by suffix."""
-_OTHER_SUFFIXES = (
-    ".heic",
-    ".heif",
-    ".avif",
-    ".gif",
-    ".jp2",
-    ".jxl",
-    ".dng",
-    ".cr2",
-    ".nef",
-    ".arw",
+OnBadImage = Literal["skip", "stop"]
+"""What an image that is missing or cannot be read does: it is left out, or ends the work."""
+_OF_JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
+_SUFFIXES = (
+    *_OF_JPEG,
+    *(".png", ".webp", ".bmp", ".tif", ".tiff", ".gif", ".avif", ".jp2"),
+    *(".ppm", ".pgm", ".pbm", ".pnm"),
 )
-"""Suffixes of images that are not read, so that folders of them are told of."""
+# OpenCV has no list of what it decodes. It decodes what it encodes, and builds differ in that.
+IMAGE_SUFFIXES = tuple(
+    suffix for suffix in _SUFFIXES if suffix in _OF_JPEG or cv2.haveImageWriter(suffix)
+)
+"""Suffixes of images, in lower case, wherever files are looked for by name. Decoding goes by
+content."""
+SELF_CHECKED = (*_OF_JPEG, ".png")
+"""Suffixes of images that `decode_image` finds cut short by their own marks."""
+_FORMATS = f"an image ({' '.join(IMAGE_SUFFIXES)})"
+_FOREIGN = {
+    ".heic": (4, (b"ftyphei", b"ftyphev", b"ftypmif1", b"ftypmsf1")),
+    ".jxl": (0, (b"\xff\x0a", b"\x00\x00\x00\x0cJXL ")),
+    ".npz or another zip archive": (0, (b"PK\x03\x04",)),
+    ".npy": (0, (b"\x93NUMPY",)),
+}
+"""Offset and first bytes of what users take for images that can be read."""
 
-_FORMATS = "a JPEG, PNG, WebP, BMP or TIFF image"
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_AVIF = (b"ftypavif", b"ftypavis")
+_TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # Any marker except the stuffed byte FF00, the restarts FFD0..FFD7 and the fill FFFF.
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -54,6 +69,7 @@ def read_image(
     size: tuple[int, int] | None = None,
     *,
     enough: tuple[int, int] | None = None,
+    bit_depth: BitDepth = "high-byte",
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image file as 8-bit RGB, upright.
 
@@ -61,12 +77,13 @@ def read_image(
     is at least twice `enough`. Decoding is faster. After resizing, the image differs by one or two
     levels of 256 (root mean square) from one decoded at full size.
 
-    - The EXIF orientation is applied.
-    - 16 bits become 8 by dropping the low byte (v >> 8), as OpenCV does.
+    - JPEG, PNG, WebP, BMP, TIFF, GIF, AVIF, JPEG 2000 and PPM, PGM, PBM are read.
+    - The EXIF orientation is applied, and an AVIF's rotation.
+    - 16 bits become 8 by dropping the low byte (v >> 8), unless `bit_depth` says otherwise.
     - Grey is repeated over the channels, a palette is looked up, CMYK is converted (for JPEG in
       Adobe's inverted convention, as Pillow has it).
-    - Alpha is dropped, as by Pillow's convert("RGB"): the hidden colours show. TIFF is the
-      exception, where transparency shows black (libtiff composites).
+    - Alpha is dropped, as by Pillow's convert("RGB"): the hidden colours show. TIFF and GIF are the
+      exceptions: transparency shows black (libtiff composites), or the GIF's background.
     - The first page or frame of several is taken.
 
     Args:
@@ -74,14 +91,15 @@ def read_image(
         size: height and width in pixels to resize to, by the default of `resize_image`; None keeps
             the file's. Where a model has another way, `prepare_image` follows it.
         enough: height and width in pixels that the image will be resized to; None for full size.
+        bit_depth: how more than 8 bits become 8; see `PreprocessingConfig`.
 
     Returns:
         The image, in red, green and blue.
 
     Raises:
         InputError: the file is missing, a folder, empty, cut short, larger than 2**28 pixels
-            (`opencv.MAX_PIXELS`), or no image of the formats above; never half a picture. Or a
-            `size` without a pixel.
+            (`opencv.MAX_PIXELS`), or no image of the formats above; never half a picture. Floats or
+            signed integers without "contrast-stretch". Or a `size` without a pixel.
 
     Example:
         >>> read_image(pictures / "0.png").shape
@@ -89,17 +107,23 @@ def read_image(
         >>> read_image(pictures / "0.png", (224, 224)).shape
         (224, 224, 3)
     """
-    if frame_time(path) is None:
-        image = decode_image(read_bytes(path, "an image file"), path, enough=enough)
-    else:
-        image = read_frame(path)
+    image = as_rgb(read_pixels(path, enough=enough), bit_depth, os.fspath(path))
     return image if size is None else resize_image(image, size)
+
+
+def read_pixels(
+    path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Read an image file as `read_image` does, in the file's own depth; see `decode_image`."""
+    if frame_time(path) is not None:
+        return read_frame(path)
+    return decode_image(read_bytes(path, "an image file"), path, enough=enough)
 
 
 def decode_image(
     data: bytes, path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode the bytes of an image file as `read_image` does.
+) -> np.ndarray:
+    """Decode the bytes of an image file, in the file's own depth.
 
     Args:
         data: all bytes of the file.
@@ -107,7 +131,8 @@ def decode_image(
         enough: as of `read_image`.
 
     Returns:
-        The image, in red, green and blue.
+        The image, upright: red, green and blue, or grey (height, width). PNG, TIFF and PNM of more
+        than 8 bits keep them; `prepare_image` makes 8 of them, as the model's configuration says.
 
     Raises:
         InputError: as `read_image`.
@@ -127,8 +152,7 @@ def decode_image(
         _check_png_size(data, path)
     try:
         with QUIET:
-            flags = cv2.IMREAD_COLOR_RGB | _reduction(data, enough)
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+            image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
     except cv2.error as error:
         reason = " ".join(error.err.split())
         if "MAX_IMAGE_PIXELS" in reason:
@@ -138,8 +162,31 @@ def decode_image(
             )
         raise InputError(f"{path}: OpenCV cannot decode this image: {reason}") from error
     if image is None:
-        raise InputError(f"{path}: found {len(data)} bytes that do not decode, expected {_FORMATS}")
-    return image
+        foreign = (
+            f"a file of the format {name}, which is not read"
+            for name, (start, marks) in _FOREIGN.items()
+            if data.startswith(marks, start)
+        )
+        found = next(foreign, f"{len(data)} bytes that do not decode")
+        raise InputError(f"{path}: found {found}, expected {_FORMATS}")
+    return _turned(image, data) if data[4:12] in _AVIF else image
+
+
+def _decoded(data: np.ndarray, start: bytes, reduction: int) -> np.ndarray | None:
+    """Decode with the flags under which OpenCV reads a format right; None where it cannot."""
+    is_tiff, is_avif = start[:4] in _TIFF_SIGNATURES, start[4:] in _AVIF
+    # Asked for RGB, OpenCV 5.0 confuses red and blue in a TIFF of 16 bits and an AVIF with alpha.
+    is_bgr = is_tiff or is_avif
+    flags = (cv2.IMREAD_COLOR if is_bgr else cv2.IMREAD_COLOR_RGB) | reduction
+    # Of AVIF and JPEG 2000 OpenCV makes 8 bits itself, because theirs may be 10 or 12.
+    if is_tiff or start.startswith((_PNG_SIGNATURE, b"P")):
+        flags |= cv2.IMREAD_ANYDEPTH
+    image = cv2.imdecode(data, flags)
+    if image is None and is_tiff:  # floats, and integers of 32 bits
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim == 2 or not is_bgr:
+        return image
+    return np.ascontiguousarray(image[..., 2::-1])
 
 
 def _jpeg_is_whole(data: bytes) -> bool:
@@ -207,11 +254,35 @@ def _crc(data: bytes) -> bytes:
     return zlib.crc32(data).to_bytes(4, "big")
 
 
+def _turned(image: np.ndarray, data: bytes) -> np.ndarray:
+    """Rotate and mirror an AVIF as its properties irot and imir say (ISO/IEC 23008-12, 6.5)."""
+    for kind, payload in _boxes(data, b"ipco"):
+        if kind == b"irot":
+            image = np.rot90(image, payload[0] & 3)
+        elif kind == b"imir":
+            image = image[:, ::-1] if payload[0] & 1 else image[::-1]
+    return np.ascontiguousarray(image)
+
+
+def _boxes(data: bytes, holder: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the type and the content of the boxes in the first box of the type `holder`."""
+    place = data.find(holder)
+    end = place - 4 + int.from_bytes(data[place - 4 : place], "big")
+    at = place + 4
+    while place > 0 and at + 8 < end:
+        size = int.from_bytes(data[at : at + 4], "big")
+        if size < 8:  # to the end of the file, or of 64 bits: no property is
+            return
+        yield data[at + 4 : at + 8], data[at + 8 : at + size]
+        at += size
+
+
 def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
     """Find the images under `folder`, in the order of their posix paths relative to it.
 
-    The search is recursive and follows links to folders. Suffixes may have any case. Hidden files
-    and folders (a name that starts with a dot) are left out.
+    The search is recursive and follows links to folders. Files are taken by `IMAGE_SUFFIXES`, in
+    any case. Hidden files and folders (a name that starts with a dot) are left out; a note counts
+    the other files.
 
     Raises:
         InputError: the folder is missing, is a file, or holds no image.
@@ -222,7 +293,7 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing"
         raise InputError(f"{folder}: found {kind}, expected a folder of images")
-    images, others = [], []
+    found = []
     # Real paths from the top to each folder: a link to one of them would make the walk endless.
     above = {folder: frozenset({real_path(folder)})}
     for parent, folders, files in os.walk(folder, followlinks=True):
@@ -235,21 +306,66 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
                 above[here / name] = above[here] | {real}
                 inside.append(name)
         folders[:] = inside
-        for name in files:
-            if name.lower().endswith(IMAGE_SUFFIXES) and not name.startswith("."):
-                images.append(here / name)
-            elif name.lower().endswith(_OTHER_SUFFIXES) and not name.startswith("."):
-                others.append(here / name)
-    if others:
-        tell(
-            f"{folder}: left out {len(others)} images of types that are not read, as "
-            f"{min(others).name!r}, expected files that end in {' '.join(IMAGE_SUFFIXES)}"
-        )
-    if not images:
-        raise InputError(
-            f"{folder}: found no image, expected files that end in {' '.join(IMAGE_SUFFIXES)}"
-        )
+        found += [here / name for name in files if not name.startswith(".")]
+    images = only_images(found, folder)
     return sorted(images, key=lambda image: image.relative_to(folder).as_posix())
+
+
+def is_image(path: str | os.PathLike[str]) -> bool:
+    """Return whether a name ends as that of an image that is read."""
+    return os.fspath(path).lower().endswith(IMAGE_SUFFIXES)
+
+
+_NO_IMAGES = (".csv", ".db", ".ini")
+"""Suffixes that no note counts: tables of positions, and what Windows leaves in folders."""
+
+
+_KINDS = 4
+"""Number of suffixes that a note names."""
+
+
+def only_images(
+    files: Sequence[pathlib.Path], source: object, *, videos: bool = False
+) -> list[pathlib.Path]:
+    """Return the images among files, and count the others in a note.
+
+    A file that is named as an image, such as its sidecar 1.json or 1.jpg.xmp of 1.jpg, is not
+    counted.
+
+    Args:
+        files: what was found.
+        source: what the message begins with, such as their folder.
+        videos: whether videos are wanted too.
+
+    Raises:
+        InputError: no image is among them.
+    """
+    images, others = [], []
+    for file in files:
+        (images if is_image(file) or (videos and is_video(file)) else others).append(file)
+    # The names of the images, with and without their suffixes.
+    known = {name for image in images for name in (image, image.with_suffix(""))} if others else ()
+    kinds = collections.Counter(
+        file.suffix.lower() or "without a suffix"
+        for file in others
+        if file.suffix.lower() not in _NO_IMAGES
+        and file not in known
+        and file.with_suffix("") not in known
+    )
+    # In the order of the counts, then of the names: that of a folder is any.
+    first = sorted(kinds.items(), key=lambda kind: (-kind[1], kind[0]))[:_KINDS]
+    words = ", ".join(f"{count:,} {kind}" for kind, count in first)
+    if rest := kinds.total() - sum(count for _, count in first):
+        words += f", {rest:,} more"
+    if not images:
+        among = f" among {counted(kinds.total(), 'file')} ({words})" if kinds else ""
+        raise InputError(
+            f"{source}: found no image{among}, expected files that end in "
+            f"{' '.join(IMAGE_SUFFIXES)}"
+        )
+    if kinds:
+        tell(f"{source}: skipped {counted(kinds.total(), 'other file')}: {words}")
+    return images
 
 
 def names_in(folder: pathlib.PurePath, images: Sequence[pathlib.PurePath]) -> list[str]:

@@ -14,17 +14,14 @@ import numpy as np
 
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import Size
-from crisalad_jax.data.images import IMAGE_SUFFIXES, read_image
+from crisalad_jax.data.images import SELF_CHECKED, is_image, read_pixels
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
-from crisalad_jax.utils.shapes import UInt8
 
 _POLL = 0.05
 """Seconds between two looks into a folder, and four times what a look takes if that is longer."""
-_SELF_TOLD = (".jpg", ".jpeg", ".png")
-"""Suffixes of formats that tell by themselves whether a file is whole."""
 _SETTLED = 1.0
 """Seconds for which a file of another format stays as it is before it counts as whole."""
 _PATIENCE = 5.0
@@ -41,8 +38,8 @@ class Frame(NamedTuple):
     """The file's path in its folder, or the camera, or a video's name, and the time."""
     time: float
     """Seconds: into a video; else since 1970, of the file's last change or the camera's frame."""
-    image: UInt8[np.ndarray, "h w 3"]
-    """8-bit RGB, upright."""
+    image: np.ndarray
+    """RGB or grey, upright, in the depth of the file; a camera's of 8 bits."""
     taken: float
     """`time.perf_counter()` when it was in hand: a whole file, or a frame from the camera."""
 
@@ -94,7 +91,7 @@ class FolderWatch:
         for parent, folders, files in os.walk(self._folder):
             folders[:] = [name for name in folders if not name.startswith(".")]
             for name in files:
-                if name.lower().endswith(IMAGE_SUFFIXES) and not name.startswith("."):
+                if is_image(name) and not name.startswith("."):
                     yield pathlib.Path(parent, name)
 
     def frames(self, check: Callable[[], None] = _go_on) -> Iterator[Frame]:
@@ -119,7 +116,7 @@ class FolderWatch:
                 check()
                 taken = time.perf_counter()
                 try:
-                    image = read_image(path)
+                    image = read_pixels(path)
                 except InputError as error:
                     if waiting[path].still_for() > _PATIENCE:
                         self._done.add(path)
@@ -149,7 +146,7 @@ class _Arriving:
         """Return whether to read the file, which has this size and time of change now."""
         if state != self._state:
             self._state, self._since, self._tried = state, time.monotonic(), False
-        waits = 0.0 if path.suffix.lower() in _SELF_TOLD else _SETTLED
+        waits = 0.0 if path.suffix.lower() in SELF_CHECKED else _SETTLED
         # What was unreadable is read again when it has changed, and for the last time at the end.
         if (self._tried and self.still_for() <= _PATIENCE) or self.still_for() < waits:
             return False

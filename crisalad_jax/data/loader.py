@@ -8,14 +8,14 @@ import os
 import pathlib
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from crisalad_jax.config.checks import takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
-from crisalad_jax.data.images import read_image
+from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.data.prepare import Preparation
@@ -29,7 +29,6 @@ from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
 if TYPE_CHECKING:  # who only reads images starts sooner without them
     from crisalad_jax.data.augmentations import Augmentation
 
-OnBadImage = Literal["skip", "stop"]
 BATCHES_AHEAD = 2
 _IMAGES_PER_TASK = 8
 """Largest number of images that a thread reads per task, because every task has an overhead."""
@@ -105,11 +104,8 @@ def _read(
     *,
     quickly: bool = False,
 ) -> Pixels:
-    image = read_image(path, enough=how.image_size if quickly else None)
-    try:
-        return how.prepare(image, check)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    image = read_pixels(path, enough=how.image_size if quickly else None)
+    return how.prepare(image, check, os.fspath(path))
 
 
 @takes(places=Places)

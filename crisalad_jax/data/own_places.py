@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, has_sides, has_split, listing
-from crisalad_jax.data.images import list_images
+from crisalad_jax.data.images import OnBadImage, list_images
 from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.data.video import is_video
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.shapes import Float64
 
 TABLE = "places.csv"
@@ -33,8 +34,10 @@ class OwnPlaces(NamedTuple):
     """Place -> places too near to be in a batch with it; None where any two may be."""
 
 
-def read_own_places(root: pathlib.Path) -> OwnPlaces:
+def read_own_places(root: pathlib.Path, on_bad_image: OnBadImage) -> OwnPlaces:
     """Read a table, a folder with a table in it, or a folder with one folder a place.
+
+    Under "skip" a note counts the images of the table that are missing, and they are left out.
 
     Raises:
         InputError: it is none of these, or what is there does not fit.
@@ -42,9 +45,9 @@ def read_own_places(root: pathlib.Path) -> OwnPlaces:
     if is_video(root):
         raise InputError(f"{root}: found a video, expected places: {_GROUPED}")
     if root.is_file():
-        return _read_table(root)
+        return _read_table(root, on_bad_image)
     if (root / TABLE).is_file():
-        return _read_table(root / TABLE)
+        return _read_table(root / TABLE, on_bad_image)
     return _read_folders(root)
 
 
@@ -78,7 +81,7 @@ def _read_folders(root: pathlib.Path) -> OwnPlaces:
     return OwnPlaces(root, images, None)
 
 
-def _read_table(table: pathlib.Path) -> OwnPlaces:
+def _read_table(table: pathlib.Path, on_bad_image: OnBadImage) -> OwnPlaces:
     rows: list[tuple[str, str, tuple[float, float, float] | None]] = []
     for row in named_rows(table, lambda header: _check_header(table, header)):
         place = row.fields["place"]
@@ -89,13 +92,22 @@ def _read_table(table: pathlib.Path) -> OwnPlaces:
         raise InputError(f"{table}: found no row below the header, expected {_COLUMNS}")
     places: dict[str, list[str]] = {}
     views: dict[str, tuple[float, float, float]] = {}
-    paths = find_images(table, table.parent, [name for name, _, _ in rows])
+    names = [name for name, _, _ in rows]
+    paths = find_images(table, table.parent, names, on_bad_image=on_bad_image)
     depth = len(table.parent.parts)
+    missing = 0
     for path, (name, place, view) in zip(paths, rows, strict=True):
+        if on_bad_image == "skip" and not path.is_file():
+            missing += 1
+            continue
         file = "/".join(path.parts[depth:]) if path.is_relative_to(table.parent) else name
         places.setdefault(place, []).append(file)
         if view is not None:
             views[file] = view
+    if not places:
+        raise InputError(f"{table}: found none of {missing} images, expected some")
+    if missing:
+        tell(f"{table}: left out {missing} of {len(rows)} images, which are missing")
     return OwnPlaces(table.parent, places, views or None)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.grouped_places import places_by_order, places_by_position
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.names import Disk, plain
 from crisalad_jax.data.own_places import OwnPlaces, read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
@@ -88,8 +89,9 @@ def read_places(
     place_frames: int | None = None,
     positions: str | os.PathLike[str] | None = None,
     fps: float | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> Places:
-    """Read a folder in the layout of GSV-Cities or of one's own; every image named must exist.
+    """Read a folder in the layout of GSV-Cities or of one's own.
 
     Or make places of any source of images, by their positions or their order. Then places that are
     too near to tell apart, `Places.near`, never meet in a batch.
@@ -115,6 +117,7 @@ def read_places(
         positions: table of positions (`read_positions`) for `place_radius`. None is what the source
             says, if that is a table, else what @UTM names say, else the EXIF data of JPEGs.
         fps: frames a second taken of videos; None is one.
+        on_bad_image: "stop" where an image that a table names is missing, or "skip" it.
 
     Returns:
         The places, with their images' files.
@@ -145,12 +148,12 @@ def read_places(
                 "layout of GSV-Cities"
             )
         if place_radius is not None:
-            found = places_by_position(root, place_radius, positions, fps)
+            found = places_by_position(root, place_radius, positions, fps, on_bad_image)
             return _own_places(root, found, min_images, f" within {place_radius:g} m")
         if place_frames is not None:
-            found = places_by_order(root, place_frames, fps)
+            found = places_by_order(root, place_frames, fps, on_bad_image)
             return _own_places(root, found, min_images, f" of every {place_frames}")
-        return _own_places(root, read_own_places(root), min_images)
+        return _own_places(root, read_own_places(root, on_bad_image), min_images)
     tables = _find_tables(root, cities)
     listings: _Listings = {}
     files: list[str] = []
@@ -159,7 +162,7 @@ def read_places(
     place_id: list[int] = []
     largest = 0
     for position, table in enumerate(tables):
-        for raw_id, images in _read_city(root, table, listings):
+        for raw_id, images in _read_city(root, table, listings, on_bad_image):
             largest = max(largest, len(images))
             if len(images) >= min_images:
                 files.extend(images)
@@ -238,12 +241,13 @@ def _find_tables(root: pathlib.Path, cities: Sequence[str] | None) -> list[pathl
 
 
 def _read_city(
-    root: pathlib.Path, table: pathlib.Path, listings: _Listings
+    root: pathlib.Path, table: pathlib.Path, listings: _Listings, on_bad_image: OnBadImage
 ) -> list[tuple[int, list[str]]]:
     """Read one city's places, ascending by id, with the images of each."""
     # The inner dict serves as an ordered set.
     places: dict[int, dict[str, None]] = {}
     name = table.stem
+    missing = 0
     for line, row in _read_rows(table):
         _, _, _, _, city_id, latitude, longitude, panorama = row
         try:
@@ -259,9 +263,14 @@ def _read_city(
             f"_{latitude}_{longitude}_{panorama}"
         )
         image = _find_image(root, (city_id, name), stem, listings)
+        if image is None and on_bad_image == "skip":
+            missing += 1
+            continue
         if image is None:
             raise _no_image(root, table, line, (city_id, name), stem)
         places.setdefault(place, {})[image] = None
+    if missing:
+        tell(f"{table}: left out {missing} rows, whose images are missing")
     ids = {place % IDS_PER_CITY: place for place in places}
     if len(ids) < len(places):
         first = next(place for place in places if ids[place % IDS_PER_CITY] != place)

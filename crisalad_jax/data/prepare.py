@@ -6,7 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
-from crisalad_jax.data.resize import Pixels, check_pixels, resize_image
+from crisalad_jax.data.depth import as_rgb
+from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float32
 
@@ -37,12 +38,18 @@ class Preparation:
         first = self.preprocessing.target_size(size, self.image_size)
         return self.preprocessing.rounded_size(first, self.side_multiple)
 
-    def prepare(self, image: Pixels, check: Callable[[Size], None] | None = None) -> Pixels:
+    def prepare(
+        self,
+        image: np.ndarray,
+        check: Callable[[Size], None] | None = None,
+        name: str | None = None,
+    ) -> Pixels:
         """Resize an image, and normalise floats.
 
         Args:
-            image: 8-bit RGB.
+            image: RGB or grey, as `as_rgb` takes it.
             check: raises InputError for a size that the model cannot describe, before any work.
+            name: the image's, for messages.
 
         Returns:
             8-bit pixels, or normalised float32.
@@ -50,13 +57,16 @@ class Preparation:
         Raises:
             InputError: the image is no array of pixels, or what `check` raises.
         """
-        check_pixels(image)
         how = self.preprocessing
+        image = as_rgb(image, how.bit_depth, name or "image")
         height, width = image.shape[:2]
         first = how.target_size((height, width), self.image_size)
         last = how.rounded_size(first, self.side_multiple)
         if check is not None:
-            check(last)
+            try:
+                check(last)
+            except InputError as error:
+                raise InputError(f"{name}: {error}" if name else str(error)) from error
         if how.size_rule == "fixed" or first != (height, width):
             image = resize_image(
                 image, first, filter=how.filter, antialias=how.antialias, pixels=how.pixels

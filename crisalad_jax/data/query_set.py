@@ -12,6 +12,7 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import has_split
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Int64
 
@@ -45,6 +46,7 @@ def read_query_set(
     positive_radius: float = 10.0,
     negative_radius: float = 25.0,
     images: str | os.PathLike[str] | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> QuerySet:
     r"""Read the training split of a set that `open_benchmark` reads, such as pitts30k_train.mat.
 
@@ -53,6 +55,7 @@ def read_query_set(
         positive_radius: in metres, inclusive.
         negative_radius: in metres; database images within it are no negatives.
         images: the folder of the images that a file names.
+        on_bad_image: as of `open_benchmark`.
 
     Returns:
         The queries with at least one positive.
@@ -76,11 +79,15 @@ def read_query_set(
     check_radius(negative_radius)
     if root.is_dir() and is_msls(root):
         # Images of different cities match in no radius, whatever their positions.
-        benchmark = open_benchmark(root, split, negative_radius, images=images)
+        benchmark = open_benchmark(
+            root, split, negative_radius, images=images, on_bad_image=on_bad_image
+        )
         near = benchmark.ground_truth()
-        positives = read_msls(root, split, positive_radius).ground_truth()
+        positives = read_msls(
+            root, split, positive_radius, on_bad_image=on_bad_image
+        ).ground_truth()
     else:
-        benchmark = open_benchmark(root, split, images=images)
+        benchmark = open_benchmark(root, split, images=images, on_bad_image=on_bad_image)
         positives, near = _matches(benchmark, positive_radius, negative_radius)
     kept = [query for query, matches in enumerate(positives) if matches.size]
     if not kept:

@@ -8,7 +8,13 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from crisalad_jax.config.concise import brief
-from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, names_in
+from crisalad_jax.data.images import (
+    OnBadImage,
+    is_image,
+    list_images,
+    names_in,
+    only_images,
+)
 from crisalad_jax.data.names import Disk
 from crisalad_jax.data.positions import Positions, read_image_table
 from crisalad_jax.data.video import (
@@ -30,6 +36,7 @@ _FORMS = (
 )
 _PATTERN = re.compile(r"[*?\[]")
 _AN_IMAGE = "an image file"
+_ARRAYS = (".npy", ".npz")
 
 
 @brief
@@ -46,7 +53,12 @@ class ImageSource(NamedTuple):
     """What the columns of a table say; None without such columns."""
 
 
-def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> ImageSource:
+def open_source(
+    images: str | os.PathLike[str],
+    *,
+    fps: float | None = None,
+    on_bad_image: OnBadImage = "stop",
+) -> ImageSource:
     """List the images of a source.
 
     Args:
@@ -54,6 +66,8 @@ def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> 
             any folders; a list, .txt, of a path a line; or a table, .csv, with a column `name`
             (see `read_image_table`). Paths in lists and tables are relative to their folder.
         fps: frames a second taken of videos; None is one, and a note says so.
+        on_bad_image: "skip" lists a missing file like the others, and whoever reads it leaves it
+            out; "stop" refuses it.
 
     Returns:
         The images. Names are relative to the folder; to that of the file; to the part of a pattern
@@ -64,7 +78,7 @@ def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> 
         InputError: no such source, no image in it, a path twice, or a file that is missing or that
             no line of text can name.
     """
-    frames = _Frames(1.0 if fps is None else fps)
+    frames = _Frames(1.0 if fps is None else fps, on_bad_image)
     source = _opened(images, frames)
     if fps is None and frames.taken < frames.there:
         tell(f"{images}: {frames.taken} of {frames.there} frames, 1 per second: --fps")
@@ -74,15 +88,22 @@ def open_source(images: str | os.PathLike[str], *, fps: float | None = None) -> 
 class _Frames:
     """Put a video's frames in its place, and count them."""
 
-    def __init__(self, fps: float) -> None:
+    def __init__(self, fps: float, on_bad_image: OnBadImage) -> None:
         check_rate(fps)
         self.fps, self.taken, self.there = fps, 0, 0
+        self._skips = on_bad_image == "skip"
 
     def of(self, paths: Sequence[pathlib.Path]) -> list[pathlib.Path]:
-        """List images, of a video its frames; single frames are named by their own times."""
+        """List images, of a video its frames; single frames are named by their own times.
+
+        What is missing stays as it is under "skip", to be skipped by who reads it.
+        """
         return [each for path in paths for each in self._of_one(path)]
 
     def _of_one(self, path: pathlib.Path) -> list[pathlib.Path]:
+        if self._skips and not file_of(path).is_file():
+            return [path]
+        check_source(file_of(path), _AN_IMAGE)
         if not is_video(path):
             return [name_frame(path)]
         chosen = list_frames(path, self.fps)
@@ -101,7 +122,7 @@ def _opened(images: str | os.PathLike[str], frames: _Frames) -> ImageSource:
         if _PATTERN.search(str(path)):
             root, found = _matching(path)
             return _source(root, frames.of(found), path)
-        if path.suffix.lower() not in IMAGE_SUFFIXES:
+        if not is_image(path):
             raise InputError(f"{path}: found nothing, expected {_FORMS}")
     suffix = path.suffix.lower()
     if suffix == ".txt":
@@ -110,7 +131,10 @@ def _opened(images: str | os.PathLike[str], frames: _Frames) -> ImageSource:
     if suffix == ".csv":
         table = read_image_table(path)
         return _listed(path, table.rows, table.positions, frames)
-    check_source(file_of(path), _AN_IMAGE)
+    if suffix in _ARRAYS:
+        raise InputError(
+            f"{path}: found arrays of NumPy, expected {_FORMS}; `describe_images` takes arrays"
+        )
     return _source(path.parent, frames.of([path]), path)
 
 
@@ -151,17 +175,8 @@ def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:
     first = next(number for number, part in enumerate(parts) if _PATTERN.search(part))
     root = pathlib.Path(*parts[:first])
     matches = [pathlib.Path(match) for match in glob.glob(str(pattern), recursive=True)]
-    found = [
-        match
-        for match in matches
-        if (match.name.lower().endswith(IMAGE_SUFFIXES) or is_video(match)) and match.is_file()
-    ]
-    if not found:
-        among = f"none of {len(matches)} files" if matches else "no file"
-        raise InputError(
-            f"{pattern}: found {among} that is an image, expected some that end in "
-            f"{' '.join(IMAGE_SUFFIXES)}"
-        )
+    files = [match for match in matches if match.is_file()]
+    found = only_images(files, pattern, videos=True)
     return root, sorted(found, key=lambda match: match.relative_to(root).as_posix())
 
 
@@ -185,8 +200,9 @@ def _listed(
         path = pathlib.Path(os.path.normpath(f"{path}{text[len(file) :]}"))
         where = f"{source}: line {number}"
         try:
-            check_source(file_of(path), _AN_IMAGE)
-            path = name_frame(path)
+            listed = frames.of([path])
+            if not is_video(path):
+                (path,) = listed  # a frame of a video by its own name
             if path in lines:
                 raise InputError(
                     f"found {line!r}, which is on line {lines[path]} too, expected it once"
@@ -197,7 +213,7 @@ def _listed(
                     f"{path}: found a video, expected {_AN_IMAGE}, or a frame such as "
                     f"{path.name}#t=12.500"
                 )
-            paths += frames.of([path])
+            paths += listed
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
     if not paths:

@@ -104,10 +104,14 @@ def train(
             backbone=backbone,
             quiet=quiet or not distributed.is_primary(),
         )
-        places = _read_set(config, data, images, grouping)
+        places = _read_set(config, data, images, grouping, on_bad_image)
         if validation is None:
             return initial, places, None
-        return initial, places, open_benchmark(validation, images=validation_images)
+        return (
+            initial,
+            places,
+            open_benchmark(validation, images=validation_images, on_bad_image=on_bad_image),
+        )
 
     initial, places, benchmark = distributed.raise_together(read)
     if (weights, backbone) == (None, None) and config.trainable != "all":
@@ -147,7 +151,11 @@ def train(
 
 
 def _read_set(
-    config: TrainConfig, data: Path, images: Path | None, grouping: Mapping[str, Any]
+    config: TrainConfig,
+    data: Path,
+    images: Path | None,
+    grouping: Mapping[str, Any],
+    on_bad_image: OnBadImage,
 ) -> Places | QuerySet:
     """Read the training set: places, or queries of which tuples are mined."""
     mining = config.mining
@@ -155,7 +163,11 @@ def _read_set(
         if images is not None:
             raise InputError("--data-images: found for places, expected it for queries alone")
         return read_places(
-            data, cities=config.cities, min_images=config.min_images_of_place, **grouping
+            data,
+            cities=config.cities,
+            min_images=config.min_images_of_place,
+            on_bad_image=on_bad_image,
+            **grouping,
         )
     for name, value in grouping.items():
         if value is not None:
@@ -176,4 +188,5 @@ def _read_set(
         positive_radius=mining.positive_radius,
         negative_radius=mining.negative_radius,
         images=images,
+        on_bad_image=on_bad_image,
     )

@@ -107,7 +107,7 @@ def describe_files(
 def describe_images(
     params: Model,
     config: ModelConfig,
-    images: Sequence[Pixels],
+    images: Sequence[np.ndarray],
     *,
     batch_size: int = 16,
 ) -> Float32[np.ndarray, "image descriptor"]:
@@ -119,15 +119,16 @@ def describe_images(
     Args:
         params: the model's parameters.
         config: the model; pictures are resized as it says.
-        images: 8-bit RGB, of any sizes, as `read_image` returns them.
+        images: 8-bit RGB, of any sizes, as `read_image` returns them, or grey; see
+            `prepare_image`.
         batch_size: largest number of images described together.
 
     Returns:
         A descriptor of each picture, in order.
 
     Raises:
-        InputError: no pictures; one that is not 8-bit RGB or that the model cannot describe; a
-            batch of none.
+        InputError: no pictures; one that `prepare_image` does not take or that the model cannot
+            describe; a batch of none.
 
     Example:
         >>> import jax, numpy as np
@@ -138,9 +139,9 @@ def describe_images(
         (1, 576)
     """
     check_grouping((), batch_size, seed=0)
-    if isinstance(images, np.ndarray) and images.ndim == 3:
+    if isinstance(images, np.ndarray) and images.ndim in (2, 3):
         raise InputError(
-            f"images: found one picture of shape {images.shape}, expected a list of pictures"
+            f"images: found one array of shape {images.shape}, expected a list of pictures"
         )
     if not len(images):
         raise InputError("images: found none, expected at least one picture")

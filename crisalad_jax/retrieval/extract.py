@@ -122,7 +122,7 @@ def extract(
         share=share,
     )
     components = _components(pca, config, weights, unit=pairs is not None, verify=verify)
-    paths, names = _listed(images, root, fps)
+    paths, names = _listed(images, root, fps, on_bad_image)
     check_rate_used(fps, paths)
     length = config.descriptor_dim if components is None else len(components.components)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
@@ -276,11 +276,14 @@ def _source(images: StrPath | Sequence[StrPath]) -> str:
 
 
 def _listed(
-    images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float | None
+    images: StrPath | Sequence[StrPath],
+    root: StrPath | None,
+    fps: float | None,
+    on_bad_image: OnBadImage,
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
     if isinstance(images, str | os.PathLike):
-        source = open_source(images, fps=fps)
+        source = open_source(images, fps=fps, on_bad_image=on_bad_image)
         inside = _inside(source.root, root) if root is not None else pathlib.PurePath()
         return source.paths, [(inside / name).as_posix() for name in source.names]
     paths = [name_frame(pathlib.Path(path)) for path in images]

@@ -3,6 +3,8 @@
 import os
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from crisalad_jax.config.checks import takes
 from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage, image_batches
 from crisalad_jax.data.prepare import Preparation
@@ -11,18 +13,20 @@ from crisalad_jax.nn.config import ModelConfig
 
 
 @takes(config=ModelConfig)
-def prepare_image(image: Pixels, config: ModelConfig) -> Pixels:
+def prepare_image(image: np.ndarray, config: ModelConfig, name: str | None = None) -> Pixels:
     """Resize a photograph as a model's configuration says; floats are normalised, too.
 
     Args:
-        image: 8-bit RGB, of `read_image`.
+        image: 8-bit RGB, of `read_image`; or grey (height, width) or (height, width, 1), which is
+            repeated over the channels; or uint16, of which the configuration makes 8 bits.
         config: the model.
+        name: the image's, for messages.
 
     Returns:
         What `describe` takes, in a batch: 8-bit pixels, or normalised float32.
 
     Raises:
-        InputError: the image is not 8-bit RGB, or the model cannot describe one of its size.
+        InputError: the image is no such array, or the model cannot describe one of its size.
 
     Example:
         >>> import numpy as np
@@ -31,7 +35,7 @@ def prepare_image(image: Pixels, config: ModelConfig) -> Pixels:
         (224, 224, 3)
     """
     how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
-    return how.prepare(image, config.check_image_size)
+    return how.prepare(image, config.check_image_size, name)
 
 
 def photograph_batches(

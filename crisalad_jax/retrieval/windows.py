@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.resize import Pixels
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.retrieval.alone import describe_alone, describe_images
@@ -126,8 +125,8 @@ class FrameDescriber:
         self._cast = cast_params(params, config)
         self._tokens: collections.deque[Tokens] = collections.deque(maxlen=window)
 
-    def __call__(self, image: Pixels) -> Float32[np.ndarray, "1 d"]:
-        """Describe the next picture: 8-bit RGB, of any size.
+    def __call__(self, image: np.ndarray) -> Float32[np.ndarray, "1 d"]:
+        """Describe the next picture: 8-bit RGB or grey, of any size.
 
         Raises:
             InputError: what `prepare_image` raises.

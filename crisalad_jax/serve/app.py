@@ -20,6 +20,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from crisalad_jax.data.images import IMAGE_SUFFIXES
 from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, utm_positions
 from crisalad_jax.serve.access import Access, RefusedError
 from crisalad_jax.serve.service import MapService
@@ -120,7 +121,8 @@ _PICTURE = {"type": "string", "format": "binary"}
 _BODY = {
     "requestBody": {
         "required": True,
-        "description": "The bytes of a JPEG, PNG, WebP, BMP or TIFF file, or a form with `image`.",
+        "description": f"The bytes of an image file ({' '.join(IMAGE_SUFFIXES)}), or a form with "
+        "`image`.",
         "content": {
             "image/*": {"schema": _PICTURE},
             "multipart/form-data": {
@@ -190,6 +192,7 @@ def make_app(
     uploads = _Room(_UPLOADS * most_waiting)
     _handle_errors(app)
     page = importlib.resources.files("crisalad_jax.serve").joinpath("page.html").read_bytes()
+    page = page.replace(b"IMAGE_SUFFIXES", ",".join(IMAGE_SUFFIXES).encode())
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     async def show_page() -> Response:

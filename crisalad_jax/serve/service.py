@@ -165,11 +165,7 @@ class MapService:
     async def _prepared(self, data: bytes, name: str) -> Pixels:
         def prepare() -> Pixels:
             config = self._worker.places.description.config
-            picture = decode_image(data, name)
-            try:
-                return prepare_image(picture, config)
-            except InputError as error:
-                raise InputError(f"{name}: {error}") from error
+            return prepare_image(decode_image(data, name), config, name)
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, prepare)
 
@@ -188,7 +184,7 @@ class MapService:
         if path is None:
             raise InputError(f"{image.name}: found no such picture any more, see --map-images")
         try:
-            pixels = read_image(path, enough=(_SIDE, _SIDE))
+            pixels = read_image(path, enough=(_SIDE, _SIDE), bit_depth="contrast-stretch")
         except InputError as error:
             raise InputError(f"{image.name}: found a picture that cannot be read") from error
         return _as_jpeg(pixels)

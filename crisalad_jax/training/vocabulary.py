@@ -221,7 +221,11 @@ def build_vocabulary(
     """
     check_target(out, ".safetensors")
     one = isinstance(images, str | os.PathLike)
-    paths = open_source(images, fps=fps).paths if one else [pathlib.Path(each) for each in images]
+    paths = (
+        open_source(images, fps=fps, on_bad_image=on_bad_image).paths
+        if one
+        else [pathlib.Path(each) for each in images]
+    )
     check_rate_used(fps, paths)
     params = with_vocabulary(
         params,

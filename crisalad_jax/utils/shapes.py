@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from jaxtyping import Int32 as Int32
     from jaxtyping import Int64 as Int64
     from jaxtyping import UInt8 as UInt8
+    from jaxtyping import UInt16 as UInt16
 else:
 
     class _Shaped:
@@ -22,4 +23,4 @@ else:
             """Return the array's type, which is what `TYPE[array, shape]` is at run time."""
             return array_and_shape[0]
 
-    Bool = Float = Float32 = Float64 = Int = Int32 = Int64 = UInt8 = _Shaped
+    Bool = Float = Float32 = Float64 = Int = Int32 = Int64 = UInt8 = UInt16 = _Shaped

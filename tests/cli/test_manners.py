@@ -351,6 +351,28 @@ def test_an_evaluation_that_skips_is_that_of_the_readable_set(
     fails(capfd, *given, words=("found an image cut short",))
 
 
+def test_an_evaluation_that_skips_what_is_missing(capfd, tmp_path, shared, spoilt):
+    """SALAD's lists name two images that are not there: as the set without them, of two folders."""
+    town, whole = spoilt
+    sides = ("database", "queries")
+    images = {side: sorted((town / "images" / "test" / side).iterdir()) for side in sides}
+    for side, kind in zip(sides, ("dbImages", "qImages"), strict=True):
+        np.save(tmp_path / f"town_{kind}.npy", [str(p.relative_to(town)) for p in images[side]])
+    truth = np.empty(len(images["queries"]), object)
+    truth[:] = [np.array(each) for each in open_benchmark(town).ground_truth()]
+    np.save(tmp_path / "town_gt.npy", truth, allow_pickle=True)
+    given = ("evaluate", "--data", tmp_path, "--weights", shared / "weights.safetensors", "--quiet")
+    given += ("--batch-size", BATCH, "--images", whole)
+    fails(capfd, *given, words=("found 1 of 7 images missing",))
+    found, _ = printed(capfd, *given, "--on-bad-image", "skip", "--json", "-")
+    assert {side: len(names) for side, names in found["skipped"].items()} == {
+        "queries": 1,
+        "database": 1,
+    }
+    same, _ = printed(capfd, *given[:2], whole, *given[3:-2], "--json", "-")
+    assert found["results"][0]["recalls"] == same["results"][0]["recalls"]
+
+
 def test_a_comparison_that_skips(capfd, tmp_path, shared, params, spoilt):
     town, whole = spoilt
     given = ("compare", "--test", town, "--weights", f"own={shared / 'weights.safetensors'}")

@@ -454,7 +454,7 @@ def test_an_abandoned_iterator_stops_reading(places, monkeypatch):
             assert go_on.wait(timeout=30)
         return np.zeros((*SIZE, 3), np.uint8)
 
-    monkeypatch.setattr(loader, "read_image", slow_read)
+    monkeypatch.setattr(loader, "read_pixels", slow_read)
     before = set(threading.enumerate())
     paths = [f"{i}" for i in range(400)]
     batches = image_batches(paths, image_size=SIZE, batch_size=16, threads=1)

@@ -149,3 +149,16 @@ def test_what_is_no_layout(tmp_path, folders):
         read_places(tmp_path / "set")
     with pytest.raises(InputError, match=r"cities: found Paris for .*, expected none"):
         read_places(tmp_path / "set", cities=["Paris"])
+
+
+def test_missing_images_of_a_table_are_left_out_with_a_note(folders):
+    text = "name,place\nbridge/1.JPG,a\nbridge/3.jpg,a\nbridge/2.jpg,a\nnone.jpg,b\n"
+    table = _table(folders, text)
+    with pytest.raises(InputError, match="found 2 of 4 images missing"):
+        read_places(table, min_images=1)
+    with pytest.warns(Note, match=r"places.csv: left out 2 of 4 images, which are missing"):
+        places = read_places(table, min_images=1, on_bad_image="skip")
+    assert places.files == ("bridge/1.JPG", "bridge/2.jpg")
+    _table(folders, "name,place\nnone.jpg,b\n")
+    with pytest.raises(InputError, match="found none of 1 images, expected name,place"):
+        read_places(table, min_images=1, on_bad_image="skip")

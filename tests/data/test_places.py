@@ -11,6 +11,7 @@ import pytest
 
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
 REAL = Path(__file__).parents[2].parent / "shared" / "data"
@@ -155,6 +156,15 @@ def test_a_missing_image_is_named_with_its_line(two_cities):
     (two_cities / "Images/A/A_0000007_2013_08_356_48.850_-2.0e0_pano1.jpg").unlink()
     with pytest.raises(InputError, match=r"A\.csv: line 7: .*A_0000007_2013_08_356_48.850"):
         read_places(two_cities)
+
+
+def test_a_missing_image_is_left_out_with_a_note(two_cities):
+    (two_cities / "Images" / "A" / f"{image_name(make_rows('A', 7, 4)[2])}.jpg").unlink()
+    with pytest.warns(Note, match=r"A.csv: left out 1 rows, whose images are missing"):
+        places = read_places(two_cities, min_images=4, on_bad_image="skip")
+    # Place 7 of A has 3 now, too few.
+    assert places.place_id.tolist() == [0, 99, 100_007, 100_012]
+    assert places.image_counts.tolist() == [4, 4, 5, 5]
 
 
 def test_places_too_small(two_cities):

@@ -144,8 +144,8 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
             "none: found nothing, expected a folder of images, an image, a video, a p",
         ),
         ("none.jpg", None, "none.jpg: found no such file, expected an image file"),
-        ("*.gif", None, r"\*.gif: found no file that is an image, expected some that end in .jpg"),
-        ("run/*.md", None, "found none of 1 files that is an image"),
+        ("*.gif", None, r"\*.gif: found no image, expected files that end in .jpg"),
+        ("run/*.md", None, "found no image among 1 file"),
         ("a.txt", "\n\n", "a.txt: found no image, expected a path a line"),
         ("a.txt", "b.png\n", "a.txt: line 1: .*b.png: found no such file, expected an image file"),
         ("a.txt", "\n{run}/left/0.png\n{run}/right/../left/0.png", "line 3: .*on line 2 too, exp"),
@@ -159,6 +159,11 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
         ("a.csv", "name,lat,lon\n{run}/left/0.png,1,\n", "line 2: .*expected two finite numbers"),
         ("a.csv", "name,x,x,y\n", "found the column x twice, expected it once"),
         ("a.csv", "name,x,y\n{run}/walk.avi,1,2\n", "found a video, expected an image file, or a"),
+        (
+            "a.npz",
+            "text",
+            "a.npz: found arrays of NumPy, expected a folder of images, .*`descr",
+        ),
         ("a.mp4", "text", "a.mp4: found a file that does not decode, expected a video"),
         ("a.mp4#t=1.000", None, "a.mp4: found no such file"),
     ],
@@ -321,3 +326,21 @@ def test_no_exif_is_no_position(root, tmp_path):
     (tmp_path / "b.jpg").write_bytes(data[: place + 30] + b"\xff" * 60 + data[place + 90 :])
     assert exif_position(tmp_path / "b.jpg") is None
     assert cv2.imread(str(tmp_path / "b.jpg")) is not None
+
+
+def test_missing_files_are_listed_to_be_skipped(root, tmp_path):
+    """An image, a video and a frame of one that are not there, and a folder in place of a file."""
+    missing = ["gone.jpg", "gone.avi", "gone.avi#t=1.000", "run/left"]
+    there = root / "run" / "right" / "2.jpg"
+    lines = [*missing, str(there)]
+    (root / "some.txt").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"some.txt: line 1: .*gone.jpg: found no such file"):
+        open_source(root / "some.txt")
+    source = open_source(root / "some.txt", on_bad_image="skip")
+    assert source.names == [*missing, "run/right/2.jpg"]
+    (root / "some.csv").write_text("name,x,y\n" + "".join(f"{line},1,2\n" for line in missing[::2]))
+    source = open_source(root / "some.csv", on_bad_image="skip")
+    assert source.positions == (("x", "y"), dict.fromkeys(missing[::2], (1.0, 2.0)))
+    assert open_source(root / "gone.jpg", on_bad_image="skip").names == ["gone.jpg"]
+    batches = image_batches(source.paths, image_size=(9, 9), batch_size=2, on_bad_image="skip")
+    assert [batch.valid.tolist() for batch in batches] == [[False, False]]

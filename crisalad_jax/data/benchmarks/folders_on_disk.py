@@ -4,7 +4,7 @@ import os
 import pathlib
 from collections.abc import Iterable, Sequence
 
-from crisalad_jax.data.images import list_images
+from crisalad_jax.data.images import OnBadImage, list_images
 from crisalad_jax.data.names import Disk
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -89,16 +89,19 @@ def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str
 def find_image_root(
     named_by: pathlib.Path,
     images: str | os.PathLike[str] | None,
-    first: str,
+    names: Sequence[str],
     folders: Sequence[str] = (".",),
+    *,
+    on_bad_image: OnBadImage = "stop",
 ) -> pathlib.Path:
-    """Find the folder that a file's image names are relative to, by the image `first`.
+    """Find the folder that a file's image names are relative to, by the first of them.
 
     Args:
         named_by: the file that names images, or the folder of it.
         images: where they are; None looks beside that file, and one folder further up.
-        first: the name of one of them.
+        names: their names.
         folders: folders there that may hold them.
+        on_bad_image: "skip" finds it by any of them.
 
     Raises:
         InputError: there is no such image.
@@ -110,25 +113,34 @@ def find_image_root(
         roots = (pathlib.Path(images),)
     disk = Disk()
     candidates = [root / folder for root in roots for folder in folders]
+    sought = names if on_bad_image == "skip" else names[:1]
     for candidate in candidates:
-        if disk.find(candidate, first) is not None:
+        if any(disk.find(candidate, name) is not None for name in sought):
             return candidate
     raise InputError(
-        f"{named_by}: found no image {first} in {', '.join(map(str, candidates))}; expected its "
+        f"{named_by}: found no image {names[0]} in {', '.join(map(str, candidates))}; expected its "
         "folder as images (--images)"
     )
 
 
 def find_images(
-    named_by: pathlib.Path, root: pathlib.Path, names: Iterable[str]
+    named_by: pathlib.Path,
+    root: pathlib.Path,
+    names: Iterable[str],
+    *,
+    on_bad_image: OnBadImage = "stop",
 ) -> tuple[pathlib.Path, ...]:
     """Return the paths of all images that a file names relative to `root`; see `names.Disk`.
+
+    Under "skip" they may be missing, and whoever reads them leaves them out.
 
     Raises:
         InputError: some are missing; how many, and which is the first.
     """
     disk, names = Disk(), list(names)
     paths = [disk.find(root, name) for name in names]
+    if on_bad_image == "skip":
+        return tuple(path or root / name for name, path in zip(names, paths, strict=True))
     missing = [root / name for name, path in zip(names, paths, strict=True) if path is None]
     if missing:
         raise InputError(

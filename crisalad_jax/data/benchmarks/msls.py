@@ -16,6 +16,7 @@ import numpy as np
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_images, listing, shown
 from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import on_ellipsoid
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
@@ -46,6 +47,7 @@ def read_msls(
     radius: float = DEFAULT_RADIUS,
     *,
     max_heading_difference: float | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
     """Read raw MSLS: all images but panoramas. A query without a match counts as a miss.
 
@@ -57,13 +59,14 @@ def read_msls(
         radius: in metres, inclusive. Images of different cities never match.
         max_heading_difference: largest difference of two compass angles in degrees, inclusive, for
             a match (the CriSALAD paper says 40); None lets any match, as the official code does.
+        on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
 
     Raises:
         InputError: no such city, a table that is missing, without a column or of another length, a
             field that is no number, images that are missing, a negative radius, an angle that is
             not from 0 to 180.
     """
-    return _read(root, split, radius, max_heading_difference, subtask=False)
+    return _read(root, split, radius, max_heading_difference, on_bad_image, subtask=False)
 
 
 def read_msls_subtask(
@@ -72,6 +75,7 @@ def read_msls_subtask(
     radius: float = DEFAULT_RADIUS,
     *,
     max_heading_difference: float | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
     """Read raw MSLS as the official code does for val: the list of 740 queries.
 
@@ -81,7 +85,7 @@ def read_msls_subtask(
 
     Arguments and errors are those of `read_msls`.
     """
-    return _read(root, split, radius, max_heading_difference, subtask=True)
+    return _read(root, split, radius, max_heading_difference, on_bad_image, subtask=True)
 
 
 class _Side(NamedTuple):
@@ -103,6 +107,7 @@ def _read(
     split: str | None,
     radius: float,
     max_heading_difference: float | None,
+    on_bad_image: OnBadImage,
     *,
     subtask: bool,
 ) -> Benchmark:
@@ -121,7 +126,13 @@ def _read(
     start = 0
     for folder in folders:
         there, asked = (
-            _read_side(folder / part, degrees=len(folders) > 1, headings=turned, subtask=subtask)
+            _read_side(
+                folder / part,
+                on_bad_image,
+                degrees=len(folders) > 1,
+                headings=turned,
+                subtask=subtask,
+            )
             for part in ("database", "query")
         )
         near = within(there.positions, asked.positions, radius)
@@ -199,7 +210,14 @@ def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
     return folders
 
 
-def _read_side(folder: pathlib.Path, *, degrees: bool, headings: bool, subtask: bool) -> _Side:
+def _read_side(
+    folder: pathlib.Path,
+    on_bad_image: OnBadImage,
+    *,
+    degrees: bool,
+    headings: bool,
+    subtask: bool,
+) -> _Side:
     """Read a folder's images that are no panoramas, in the order of the tables."""
     more = ("lat", "lon") * degrees + ("ca",) * headings
     raw = _read_table(folder / "raw.csv", ("key", "pano", *more))
@@ -235,7 +253,7 @@ def _read_side(folder: pathlib.Path, *, degrees: bool, headings: bool, subtask: 
     ]
     angles = [_number(folder / "raw.csv", row, "ca", raw) if headings else 0.0 for row, _ in chosen]
     return _Side(
-        images=find_images(folder / "raw.csv", folder / "images", names),
+        images=find_images(folder / "raw.csv", folder / "images", names, on_bad_image=on_bad_image),
         positions=np.array(positions),
         degrees=np.array(places),
         headings=np.array(angles),

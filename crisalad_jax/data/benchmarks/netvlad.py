@@ -14,6 +14,7 @@ import numpy as np
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images
 from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
 from crisalad_jax.utils.shapes import Float64
@@ -29,6 +30,7 @@ def read_netvlad(
     radius: float | None = None,
     *,
     images: str | os.PathLike[str] | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
     """Read a `.mat` file of NetVLAD; a positive is at most `radius` metres away.
 
@@ -38,6 +40,7 @@ def read_netvlad(
         images: the folder with `000/...` (or `images/000/...`) and with the queries in
             `queries_real/`, `queries/` or `query/`; None looks beside the file and one folder
             further up.
+        on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
 
     Raises:
         InputError: no such file, no dbStruct in it, counts that differ from its arrays, images that
@@ -60,8 +63,8 @@ def read_netvlad(
                 "at least one"
             )
         positions = _positions(path, struct, utm, len(listed))
-        root = find_image_root(path, images, listed[0], folders)
-        sides.append((find_images(path, root, listed), positions))
+        root = find_image_root(path, images, listed, folders, on_bad_image=on_bad_image)
+        sides.append((find_images(path, root, listed, on_bad_image=on_bad_image), positions))
     (database, places), (queries, asked) = sides
     return Benchmark(
         name=f"{path.stem} (NetVLAD .mat, {_text(path, struct, 'whichSet')} set, {radius:g} m)",

@@ -3,7 +3,7 @@
 import os
 import pathlib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.data.benchmarks import folders, vpr_bench
@@ -19,6 +19,7 @@ from crisalad_jax.data.benchmarks.msls import is_msls, read_msls, read_msls_subt
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
 from crisalad_jax.data.benchmarks.salad_lists import has_lists, is_list, read_salad_lists
 from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_one_array
 
@@ -30,6 +31,8 @@ class Layout(NamedTuple):
     read: Callable[..., Benchmark]
     options: tuple[str, ...] = ()
     """Names of the options that the reader takes beside the path."""
+    names_images: bool = False
+    """Whether it names images, which may be missing; the reader takes `on_bad_image`."""
 
 
 LAYOUTS = {
@@ -37,11 +40,16 @@ LAYOUTS = {
         "a folder of @UTM names", read_utm, ("split", "radius", "queries", "ignore_zones")
     ),
     "vpr-bench": Layout("a VPR-Bench folder", vpr_bench.read_vpr_bench),
-    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images")),
-    "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images")),
-    "msls": Layout("raw MSLS", read_msls, ("split", "radius", "max_heading_difference")),
+    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images"), True),
+    "salad": Layout(
+        ".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images"), True
+    ),
+    "msls": Layout("raw MSLS", read_msls, ("split", "radius", "max_heading_difference"), True),
     "msls-subtask": Layout(
-        "raw MSLS, subtask all", read_msls_subtask, ("split", "radius", "max_heading_difference")
+        "raw MSLS, subtask all",
+        read_msls_subtask,
+        ("split", "radius", "max_heading_difference"),
+        True,
     ),
     "folders": Layout("two plain folders", folders.read_folders, ("split", "radius", "frames")),
 }
@@ -60,6 +68,7 @@ def open_benchmark(
     queries: str | None = None,
     ignore_zones: bool = False,
     layout: str | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
     """Read an evaluation set of the given `layout`, or of the layout that its files show.
 
@@ -77,6 +86,8 @@ def open_benchmark(
         queries: the folder of the queries, where there are several.
         ignore_zones: whether @UTM numbers of all zones are compared as if of one plane.
         layout: one of `LAYOUTS`; `msls-subtask` is never found from the files.
+        on_bad_image: "stop" where an image that a file names is missing; under "skip" it is in the
+            set, and `evaluate` leaves it out.
 
     Returns:
         The set: queries, database, positions and ground truth.
@@ -105,7 +116,7 @@ def open_benchmark(
         "queries": queries,
         "ignore_zones": ignore_zones or None,
     }
-    given = {name: value for name, value in options.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():
         if name not in chosen.options:
             known = ", ".join(chosen.options).replace("_", " ") or "no option"
@@ -113,6 +124,8 @@ def open_benchmark(
                 f"{name.replace('_', ' ')}: found {str(value)!r}, but {root} is {chosen.words}, "
                 f"which takes {known}"
             )
+    if chosen.names_images:
+        given["on_bad_image"] = on_bad_image
     return chosen.read(root, **given)
 
 

@@ -15,6 +15,7 @@ from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_i
 from crisalad_jax.data.benchmarks.ground_truth import indices, is_nordland_star, matches
 from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.shapes import Int64
@@ -33,6 +34,7 @@ def read_salad_lists(
     split: str | None = None,
     *,
     images: str | os.PathLike[str] | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
     """Read the `.npy` lists of GSV-Cities and SALAD. No code in the files is run.
 
@@ -41,6 +43,7 @@ def read_salad_lists(
         split: part of a set's name, such as `val`, where the folder has the lists of several sets.
         images: the folder to which the names are relative; None looks beside the files and one
             folder further up.
+        on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
 
     Raises:
         InputError: not the lists of just one set, a file that holds anything but names or indices,
@@ -65,8 +68,8 @@ def read_salad_lists(
         ("dbImages", database_names, (".",)),
         ("qImages", query_names, _QUERY_FOLDERS),
     ):
-        folder = find_image_root(files[kind], images, names[0], folders)
-        images_of[kind] = find_images(files[kind], folder, names)
+        folder = find_image_root(files[kind], images, names, folders, on_bad_image=on_bad_image)
+        images_of[kind] = find_images(files[kind], folder, names, on_bad_image=on_bad_image)
     cities = _msls_cities(database_names + query_names)
     if nordland:
         name = "Nordland*, winter database, summer queries (SALAD's lists)"

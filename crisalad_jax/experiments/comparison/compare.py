@@ -71,7 +71,7 @@ def compare(
         if jobs > 1:
             run_jobs(config, out, jobs, on_bad_image=on_bad_image, say=say)
             warnings.simplefilter("ignore", Note)  # the processes have told them
-        prepared = prepare(config)
+        prepared = prepare(config, on_bad_image)
     prepared, left_out = without_unreadable(prepared, on_bad_image, quiet=quiet)
     carry_out(prepared, out, say=say, quiet=quiet)
     with next_writer(out):

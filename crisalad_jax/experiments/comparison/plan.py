@@ -261,7 +261,7 @@ def without_unreadable(
     return prepared._replace(benchmarks=readable, on_bad_image=on_bad_image), lines
 
 
-def prepare(config: ComparisonConfig) -> Prepared:
+def prepare(config: ComparisonConfig, on_bad_image: OnBadImage = "stop") -> Prepared:
     """Read the sets and make and check all configurations, weights from files included.
 
     A note tells which runs warm up for fewer steps than their recipes, because they are short.
@@ -272,7 +272,7 @@ def prepare(config: ComparisonConfig) -> Prepared:
             parts each other; more images would be ranked anew than a set has.
     """
     weights = _weights(config)
-    benchmarks = [open_benchmark(path) for path in config.test]
+    benchmarks = [open_benchmark(path, on_bad_image=on_bad_image) for path in config.test]
     for benchmark in benchmarks:
         benchmark.ground_truth()
     drafts = list(_drafts(config, weights))
@@ -283,14 +283,14 @@ def prepare(config: ComparisonConfig) -> Prepared:
             f"--train: found none, expected a training set for {', '.join(dict.fromkeys(need))}, "
             "or --weights of each"
         )
-    places, views = _places(config) if need else (None, _VIEWS)
+    places, views = _places(config, on_bad_image) if need else (None, _VIEWS)
     variants = []
     shortened: dict[str, list[str]] = {}
     for draft in drafts:
         training = draft.training
         if places is not None and draft.run not in weights:
-            training = _fitted_row(draft, config, places, views)
-            own, per_epoch = _own_training_set(draft, training, config, places)
+            training = _fitted_row(draft, config, places, views, on_bad_image)
+            own, per_epoch = _own_training_set(draft, training, config, places, on_bad_image)
             steps = per_epoch * training.epochs
             optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
             # From nothing `_fitted` has shortened it.
@@ -321,16 +321,25 @@ def prepare(config: ComparisonConfig) -> Prepared:
 
 
 def _own_training_set(
-    draft: Variant, training: TrainConfig, config: ComparisonConfig, places: Places
+    draft: Variant,
+    training: TrainConfig,
+    config: ComparisonConfig,
+    places: Places,
+    on_bad_image: OnBadImage,
 ) -> tuple[Places, int]:
     """Choose a variant's training set, and count the steps of an epoch, which has some."""
     assert config.train is not None
     if draft.row is not None:
         places = read_places(
-            config.train, cities=training.cities, min_images=training.min_images_of_place
+            config.train,
+            cities=training.cities,
+            min_images=training.min_images_of_place,
+            on_bad_image=on_bad_image,
         )
     elif training.min_images_of_place < training.min_images:
-        places = read_places(config.train, min_images=training.min_images_of_place)
+        places = read_places(
+            config.train, min_images=training.min_images_of_place, on_bad_image=on_bad_image
+        )
     try:
         steps = steps_per_epoch(training, groups_of(training, places))
     except InputError as error:
@@ -424,18 +433,22 @@ def _checked(draft: Variant, path: pathlib.Path, config: ComparisonConfig) -> Mo
     return model.resized(config.image_size, config.resize)
 
 
-def _places(config: ComparisonConfig) -> tuple[Places, int]:
+def _places(config: ComparisonConfig, on_bad_image: OnBadImage) -> tuple[Places, int]:
     """Read the training set, and choose the number of images of a place in a batch."""
     assert config.train is not None
-    places = read_places(config.train, min_images=2)
+    places = read_places(config.train, min_images=2, on_bad_image=on_bad_image)
     views = int(np.clip(np.median(places.image_counts), 2, _VIEWS))
     if views > 2:
-        places = read_places(config.train, min_images=views)
+        places = read_places(config.train, min_images=views, on_bad_image=on_bad_image)
     return places, views
 
 
 def _fitted_row(
-    draft: Variant, config: ComparisonConfig, places: Places, views: int
+    draft: Variant,
+    config: ComparisonConfig,
+    places: Places,
+    views: int,
+    on_bad_image: OnBadImage,
 ) -> TrainConfig:
     """Fit a variant's recipe to a training set; what a row of one's own sets stays as it is."""
     training, row, count = draft.training, draft.row, len(places.place_id)
@@ -446,7 +459,9 @@ def _fitted_row(
         views = training.images_per_place
     if "cities" in row.flags:
         assert config.train is not None
-        own = read_places(config.train, cities=training.cities, min_images=views)
+        own = read_places(
+            config.train, cities=training.cities, min_images=views, on_bad_image=on_bad_image
+        )
         count = len(own.place_id)
     # Twice: what is fitted depends on what is set, and must not replace it.
     fitted = row.changed(_fitted(training, config, count, views, epochs), config.preset)

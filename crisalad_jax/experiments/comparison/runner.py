@@ -23,7 +23,7 @@ import numpy as np
 from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.images import read_image
+from crisalad_jax.data.images import read_pixels
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import right_retrievals
 from crisalad_jax.evaluation.results import GroupingResult
@@ -449,7 +449,7 @@ def _race(prepared: Prepared, out: pathlib.Path, quiet: bool) -> dict[str, Any]:
 def _describing(prepared: Prepared, out: pathlib.Path, variant: Variant) -> Callable[[], Any]:
     params = _model(prepared, out, variant, variant.seeds(1)[0], quiet=True)
     # Of the first set's size, which models that take images at their own size go by.
-    image = prepare_image(read_image(prepared.benchmarks[0].queries[0]), variant.model)
+    image = prepare_image(read_pixels(prepared.benchmarks[0].queries[0]), variant.model)
     return describing(params, variant.model, image, prepared.config.batch_size)
 
 

@@ -69,7 +69,8 @@ def _work(task: dict[str, Any], send: Any) -> None:
     load_entry_points()
     for plugin in task["plugins"]:
         load_plugin(plugin)
-    prepared = prepare(from_plain(ComparisonConfig, task["config"], source="--jobs"))
+    config = from_plain(ComparisonConfig, task["config"], source="--jobs")
+    prepared = prepare(config, task["on_bad_image"])
     prepared, _ = without_unreadable(prepared, task["on_bad_image"], quiet=True)
     out = pathlib.Path(task["out"])
     with next_writer(out, quiet=True):  # after the other processes, in a moment

@@ -102,11 +102,14 @@ def retrieval_figure(
     between = 0.34 if names is None else 0.48
     head = 0.85 if title else 0.55
     side = round(width * DPI)
-    thumbnails = {queries[i]: thumbnail(read_image(queries[i]), side) for i in chosen}
+    thumbnails = {
+        queries[i]: thumbnail(read_image(queries[i], bit_depth="contrast-stretch"), side)
+        for i in chosen
+    }
     lost: dict[Path, InputError] = {}
     for file in dict.fromkeys(database[index] for query in chosen for index in shown[query]):
         try:
-            thumbnails[file] = thumbnail(read_image(file), side)
+            thumbnails[file] = thumbnail(read_image(file, bit_depth="contrast-stretch"), side)
         except InputError as error:
             if elsewhere is None:
                 raise

@@ -192,7 +192,7 @@ def _metres(distance: float | None) -> tuple[str, ...]:
 def _photograph(
     subject: Subject, path: pathlib.Path, kind: str, lines: tuple[str, ...], words: str
 ) -> Photograph:
-    image = thumbnail(read_image(path), _THUMBNAIL)
+    image = thumbnail(read_image(path, bit_depth="contrast-stretch"), _THUMBNAIL)
     height, width = image.shape[:2]
     alt = f"{words}: {subject.name(path)}"
     return Photograph(webp(image), width, height, alt, kind, lines)

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.images import read_image
+from crisalad_jax.data.depth import as_rgb
+from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report.gallery import answers_figure, retrieval_figure, thumbnail
@@ -44,7 +45,7 @@ def show_transport(
     middle panel.
 
     Args:
-        image: a file, or 8-bit RGB as `read_image` returns it.
+        image: a file, or 8-bit RGB or grey, as `prepare_image` takes it.
         params: the model's parameters.
         config: the model.
 
@@ -70,8 +71,8 @@ def show_transport(
             "show_transport(image, params, config)"
         )
     check_params(params, config)
-    pixels = read_image(image) if isinstance(image, str | os.PathLike) else image
-    picture = transport_of_image(pixels, params, config)
+    pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
+    picture = transport_of_image(as_rgb(pixels, config.preprocessing.bit_depth), params, config)
     clusters = strongest_clusters([picture])
     share = picture.dustbin_share
     height, width = picture.image.shape[:2]

@@ -100,7 +100,10 @@ def transport_of(
     paths: list[pathlib.Path], params: Crisalad, config: ModelConfig
 ) -> list[Transported]:
     """Read photographs and compute their transport, one by one: their sizes may differ."""
-    return [transport_of_image(read_image(path), params, config) for path in paths]
+    bit_depth = config.preprocessing.bit_depth
+    return [
+        transport_of_image(read_image(path, bit_depth=bit_depth), params, config) for path in paths
+    ]
 
 
 def transport_of_image(image: Pixels, params: Crisalad, config: ModelConfig) -> Transported:

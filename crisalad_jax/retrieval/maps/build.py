@@ -159,12 +159,13 @@ def _new_images(
     """
     names, sizes, new = [], [], []
     for path in paths:
-        name, size = path.relative_to(root).as_posix(), file_of(path).stat().st_size
+        name, file = path.relative_to(root).as_posix(), file_of(path)
+        size = file.stat().st_size if file.is_file() else None  # missing: to be skipped
         if (known := target.image(name)) is None:
             names.append(name)
-            sizes.append(size)
+            sizes.append(size or 0)
             new.append(path)
-        elif known.bytes != size:
+        elif size not in (None, known.bytes):
             raise InputError(
                 f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
                 f"{known.root}, expected new names for new pictures"
@@ -252,7 +253,7 @@ def index(
     if not has_images(out):
         check_no_record_lost(out)  # before any work
         description = None  # a map that a kill left without images binds nobody
-    source = open_source(images, fps=fps)
+    source = open_source(images, fps=fps, on_bad_image=on_bad_image)
     check_rate_used(fps, source.paths)
     table = source.positions if positions is None else positions
     known = _positions(table, images, source.names)

@@ -21,10 +21,9 @@ from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.images import read_image
+from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
-from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
@@ -373,7 +372,7 @@ class Map:
 
     def locate(
         self,
-        image: Pixels | str | os.PathLike[str],
+        image: np.ndarray | str | os.PathLike[str],
         k: int = 5,
         *,
         params: "Crisalad | Runtime | None" = None,
@@ -384,7 +383,8 @@ class Map:
         `query` asks for many images at once.
 
         Args:
-            image: a picture of 8-bit RGB, as `read_image` returns it, or its file.
+            image: a picture of 8-bit RGB, as `read_image` returns it, or of grey (height, width) or
+                (height, width, 1), such as ROS's mono8; or its file.
             k: number of answers; all where the map has fewer.
             params: parameters of the model that made the map; None loads them from where they were.
 
@@ -392,8 +392,8 @@ class Map:
             The answers, best first. Positions are in `axes`.
 
         Raises:
-            InputError: a file that cannot be read, a picture that is not 8-bit RGB, k below 1; what
-                `load_params`, `check_params` and `search` raise.
+            InputError: a file that cannot be read, an array that `prepare_image` does not take, k
+                below 1; what `load_params`, `check_params` and `search` raise.
 
         Example:
             >>> import jax
@@ -410,7 +410,7 @@ class Map:
         from crisalad_jax.retrieval.alone import describe_images
 
         check_count("k", k)
-        picture = read_image(image) if isinstance(image, str | os.PathLike) else image
+        picture = read_pixels(image) if isinstance(image, str | os.PathLike) else image
         if params is None:
             params = self._checked or self.load_params()
         self.check_params(params)

@@ -160,7 +160,7 @@ def query(
     check_grouping((), batch_size, seed=0)
     check_count("k", k)
     min_similarity = asked_similarity(places, min_similarity)
-    root, sources = _listed(images, fps)
+    root, sources = _listed(images, fps, on_bad_image)
     paths = [path for source in sources for path in source]
     check_rate_used(fps, paths)
     batch_size = useful_batch_size(batch_size, len(paths))
@@ -255,12 +255,14 @@ def _described(
     )
 
 
-def _listed(images: Any, fps: float | None) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
+def _listed(
+    images: Any, fps: float | None, on_bad_image: OnBadImage
+) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
     """List the images of each source, below a folder that holds all."""
     given = [images] if isinstance(images, str | os.PathLike) else images
     if not given:
         raise InputError("images: found none, expected images or folders of them")
-    sources = [open_source(each, fps=fps) for each in given]
+    sources = [open_source(each, fps=fps, on_bad_image=on_bad_image) for each in given]
     roots = {source.root for source in sources}
     if len(roots) == 1:
         return roots.pop(), _joined([source.paths for source in sources])

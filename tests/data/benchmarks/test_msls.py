@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crisalad_jax.data.benchmarks import read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks import open_benchmark, read_msls, read_msls_subtask
 from crisalad_jax.data.benchmarks.msls import heading_difference
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch
@@ -254,6 +254,9 @@ def test_tables_of_other_lengths_and_missing_files(tmp_path):
     (folder / "images" / "b.jpg").unlink()
     with pytest.raises(InputError, match=r"raw.csv: found 1 of 2 images missing.*b.jpg"):
         read_msls(root)
+    for layout in ("msls", "msls-subtask"):
+        found = open_benchmark(root, layout=layout, on_bad_image="skip").database
+        assert folder / "images" / "b.jpg" in found
     table = folder / "postprocessed.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
     with pytest.raises(InputError, match=r"postprocessed.csv: found 1 rows, expected the same 2"):

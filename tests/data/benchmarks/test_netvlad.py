@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from crisalad_jax.data.benchmarks import read_netvlad
+from crisalad_jax.data.benchmarks import open_benchmark, read_netvlad
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch
 
@@ -116,6 +116,13 @@ def test_missing_images_are_counted(tmp_path):
         (tmp_path / name).unlink()
     with pytest.raises(InputError, match=rf"found 3 of 30 images missing.*{DATABASE_NAMES[4]}"):
         read_netvlad(path)
+    # Under "skip" they stay in the set, for the reader of images; also the first, by which the
+    # folder is found.
+    whole = read_netvlad(path, on_bad_image="skip")
+    (tmp_path / DATABASE_NAMES[0]).unlink()
+    skipped = open_benchmark(path, on_bad_image="skip")
+    assert skipped.database == whole.database
+    assert skipped.database == tuple(tmp_path / name for name in DATABASE_NAMES)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.retrieval.alone import describe_alone
 from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.maps.build import Indexed, index_images
+from crisalad_jax.retrieval.maps.build import index as index_source
 from crisalad_jax.retrieval.maps.manifest import describe_map
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.utils.errors import InputError
@@ -93,6 +94,23 @@ def test_an_unreadable_image_ends_it_or_is_left_out(params, database, tmp_path):
         assert len(found) == 6
         assert found.image(paths[5].name) is None
     assert index(tmp_path / "map", params, database, on_bad_image="skip").there == 6
+
+
+def test_a_missing_image_of_a_list_is_left_out(params, database, tmp_path, shared):
+    """And one of the map's that is gone since then is there, as before."""
+    names = [path.name for path in list_images(database)]
+    table = database / "table.csv"
+    table.write_text("name,x,y\n" + "".join(f"{name},1,2\n" for name in ["none.jpg", *names]))
+    options = {"weights": shared / "weights.safetensors", "batch_size": BATCH, "quiet": True}
+    out = tmp_path / "map"
+    with pytest.raises(InputError, match=r"line 2: .*none.jpg: found no such file"):
+        index_source(params, MODEL, table, out, **options)
+    assert not out.exists()
+    result = index_source(params, MODEL, table, out, on_bad_image="skip", **options)
+    assert (result.added, result.positions, result.unreadable) == (7, 7, ["none.jpg"])
+    (database / names[0]).unlink()
+    result = index_source(params, MODEL, table, out, on_bad_image="skip", **options)
+    assert (result.added, result.there, result.unreadable) == (0, 7, ["none.jpg"])
 
 
 def test_another_picture_by_the_same_name_is_refused_before_any_work(params, database, tmp_path):

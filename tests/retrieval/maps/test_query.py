@@ -2,8 +2,11 @@
 
 import gc
 import json
+import math
 import pathlib
+import shutil
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ import crisalad_jax.retrieval.maps.query
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.answers import answer_lines
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.data.live import FolderWatch
+from crisalad_jax.data.live import FolderWatch, Frame
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.live import query_live
@@ -191,6 +194,68 @@ def test_one_picture_is_located_as_by_a_query(folder, params, answers):
             )
             assert [answer.rank for answer in found] == [1, 2, 3]
     assert len(places.locate(answers.queries[0], k=10**6, params=params)) == len(places)
+
+
+@pytest.mark.parametrize("last", [(), (1,)], ids=["mono8", "one channel"])
+def test_grey_is_located_as_its_three_channels(folder, answers, last):
+    """As cv2.IMREAD_GRAYSCALE and ROS's mono8 have it, and what comes live."""
+    grey = cv2.imread(str(answers.queries[0]), cv2.IMREAD_GRAYSCALE)
+    picture, repeated = grey.reshape(*grey.shape, *last), np.stack([grey] * 3, axis=-1)
+    places = Map.open(folder)
+    assert places.locate(picture, k=3) == places.locate(repeated, k=3)
+
+    class Node:
+        size = None
+
+        def frames(self, check=None):
+            for each in (picture, repeated):
+                yield Frame("camera", 1.5, each, 0.0)
+
+    first, second = query_live(places, places.load_params(), Node(), k=3)
+    assert list(first.answers.rows()) == list(second.answers.rows())
+
+
+def test_a_map_of_thermal_images_reads_queries_as_it_was_made(tmp_path, shared, params, sides):
+    """16-bit files against 8-bit ones that were stretched by hand, and kept as they are."""
+    weights = shared / "weights.safetensors"
+    for number, path in enumerate(list_images(sides[0])):
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        thermal = 7200 + 6 * grey.astype(np.uint16)
+        ranks = [math.ceil(thermal.size * share) - 1 for share in (0.01, 0.99)]
+        low, high = np.sort(thermal, axis=None)[ranks].astype(float)
+        by_hand = np.rint(255 * np.clip((thermal - low) / (high - low), 0, 1)).astype(np.uint8)
+        for name, values in (("thermal", thermal), ("by_hand", by_hand)):
+            (tmp_path / name).mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), values)
+    options = {"weights": weights, "batch_size": BATCH, "quiet": True}
+    out = tmp_path / "map"
+    way = {"resize": ["contrast-stretch"]}
+    index(params, MODEL, tmp_path / "thermal", out, **options, **way)
+    index(params, MODEL, tmp_path / "by_hand", tmp_path / "map2", **options)
+    places, expected = Map.open(out), Map.open(tmp_path / "map2")
+    np.testing.assert_array_equal(
+        np.concatenate(list(places.descriptors)), np.concatenate(list(expected.descriptors))
+    )
+    one = tmp_path / "thermal" / "3.png"
+    values = cv2.imread(str(one), cv2.IMREAD_UNCHANGED)
+    right = expected.locate(tmp_path / "by_hand" / "3.png", k=3)
+    for image in (one, values, values.astype(np.float32)):
+        found = places.locate(image, k=3)
+        assert [(a.image.name, a.similarity) for a in found] == [
+            (a.image.name, a.similarity) for a in right
+        ]
+    watch = FolderWatch(tmp_path)
+    shutil.copy(one, tmp_path / "new.png")
+    live = next(query_live(places, params, watch, k=3))
+    asked = query(places, params, one, k=3, quiet=True)
+    for each in (live.answers, asked):
+        ((_, ranked),) = each.rows()
+        assert [answer.image.name for answer in ranked] == [answer.image.name for answer in right]
+        # Batches of one and of many round otherwise.
+        assert ranked[0].similarity == pytest.approx(right[0].similarity, abs=5e-6)
+    # More images in another way are refused, as in any map.
+    with pytest.raises(InputError, match=r"expected .*contrast-stretch as in the map"):
+        index(params, MODEL, tmp_path / "thermal", out, **options, resize=["high-byte"])
 
 
 def test_what_locate_refuses(folder, params, answers):
