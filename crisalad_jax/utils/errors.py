@@ -1,6 +1,10 @@
 """The errors that a command ends with in one line: bad input, and a signal."""
 
 import signal
+from collections.abc import Sequence
+
+_MOST = 3
+"""Number of problems that one message lists."""
 
 
 class InputError(ValueError):
@@ -9,6 +13,17 @@ class InputError(ValueError):
     The command line ends with code 2. The message is one line that names the file or argument, what
     was found and what was expected.
     """
+
+
+def few(problems: Sequence[str]) -> str:
+    """Join problems to one line: the first three, and how many more there are.
+
+    Example:
+        >>> few([f"{letter} missing" for letter in "abcde"])
+        'a missing; b missing; c missing; and 2 more'
+    """
+    more = [f"and {len(problems) - _MOST} more"] if len(problems) > _MOST else []
+    return "; ".join([*problems[:_MOST], *more])
 
 
 class Stopped(Exception):
