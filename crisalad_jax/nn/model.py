@@ -140,16 +140,14 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
     if stored:
         problems = misfits(params, template) or not_finite(params)
     else:
-        _check_mode(config)
+        _check_width(params, config)
         dtypes = {jnp.dtype(config.compute_dtype)}
         problems = misfits(params, template, dtypes)
         if problems:
             joined = _joined(params, config)
             problems = problems if joined is None else misfits(joined, template, dtypes)
     if problems:
-        wide = any("found float64" in problem for problem in problems)
-        hint = " (float64 is for compute_dtype float64)" if wide else ""
-        raise InputError(f"params: not of this configuration: {few(problems)}{hint}")
+        raise InputError(f"params: not of this configuration: {few(problems)}")
 
 
 def _joined(params: Crisalad, config: ModelConfig) -> Crisalad | None:
@@ -171,16 +169,19 @@ def _check_classes(params: Any, config: Any) -> None:
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
 
 
-def _is_wide(leaf: Any) -> bool:
-    return isinstance(leaf, np.ndarray) and leaf.dtype == np.float64
-
-
-def _check_mode(config: ModelConfig) -> None:
-    # JAX would compute in float32, with a warning for each array.
-    if config.compute_dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
+def _check_width(params: Any, config: ModelConfig) -> None:
+    """Raise InputError where JAX would compute in float32 what is float64."""
+    if config.compute_dtype == "float64":
+        if not jax.config.jax_enable_x64:  # pyright: ignore
+            raise InputError(
+                "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
+                "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)"
+            )
+    elif any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves(params)):
+        wide = [n for n, x in named_leaves(params).items() if getattr(x, "dtype", 0) == np.float64]
         raise InputError(
-            "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
-            "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)"
+            f"params: found float64: {few(wide)}; expected float32, or ModelConfig.compute_dtype "
+            "float64"
         )
 
 
@@ -231,8 +232,7 @@ def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[[_
                 return function(*args, **options)  # which raises Python's own error
             params, config = given["params"], given["config"]
             _check_classes(params, config)
-            if any(_is_wide(leaf) for leaf in jax.tree.leaves(params)):
-                check_params(params, config)  # the trace would take float64 for float32
+            _check_width(params, config)  # a trace takes NumPy's float64 for float32
             check(given[second], config)
             try:
                 return function(*args, **options)

@@ -30,6 +30,7 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import check_params, describe, init_crisalad, parameter_shapes
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.training.loop import fit
+from crisalad_jax.training.optimiser import make_optimiser
 from crisalad_jax.training.step import init_train_state, make_train_step, step_config
 from crisalad_jax.training.vocabulary import with_vocabulary
 from crisalad_jax.utils.errors import InputError
@@ -86,21 +87,19 @@ def test_so_are_those_and_the_descriptors_of_a_plug_in() -> None:
     in_both_modes(lambda: describe(params, IMAGES, config))
 
 
-@pytest.mark.parametrize("normalisation", ["mean-deviation", "local-contrast"])
-def test_descriptors_are_the_same_in_any_transformation(normalisation: str) -> None:
-    how = dataclasses.replace(MODEL.preprocessing, normalisation=normalisation)
+def test_descriptors_are_the_same() -> None:
+    how = dataclasses.replace(MODEL.preprocessing, normalisation="local-contrast")
     config = dataclasses.replace(MODEL, preprocessing=how)
-    key = jax.random.key(1)  # draws dropout
+    in_both_modes(lambda: describe(PARAMS, IMAGES, config, key=jax.random.key(1)))  # of dropout
 
-    def score(params: Any) -> jax.Array:
-        return describe(params, IMAGES, config, key=key)[:, ::7].sum()
 
-    for call in (
-        lambda: describe(PARAMS, IMAGES, config, key=key),
-        lambda: jax.jit(jax.grad(score))(PARAMS),
-        lambda: jax.vmap(lambda images: describe(PARAMS, images, config))(IMAGES[None]),
-    ):
-        in_both_modes(call)
+def test_so_are_gradients_within_a_program_of_the_users() -> None:
+    @jax.jit
+    @jax.grad
+    def slope(params: Any) -> jax.Array:
+        return describe(params, IMAGES, MODEL, key=jax.random.key(1))[:, ::7].sum()
+
+    in_both_modes(lambda: slope(PARAMS))
 
 
 def test_no_number_of_a_program_is_float64() -> None:
@@ -115,34 +114,33 @@ def test_no_number_of_a_program_is_float64() -> None:
 def test_a_training_step_is_the_same() -> None:
     """With Adam's own numbers, and those of an optimiser of JAX's default types."""
 
-    def counted(steps: int) -> Any:
-        def init(_: Any) -> Any:
-            return jnp.zeros(())
+    def init(_: Any) -> Any:
+        return jnp.zeros(())
 
-        def update(updates: Any, state: Any, params: Any = None) -> Any:
-            scale = 1 / (1.7 + state)
-            return jax.tree.map(lambda each: -scale * each, updates), state + 1 / steps
+    def update(updates: Any, state: Any, params: Any = None) -> Any:
+        scale = 1 / (1.7 + state)
+        return jax.tree.map(lambda each: scale * each, updates), state + 1 / 3
 
-        return optax.GradientTransformation(init, update)
+    optimiser = optax.chain(
+        make_optimiser(RECIPE.optimiser, steps=8), optax.GradientTransformation(init, update)
+    )
+    options = {"steps": 8, "optimiser": optimiser}
 
-    for options in ({}, {"optimiser": counted(3)}):
+    def train() -> Any:
+        step = make_train_step(RECIPE, **options)
+        state, frozen = init_train_state(PARAMS, "all", step_config(RECIPE, **options))
+        for _ in range(3):
+            labels = jnp.asarray(LABELS)  # int64 in the 64-bit mode
+            state, metrics = step(state, frozen, IMAGES, labels, jax.random.key(4))
+        return state, metrics
 
-        def train(options: Any = options) -> Any:
-            static = step_config(RECIPE, steps=8, **options)
-            step = make_train_step(RECIPE, steps=8, **options)
-            state, frozen = init_train_state(PARAMS, "all", static)
-            for _ in range(3):
-                labels = jnp.asarray(LABELS)  # int64 in the 64-bit mode
-                state, metrics = step(state, frozen, IMAGES, labels, jax.random.key(4))
-            return state, metrics
-
-        in_both_modes(train)
+    in_both_modes(train)
 
 
 @pytest.mark.parametrize("name", LOSSES.names())
 def test_losses_of_float32_are_float32(name: str) -> None:
     rows = np.random.default_rng(0).normal(size=(4, 6)).astype(np.float32)
-    config = LossConfig(kind=LOSSES.make(name))
+    config = LossConfig(kind=LOSSES.make(name), miner="none")
     if config.kind.grouping is not None or config.kind.reads_dense:
         pytest.skip("takes more than descriptors; the training step is tested above")
     with jax.enable_x64(True):
@@ -161,6 +159,7 @@ def test_files_and_digests_are_the_same(tmp_path: pathlib.Path) -> None:
     assert files[0] == files[1]
 
 
+@pytest.mark.usefixtures("_unchecked")  # symbolic shapes
 def test_an_exported_program_is_the_same() -> None:
     def exported() -> bytes:
         return bytes(export_model(PARAMS, MODEL, ExportConfig()).serialize())
@@ -236,19 +235,15 @@ def wide(params: Any, make: Any = np.asarray) -> Any:
 
 
 def test_float64_parameters_are_told_unless_the_model_computes_in_float64() -> None:
-    message = (
-        r"^params: not of this configuration: .* found float64 .*; and 74 more "
-        r"\(float64 is for compute_dtype float64\)$"
-    )
     count = len(jax.tree.leaves(PARAMS))
-    message = message.replace("74", str(count - 3))
+    message = rf"^params: found float64: .*; and {count - 3} more; expected float32, or ModelConf"
     with pytest.raises(InputError, match=message):
         describe(wide(PARAMS), IMAGES, MODEL)  # NumPy's, which JAX would make float32
     config = dataclasses.replace(MODEL, compute_dtype="float64")
     with jax.enable_x64(True):
         with pytest.raises(InputError, match=message):
             describe(wide(PARAMS, jnp.asarray), IMAGES, MODEL)
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError, match=r"found float64 .*, expected float32"):
             check_params(wide(PARAMS), MODEL, stored=True)
         found = describe(wide(PARAMS, jnp.asarray), IMAGES, config)
         assert found.dtype == jnp.float64
