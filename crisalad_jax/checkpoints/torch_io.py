@@ -347,8 +347,7 @@ def _unwrap(content: Any, path: pathlib.Path) -> tuple[_Dictionary, ModelConfig 
     ]
     if strange:
         raise InputError(
-            f"{path}: found {few(sorted(strange))}, expected nothing but tensors by name: "
-            f"{_HOW}"
+            f"{path}: found {few(sorted(strange))}, expected nothing but tensors by name: {_HOW}"
         )
     return content, config
 

@@ -190,7 +190,8 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     """Cast the weights of the backbone's large linear layers to the type of their products.
 
     Otherwise every call casts them. Descriptors stay the same to the bit. In bfloat16 the weights
-    take half the memory, and no longer train.
+    take half the memory, and no longer train. In float64 all parameters are cast, so that none of
+    their sums is rounded to float32.
 
     Args:
         params: the parameters, or a tree of these with some left out.
@@ -209,6 +210,8 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     """
     dtype = jnp.dtype(config.compute_dtype)
     names = iter(named_leaves(params))
+    if dtype == jnp.float64:
+        return jax.tree.map(lambda leaf: leaf.astype(dtype), params)
 
     def cast(leaf: Any) -> Any:
         return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
@@ -234,6 +237,9 @@ def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[[_
             _check_classes(params, config)
             _check_width(params, config)  # a trace takes NumPy's float64 for float32
             check(given[second], config)
+            if config.compute_dtype == "float64":
+                check_params(params, config)
+                args, options = (), given | {"params": cast_params(params, config)}
             try:
                 return function(*args, **options)
             except TypeError:

@@ -247,7 +247,7 @@ def test_float64_parameters_are_told_unless_the_model_computes_in_float64() -> N
             check_params(wide(PARAMS), MODEL, stored=True)
         found = describe(wide(PARAMS, jnp.asarray), IMAGES, config)
         assert found.dtype == jnp.float64
-        # Of the same numbers, whose products are exact in float64.
+        # They hold the same numbers.
         np.testing.assert_array_equal(describe(PARAMS, IMAGES, config), found)
     # Float32 keeps 6e-8 of a number; some tens of layers add up to some tens of that.
     np.testing.assert_allclose(describe(PARAMS, IMAGES, MODEL), found, atol=3e-6)
