@@ -51,6 +51,7 @@ from crisalad_jax.nn.model import (
 )
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.checksums import sha256_of
+from crisalad_jax.utils.compiler import number_types
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
@@ -182,7 +183,7 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     """
     check_exportable(params, config, how)
     run, weights, images = _program(params, config, how)
-    with lowering_for(PORTABLE), _without_sources():
+    with number_types([config]), lowering_for(PORTABLE), _without_sources():
         if how.weights_inside:
             whole = jax.jit(lambda images: run(weights, images))
             return export.export(whole, platforms=how.platforms)(images)
@@ -353,7 +354,7 @@ def _write_onnx(
     files: dict[str, Any] = {}
     for name, (function, arrays, inputs, output) in parts.items():
         path = folder / f"{name}.onnx"
-        with lowering_for(STRAIGHT):
+        with number_types([config]), lowering_for(STRAIGHT):
             words = f"{', '.join(inputs)} to {output}; {GROUPINGS[how.grouping]}"
             beside = not how.weights_inside
             products = write_onnx(

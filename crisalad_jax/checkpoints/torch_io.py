@@ -46,7 +46,7 @@ from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import atomic_path, check_source, check_target, is_html
 
 SUFFIXES = {
@@ -129,8 +129,8 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
 
     Raises:
         InputError: the file is missing, cut short, none of the layouts, asks to run code, or does
-            not fit its layout (every name that is missing, unknown or misshaped is listed); or
-            torch is needed and not installed.
+            not fit its layout (the first names that are missing, unknown or misshaped are listed);
+            or torch is needed and not installed.
     """
     path = pathlib.Path(path)
     check_source(path, "a checkpoint")
@@ -347,8 +347,7 @@ def _unwrap(content: Any, path: pathlib.Path) -> tuple[_Dictionary, ModelConfig 
     ]
     if strange:
         raise InputError(
-            f"{path}: found {', '.join(sorted(strange))}, expected nothing but tensors by name: "
-            f"{_HOW}"
+            f"{path}: found {few(sorted(strange))}, expected nothing but tensors by name: {_HOW}"
         )
     return content, config
 

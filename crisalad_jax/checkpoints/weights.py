@@ -18,10 +18,10 @@ from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.misfits import is_finite
+from crisalad_jax.nn.misfits import misfits, not_finite
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import check_source, is_html
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
@@ -144,8 +144,8 @@ def load_weights(
 
     Raises:
         InputError: the file is missing, changed, cut short or no such file; it needs a part that is
-            not registered; its parameters do not fit its configuration or are not finite (all that
-            are missing, unknown or wrong are listed); its configuration is not `expected` (all
+            not registered; its parameters do not fit its configuration or are not finite (the first
+            that are missing, unknown or wrong are listed); its configuration is not `expected` (all
             fields that differ are listed); or AnyLoc's vocabulary is of another backbone.
 
     Example:
@@ -323,22 +323,11 @@ def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path
         )
     template = parameter_shapes(config)
     wanted = named_leaves(template)
-    problems = [f"{name} missing" for name in wanted.keys() - arrays.keys()]
-    problems += [f"{name} unknown" for name in arrays.keys() - wanted.keys()]
-    for name, leaf in wanted.items():
-        if name not in arrays:
-            continue
-        array = arrays[name]
-        if array.dtype == np.float16 and leaf.dtype == np.float32:
-            array = arrays[name] = array.astype(np.float32)
-        if (array.dtype, array.shape) != (leaf.dtype, leaf.shape):
-            problems.append(
-                f"{name} found {array.dtype} {array.shape}, expected {leaf.dtype} {leaf.shape}"
-            )
-        elif not is_finite(array):
-            problems.append(f"{name} holds NaN or infinity")
+    halves = {name: array for name, array in arrays.items() if array.dtype == np.float16}
+    arrays |= {name: array.astype(np.float32) for name, array in halves.items()}
+    problems = misfits(arrays, wanted) or not_finite(arrays)
     if problems:
-        raise InputError(f"{path}: weights do not fit: {'; '.join(sorted(problems))}")
+        raise InputError(f"{path}: weights do not fit: {few(problems)}")
     # Not the file's own memory, which another program may change, and copied when this returns.
     leaves = [jax.device_put(arrays[name], may_alias=False) for name in wanted]
     jax.block_until_ready(leaves)

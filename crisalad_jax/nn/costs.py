@@ -1,6 +1,7 @@
 """Count a model's parameters, and the multiply-accumulates of its traced program."""
 
 import collections
+import dataclasses
 import functools
 import math
 import re
@@ -62,6 +63,7 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
         'cross-image encoder'
     """
     params = parameter_shapes(config)
+    config = dataclasses.replace(config, compute_dtype="float32")  # counts are of any type
 
     def tokens_of(count: int) -> Any:
         pixels = jax.ShapeDtypeStruct((count, *config.input_size, 3), jnp.uint8)

@@ -3,7 +3,8 @@
 `jax.random` compiles a program for every shape, which takes longer than all drawing. Here one
 program of each distribution draws `_CHUNK` numbers, and is called until there are enough. The bits
 of JAX's threefry depend on the key and the place alone, so the numbers are those of `jax.random`.
-While JAX traces (`jax.eval_shape`, `jax.jit`), and for other generators, `jax.random` draws itself.
+All are float32, in JAX's 64-bit mode too. While JAX traces (`jax.eval_shape`, `jax.jit`), and for
+other generators, `jax.random` draws itself.
 """
 
 import contextlib
@@ -62,15 +63,15 @@ def _chunk(key: Array, distribution: Callable[..., Array], *limits: Any) -> Arra
 
 
 def _uniform(key: PRNGKeyArray, limits: tuple[Any, ...], shape: Shape) -> Array:
-    return jax.random.uniform(key, shape, minval=limits[0], maxval=limits[1])
+    return jax.random.uniform(key, shape, jnp.float32, minval=limits[0], maxval=limits[1])
 
 
 def _normal(key: PRNGKeyArray, _: tuple[Any, ...], shape: Shape) -> Array:
-    return jax.random.normal(key, shape)
+    return jax.random.normal(key, shape, jnp.float32)
 
 
 def _truncated_normal(key: PRNGKeyArray, limits: tuple[Any, ...], shape: Shape) -> Array:
-    return jax.random.truncated_normal(key, limits[0], limits[1], shape)
+    return jax.random.truncated_normal(key, limits[0], limits[1], shape, jnp.float32)
 
 
 @contextlib.contextmanager
@@ -85,9 +86,7 @@ def only_shapes() -> Iterator[None]:
 
 def _is_plain(key: Any) -> bool:
     """Return whether the numbers that `jax.random` draws with a key can be drawn here."""
-    if isinstance(key, jax.core.Tracer) or jax.config.jax_enable_x64:  # pyright: ignore
-        return False
-    if not jax.config.jax_threefry_partitionable:  # pyright: ignore
+    if isinstance(key, jax.core.Tracer) or not jax.config.jax_threefry_partitionable:  # pyright: ignore
         return False
     if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         return jax.random.key_impl(key) == "threefry2x32" and key.shape == ()
@@ -98,7 +97,7 @@ def _draw(
     distribution: Callable[..., Array], key: Any, shape: Shape, scale: float, *limits: float
 ) -> Array:
     if _only_shapes.get():
-        return jnp.zeros(shape)
+        return jnp.zeros(shape, jnp.float32)
     size = math.prod(shape)
     if not _is_plain(key) or size >= 2**32:
         drawn = distribution(key, limits, tuple(shape))
@@ -182,15 +181,15 @@ def stacked(draw: Callable[[PRNGKeyArray], Any], keys: Sequence[PRNGKeyArray]) -
 
 
 def full(shape: Shape, value: float) -> Float[Array, "*shape"]:
-    """Make an array of one value, of the default type of floats, without a program for it."""
-    return jax.device_put(np.full(shape, value, jnp.result_type(float)))
+    """Make a float32 array of one value, without a program for it."""
+    return jax.device_put(np.full(shape, value, np.float32))
 
 
 def zeros(*shape: int) -> Float[Array, "*shape"]:
-    """Make an array of zeros, of the default type of floats, without a program for it."""
+    """Make a float32 array of zeros, without a program for it."""
     return full(shape, 0.0)
 
 
 def ones(*shape: int) -> Float[Array, "*shape"]:
-    """Make an array of ones, of the default type of floats, without a program for it."""
+    """Make a float32 array of ones, without a program for it."""
     return full(shape, 1.0)

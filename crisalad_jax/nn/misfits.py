@@ -8,9 +8,6 @@ import numpy as np
 
 from crisalad_jax.utils.pytree import named_leaves
 
-_MOST = 5
-"""Largest number of misfits that one message lists."""
-
 
 def misfits(found: Any, expected: Any, dtypes: Collection[Any] = ()) -> list[str]:
     """List in what a tree of arrays differs from another: names, shapes, types, classes.
@@ -87,14 +84,3 @@ def not_finite(tree: Any) -> list[str]:
         for name, leaf in named_leaves(tree).items()
         if not is_finite(np.asarray(leaf))
     ]
-
-
-def shortened(problems: list[str]) -> str:
-    """Join misfits to one line, the first few of many.
-
-    Example:
-        >>> shortened([f"{letter} missing" for letter in "abcdefgh"])
-        'a missing; b missing; c missing; d missing; e missing; and 3 more'
-    """
-    more = [f"and {len(problems) - _MOST} more"] if len(problems) > _MOST else []
-    return "; ".join(problems[:_MOST] + more)

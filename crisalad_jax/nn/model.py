@@ -30,13 +30,13 @@ from crisalad_jax.nn.layers import (
     split_key,
     split_statistics,
 )
-from crisalad_jax.nn.misfits import misfits, not_finite, shortened
+from crisalad_jax.nn.misfits import misfits, not_finite
 from crisalad_jax.nn.pixels import check_pixels, normalise
 from crisalad_jax.nn.projection import project
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import IMAGE, image_mesh, over_images
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
@@ -81,6 +81,11 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         >>> params.backbone.cls_token.shape
         (128,)
     """
+    with compiler.number_types():
+        return _drawn(key, config)
+
+
+def _drawn(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     keys = draw.split(key, 3)
     backbone = config.backbone.init(keys[0])
     check_drawn(backbone, f"backbone {config.backbone.part_name}")
@@ -98,14 +103,9 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     )
 
 
+@functools.lru_cache(maxsize=64)
 def parameter_shapes(config: ModelConfig) -> Crisalad:
     """Return shapes and types of all parameters (`jax.ShapeDtypeStruct`); nothing is computed."""
-    return _shapes(config, str(jnp.result_type(float)))
-
-
-@functools.lru_cache(maxsize=64)
-def _shapes(config: ModelConfig, default: str) -> Crisalad:
-    """Make the tree for JAX's `default` type of floats, which its 64-bit mode changes."""
     with draw.only_shapes():
         return jax.eval_shape(lambda: init_crisalad(jax.random.key(0), config))
 
@@ -122,7 +122,8 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
         stored: whether a file is to keep them, which takes whole, finite float32 arrays alone.
 
     Raises:
-        InputError: they are not; all misfits are listed, or the first of many.
+        InputError: they are not, the first of the misfits are listed; or the model computes in
+            float64, outside of JAX's 64-bit mode.
 
     Example:
         >>> import jax
@@ -137,15 +138,16 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
     _check_classes(params, config)
     template = parameter_shapes(config)
     if stored:
-        problems = misfits(params, template, {jnp.dtype("float32")}) or not_finite(params)
+        problems = misfits(params, template) or not_finite(params)
     else:
-        dtypes = {jnp.dtype(name) for name in ("float32", "float64", config.compute_dtype)}
+        _check_width(params, config)
+        dtypes = {jnp.dtype(config.compute_dtype)}
         problems = misfits(params, template, dtypes)
         if problems:
             joined = _joined(params, config)
             problems = problems if joined is None else misfits(joined, template, dtypes)
     if problems:
-        raise InputError(f"params: not of this configuration: {shortened(problems)}")
+        raise InputError(f"params: not of this configuration: {few(problems)}")
 
 
 def _joined(params: Crisalad, config: ModelConfig) -> Crisalad | None:
@@ -167,12 +169,29 @@ def _check_classes(params: Any, config: Any) -> None:
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
 
 
+def _check_width(params: Any, config: ModelConfig) -> None:
+    """Raise InputError where JAX would compute in float32 what is float64."""
+    if config.compute_dtype == "float64":
+        if not jax.config.jax_enable_x64:  # pyright: ignore
+            raise InputError(
+                "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
+                "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)"
+            )
+    elif any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves(params)):
+        wide = [n for n, x in named_leaves(params).items() if getattr(x, "dtype", 0) == np.float64]
+        raise InputError(
+            f"params: found float64: {few(wide)}; expected float32, or ModelConfig.compute_dtype "
+            "float64"
+        )
+
+
 @takes(config=ModelConfig)
 def cast_params(params: Any, config: ModelConfig) -> Any:
     """Cast the weights of the backbone's large linear layers to the type of their products.
 
     Otherwise every call casts them. Descriptors stay the same to the bit. In bfloat16 the weights
-    take half the memory, and no longer train.
+    take half the memory, and no longer train. In float64 all parameters are cast, so that none of
+    their sums is rounded to float32.
 
     Args:
         params: the parameters, or a tree of these with some left out.
@@ -191,6 +210,8 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     """
     dtype = jnp.dtype(config.compute_dtype)
     names = iter(named_leaves(params))
+    if dtype == jnp.float64:
+        return jax.tree.map(lambda leaf: leaf.astype(dtype), params)
 
     def cast(leaf: Any) -> Any:
         return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
@@ -212,12 +233,17 @@ def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[[_
             given = dict(zip(("params", second, "config"), args, strict=False), **options)
             if len(given.keys() & {"params", second, "config"}) < 3:
                 return function(*args, **options)  # which raises Python's own error
-            _check_classes(given["params"], given["config"])
-            check(given[second], given["config"])
+            params, config = given["params"], given["config"]
+            _check_classes(params, config)
+            _check_width(params, config)  # a trace takes NumPy's float64 for float32
+            check(given[second], config)
+            if config.compute_dtype == "float64":
+                check_params(params, config)
+                args, options = (), given | {"params": cast_params(params, config)}
             try:
                 return function(*args, **options)
             except TypeError:
-                check_params(given["params"], given["config"])  # a leaf may be no array
+                check_params(params, config)  # a leaf may be no array
                 raise
 
         return cast(_F, call)

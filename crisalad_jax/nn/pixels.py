@@ -93,7 +93,7 @@ def normalise(
     DINOv2 expects. "local-contrast" uses those of each pixel's 21 x 21 neighbourhood. It is for
     small models trained from scratch, which would have to learn to ignore the light.
     """
-    # JAX's default float type: float32, and float64 in its 64-bit mode.
+    # JAX's default float type: float64 for a model that computes in it (`compiler.number_types`).
     pixels = image.astype(float) / 255
     if how.normalisation == "local-contrast":
         return _local_contrast(pixels)

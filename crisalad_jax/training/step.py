@@ -179,6 +179,13 @@ def init_train_state(
         f"config: found {type(config).__name__}, expected the StepConfig of `step_config`",
     )
     check_params(params, config.model)
+    with compiler.number_types([config]):
+        return _init_state(params, trainable, config, key)
+
+
+def _init_state(
+    params: Crisalad, trainable: str, config: StepConfig, key: PRNGKeyArray | None
+) -> tuple[TrainState, PyTree]:
     if isinstance(config.optimiser, OptimiserConfig) and distributed.is_primary():
         tell_long_warmup(config.optimiser, config.steps, config.steps_per_epoch)
     chosen, frozen = split_params(params, config.model, trainable)
@@ -334,7 +341,7 @@ def make_train_step(
             raise InputError(f"labels: found up to {np.max(labels)}, expected numbers below 2^31")
         mask = jnp.ones(len(labels), bool) if valid is None else jnp.asarray(valid)
         return train_step(
-            state, frozen, jnp.asarray(images), jnp.asarray(labels), mask, key, static
+            state, frozen, jnp.asarray(images), jnp.asarray(labels, jnp.int32), mask, key, static
         )
 
     return step

@@ -30,6 +30,7 @@ from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.grouping import useful_batch_size
 from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
+from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target
@@ -103,10 +104,11 @@ def with_vocabulary(
     if not np.isfinite(features).all():
         raise InputError("features: found NaN or infinity, expected a backbone's finite numbers")
     spherical = config.aggregator.spherical_centroids
-    there = jnp.asarray(features)
-    reduced = np.asarray(config.aggregator.centroid_features(there))
-    centroids = jnp.asarray(_k_means(reduced, clusters, seed, spherical=spherical))
-    aggregator = config.aggregator.from_centroids(centroids, there)
+    with compiler.number_types():
+        there = jnp.asarray(features)
+        reduced = np.asarray(config.aggregator.centroid_features(there))
+        centroids = jnp.asarray(_k_means(reduced, clusters, seed, spherical=spherical))
+        aggregator = config.aggregator.from_centroids(centroids, there)
     aggregator = config.aggregator.bind(aggregator, params.backbone)
     return dataclasses.replace(params, aggregator=aggregator)
 

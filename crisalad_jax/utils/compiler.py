@@ -69,7 +69,8 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
     """Wrap a function in `jax.jit` with `compiler_options`, outside of other transformations.
 
     Inside another transformation the outermost `jit` decides, because JAX takes no other options.
-    On accelerators float32 products have the `precision` of a configuration among the arguments.
+    On accelerators float32 products have the `precision` of a configuration among the arguments,
+    and everywhere numbers are of `number_types`.
     The returned function has `lower` too, which lowers for the `target`.
     """
     inner = jax.jit(function, **options)
@@ -85,9 +86,9 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
     def call(*args: Any, **kwargs: Any) -> Any:
         leaves = jax.tree.leaves((args, kwargs))
         if get_opaque_trace_state() != _AT_REST:
-            with _precision_of(leaves):
+            with number_types(leaves), _precision_of(leaves):
                 return inner(*args, **kwargs)
-        with _precision_of(leaves), over_devices_of(leaves):
+        with number_types(leaves), _precision_of(leaves), over_devices_of(leaves):
             jitted = outermost()
             if not runs_long and target() == machine():
 
@@ -102,12 +103,22 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
 
     def lower(*args: Any, **kwargs: Any) -> Any:
         leaves = jax.tree.leaves((args, kwargs))
-        with _precision_of(leaves), over_devices_of(leaves):
+        with number_types(leaves), _precision_of(leaves), over_devices_of(leaves):
             traced = outermost().trace(*args, **kwargs)
             return traced.lower(lowering_platforms=lowering_platforms())
 
     call.__dict__["lower"] = lower
     return cast(Jitted[_P, _R], call)
+
+
+def number_types(leaves: Sequence[Any] = ()) -> contextlib.AbstractContextManager[Any]:
+    """Compute in JAX's 32-bit mode, unless a configuration among the `leaves` is of float64.
+
+    A program may be in the 64-bit mode for another package. Numbers without a type of their own, as
+    of `jnp.zeros` or an optimiser's schedule, would be float64 in it, and results other ones.
+    """
+    wide = any(getattr(leaf, "compute_dtype", None) == "float64" for leaf in leaves)
+    return contextlib.nullcontext() if wide else jax.enable_x64(False)
 
 
 def _precision_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[None]:

@@ -1,6 +1,10 @@
 """The errors that a command ends with in one line: bad input, and a signal."""
 
 import signal
+from collections.abc import Sequence
+
+_MOST = 3
+"""Number of problems that one message lists."""
 
 
 class InputError(ValueError):
@@ -14,6 +18,17 @@ class InputError(ValueError):
 def how_ended(number: int) -> str:
     """Say by which signal a program ends, in the words of every command."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+
+
+def few(problems: Sequence[str]) -> str:
+    """Join problems to one line: the first three, and how many more there are.
+
+    Example:
+        >>> few([f"{letter} missing" for letter in "abcde"])
+        'a missing; b missing; c missing; and 2 more'
+    """
+    more = [f"and {len(problems) - _MOST} more"] if len(problems) > _MOST else []
+    return "; ".join([*problems[:_MOST], *more])
 
 
 class Stopped(Exception):

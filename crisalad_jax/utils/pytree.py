@@ -71,7 +71,7 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
 
 
 def check_drawn(tree: Any, where: str) -> None:
-    """Check that new parameters are arrays of numbers that can train, in float32 at least.
+    """Check that new parameters are float32 arrays.
 
     An array of no numbers is no parameter: optimisers divide by its size. None stands for it.
 
@@ -80,7 +80,7 @@ def check_drawn(tree: Any, where: str) -> None:
     """
     for name, leaf in named_leaves(tree).items():
         dtype = getattr(leaf, "dtype", type(leaf).__name__)
-        if dtype not in (jnp.float32, jnp.float64):
+        if dtype != jnp.float32:
             path = f" {name}" if name else ""
             raise InputError(f"{where}: found parameter{path} of type {dtype}, expected float32")
         if not leaf.size:

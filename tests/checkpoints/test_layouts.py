@@ -203,7 +203,7 @@ def small(name: str) -> tuple[dict[str, np.ndarray], ModelConfig]:
 
 
 @pytest.mark.parametrize("layout", ["dinov2", "huggingface"])
-def test_all_that_is_wrong_is_listed_at_once(layout: str) -> None:
+def test_the_first_of_what_is_wrong_is_listed(layout: str) -> None:
     state, config = small(layout)
     norm, token = {
         "dinov2": ("norm.weight", "cls_token"),
@@ -218,13 +218,9 @@ def test_all_that_is_wrong_is_listed_at_once(layout: str) -> None:
     assert message.startswith(
         f"file.pth: does not fit the layout {layout} of width 64 and 2 blocks"
     )
-    for words in (
-        f"{norm} missing",
-        "head.weight unknown",
-        f"{token} found (1, 64), expected (1, 1, 64)",
-        "blocks.9.x unknown; blocks.10.x unknown",
-    ):
-        assert words in message
+    # The others are `head.weight`, unknown, and the norm, missing.
+    first = f"blocks.9.x unknown; blocks.10.x unknown; {token} found (1, 64), expected (1, 1, 64)"
+    assert message.endswith(f": {first}; and 2 more")
     assert "\n" not in message
 
 

@@ -19,7 +19,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
 
@@ -200,7 +200,7 @@ def to_params(
     DINOv2's mask token, the batch norms' counts of batches, DINOv3's periods.
 
     Raises:
-        InputError: naming `source` and every name that is missing, unknown or misshaped.
+        InputError: naming `source` and the first names that are missing, unknown or misshaped.
     """
     shapes = public_shapes(config, layout)
     for line in table(config, layout):
@@ -218,7 +218,7 @@ def to_params(
     if problems:
         raise InputError(
             f"{source}: does not fit the layout {layout} of {_size(config)}: "
-            f"{'; '.join(sorted(problems, key=_natural))}"
+            f"{few(sorted(problems, key=_natural))}"
         )
     template = named_leaves(parameter_shapes(config))
     ours: dict[str, np.ndarray] = {}

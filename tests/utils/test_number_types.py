@@ -1,0 +1,282 @@
+"""The same bits, types, files and digests whether or not a program has JAX's 64-bit mode on."""
+
+import dataclasses
+import functools
+import json
+import pathlib
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import safetensors
+
+from crisalad_jax.checkpoints.export import ExportConfig, export_model
+from crisalad_jax.checkpoints.load import load
+from crisalad_jax.checkpoints.starter import FILE
+from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
+from crisalad_jax.data.places import read_places
+from crisalad_jax.losses import LOSSES, LossConfig, metric_loss
+from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
+from crisalad_jax.nn.aggregators.base import TokenShape
+from crisalad_jax.nn.config import PRESETS, ModelConfig, with_aggregator
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import check_params, describe, init_crisalad, parameter_shapes
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.optimiser import make_optimiser
+from crisalad_jax.training.step import init_train_state, make_train_step, step_config
+from crisalad_jax.training.vocabulary import with_vocabulary
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import MODEL, RECIPE, assert_equal, random_params
+
+IMAGES = np.random.default_rng(0).integers(0, 256, (4, *MODEL.image_size, 3), np.uint8)
+LABELS = np.array([0, 0, 1, 1])
+PARAMS = random_params(MODEL)
+
+
+def in_both_modes(make: Callable[[], Any]) -> Any:
+    """What `make` returns, which must be the same to the bit in both modes."""
+    expected = make()
+    with jax.enable_x64(True):
+        found = make()
+    assert_equal(found, expected)
+    return found
+
+
+@pytest.mark.parametrize("name", AGGREGATORS.names())
+def test_parameters_are_float32_and_the_same(name: str) -> None:
+    alone = CrossImageConfig(layers=0)
+    config = with_aggregator(PRESETS["tiny"], name, "tiny", cross_image=alone)
+    params = in_both_modes(lambda: init_crisalad(jax.random.key(2), config))
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Shifted(Aggregator):
+    """As people write them: of JAX's default types."""
+
+    def token_shape(self, dim: int) -> TokenShape:
+        return TokenShape(dim, 0, dim)
+
+    def init(self, key: Any, backbone: Any, grid: Any) -> Any:
+        return {"shift": jax.random.normal(key, (backbone.dim,)), "scale": jnp.ones(())}
+
+    def apply(self, params: Any, features: Any, grid: Any, *, key: Any) -> Tokens:
+        weights = jnp.linspace(0.0, 1.0, features.patches.shape[-2])
+        mean = jnp.einsum("p,...pd->...d", weights, features.patches)
+        return Tokens.of_global(params["scale"] * mean + params["shift"])
+
+
+@pytest.mark.usefixtures("own_parts")
+def test_so_are_those_and_the_descriptors_of_a_plug_in() -> None:
+    AGGREGATORS.register("shifted")(Shifted)
+    config = ModelConfig(
+        image_size=MODEL.image_size,
+        backbone=MODEL.backbone,
+        aggregator=Shifted(),
+        cross_image=CrossImageConfig(layers=0),
+    )
+    params = in_both_modes(lambda: init_crisalad(jax.random.key(2), config))
+    in_both_modes(lambda: describe(params, IMAGES, config))
+
+
+def test_descriptors_are_the_same() -> None:
+    how = dataclasses.replace(MODEL.preprocessing, normalisation="local-contrast")
+    config = dataclasses.replace(MODEL, preprocessing=how)
+    in_both_modes(lambda: describe(PARAMS, IMAGES, config, key=jax.random.key(1)))  # of dropout
+
+
+def test_so_are_gradients_within_a_program_of_the_users() -> None:
+    @jax.jit
+    @jax.grad
+    def slope(params: Any) -> jax.Array:
+        return describe(params, IMAGES, MODEL, key=jax.random.key(1))[:, ::7].sum()
+
+    in_both_modes(lambda: slope(PARAMS))
+
+
+def test_no_number_of_a_program_is_float64() -> None:
+    with jax.enable_x64(True):
+        traced = jax.make_jaxpr(functools.partial(describe, config=MODEL))(PARAMS, IMAGES)
+        wide = dataclasses.replace(MODEL, compute_dtype="float64")
+        truly = jax.make_jaxpr(functools.partial(describe, config=wide))(PARAMS, IMAGES)
+    assert not re.search(r"\b[fi]64\b", str(traced))
+    assert "f64" in str(truly)
+
+
+def test_a_training_step_is_the_same() -> None:
+    """With Adam's own numbers, and those of an optimiser of JAX's default types."""
+
+    def init(_: Any) -> Any:
+        return jnp.zeros(())
+
+    def update(updates: Any, state: Any, params: Any = None) -> Any:
+        scale = 1 / (1.7 + state)
+        return jax.tree.map(lambda each: scale * each, updates), state + 1 / 3
+
+    optimiser = optax.chain(
+        make_optimiser(RECIPE.optimiser, steps=8), optax.GradientTransformation(init, update)
+    )
+    options = {"steps": 8, "optimiser": optimiser}
+
+    def train() -> Any:
+        step = make_train_step(RECIPE, **options)
+        state, frozen = init_train_state(PARAMS, "all", step_config(RECIPE, **options))
+        for _ in range(3):
+            labels = jnp.asarray(LABELS)  # int64 in the 64-bit mode
+            state, metrics = step(state, frozen, IMAGES, labels, jax.random.key(4))
+        return state, metrics
+
+    in_both_modes(train)
+
+
+@pytest.mark.parametrize("name", LOSSES.names())
+def test_losses_of_float32_are_float32(name: str) -> None:
+    rows = np.random.default_rng(0).normal(size=(4, 6)).astype(np.float32)
+    config = LossConfig(kind=LOSSES.make(name), miner="none")
+    if config.kind.grouping is not None or config.kind.reads_dense:
+        pytest.skip("takes more than descriptors; the training step is tested above")
+    with jax.enable_x64(True):
+        assert metric_loss(jnp.asarray(rows), jnp.asarray(LABELS), config).loss.dtype == jnp.float32
+
+
+def test_files_and_digests_are_the_same(tmp_path: pathlib.Path) -> None:
+    params = init_crisalad(jax.random.key(0), MODEL)
+    save_weights(tmp_path / "narrow.safetensors", params, MODEL)
+    with jax.enable_x64(True):
+        save_weights(tmp_path / "wide.safetensors", init_crisalad(jax.random.key(0), MODEL), MODEL)
+        loaded, config = load_weights(tmp_path / "narrow.safetensors", MODEL)
+    assert_equal(loaded, params)
+    assert model_hash(loaded, config) == model_hash(params, MODEL)
+    files = [(tmp_path / f"{name}.safetensors").read_bytes() for name in ("narrow", "wide")]
+    assert files[0] == files[1]
+
+
+@pytest.mark.usefixtures("_unchecked")  # symbolic shapes
+def test_an_exported_program_is_the_same() -> None:
+    def exported() -> bytes:
+        return bytes(export_model(PARAMS, MODEL, ExportConfig()).serialize())
+
+    expected = exported()
+    with jax.enable_x64(True):
+        assert exported() == expected
+
+
+def test_a_vocabulary_is_the_same(shared: pathlib.Path) -> None:
+    alone = CrossImageConfig(layers=0)
+    config = dataclasses.replace(
+        with_aggregator(PRESETS["tiny"], "netvlad", "tiny", cross_image=alone), image_size=(42, 56)
+    )
+    params = init_crisalad(jax.random.key(0), config)
+    paths = sorted((shared / "city" / "Images").rglob("*.jpg"))
+    in_both_modes(lambda: with_vocabulary(params, config, paths))
+
+
+def test_a_run_that_is_extended_in_the_other_mode_is_the_run_itself(
+    shared: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    places = read_places(shared / "city", min_images=2)
+    half = dataclasses.replace(
+        RECIPE, epochs=1, optimiser=dataclasses.replace(RECIPE.optimiser, decay_steps=6)
+    )
+    whole = dataclasses.replace(half, epochs=2)
+    expected = fit(whole, places, tmp_path / "whole", quiet=True)
+    modes = (False, True)
+    for first in modes:
+        run = tmp_path / f"{first}"
+        with jax.enable_x64(first):
+            fit(half, places, run, quiet=True)
+        with jax.enable_x64(not first):
+            found = fit(whole, places, run, quiet=True)
+        assert_equal(found.params, expected.params)
+
+
+BY_ITSELF = """
+import json, sys
+import jax
+import numpy as np
+import crisalad_jax as cj
+from crisalad_jax.checkpoints.weights import model_hash
+params, config = cj.load("starter")
+images = np.random.default_rng(0).integers(0, 256, (1, 96, 128, 3), np.uint8)
+found = np.asarray(cj.describe(params, images, config))
+print(json.dumps([jax.config.jax_enable_x64, str(found.dtype), found.tobytes().hex(),
+    model_hash(params, config)]))
+"""
+
+
+def test_the_starter_loads_and_describes_in_a_program_of_the_64_bit_mode(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with safetensors.safe_open(FILE, framework="numpy") as file:
+        (value,) = file.metadata().values()
+    found = {}
+    for mode in ("0", "1"):
+        monkeypatch.setenv("JAX_ENABLE_X64", mode)
+        done = subprocess.run(
+            [sys.executable, "-c", BY_ITSELF], capture_output=True, text=True, check=True
+        )
+        found[mode] = json.loads(done.stdout)
+    assert found["1"][0] is True
+    assert found["1"][1:] == found["0"][1:]
+    # What the file itself says of its parameters.
+    assert found["1"][3] == json.loads(value)["model_sha256"]
+
+
+def wide(params: Any, make: Any = np.asarray) -> Any:
+    return jax.tree.map(lambda leaf: make(np.asarray(leaf, np.float64)), params)
+
+
+def test_float64_parameters_are_told_unless_the_model_computes_in_float64() -> None:
+    count = len(jax.tree.leaves(PARAMS))
+    message = rf"^params: found float64: .*; and {count - 3} more; expected float32, or ModelConf"
+    with pytest.raises(InputError, match=message):
+        describe(wide(PARAMS), IMAGES, MODEL)  # NumPy's, which JAX would make float32
+    config = dataclasses.replace(MODEL, compute_dtype="float64")
+    with jax.enable_x64(True):
+        with pytest.raises(InputError, match=message):
+            describe(wide(PARAMS, jnp.asarray), IMAGES, MODEL)
+        with pytest.raises(InputError, match=r"found float64 .*, expected float32"):
+            check_params(wide(PARAMS), MODEL, stored=True)
+        found = describe(wide(PARAMS, jnp.asarray), IMAGES, config)
+        assert found.dtype == jnp.float64
+        # They hold the same numbers.
+        np.testing.assert_array_equal(describe(PARAMS, IMAGES, config), found)
+    # Float32 keeps 6e-8 of a number; some tens of layers add up to some tens of that.
+    np.testing.assert_allclose(describe(PARAMS, IMAGES, MODEL), found, atol=3e-6)
+
+
+def test_a_model_of_float64_is_refused_in_the_32_bit_mode() -> None:
+    config = dataclasses.replace(MODEL, compute_dtype="float64")
+    message = r"^ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected JAX_ENA"
+    with pytest.raises(InputError, match=message):
+        describe(PARAMS, IMAGES, config)
+    static = step_config(dataclasses.replace(RECIPE, model=config), steps=8)
+    with pytest.raises(InputError, match=message):
+        init_train_state(PARAMS, "all", static)
+
+
+def test_a_file_of_another_model_lists_three_misfits_and_counts_the_others(
+    tmp_path: pathlib.Path,
+) -> None:
+    path = tmp_path / "w.safetensors"
+    save_weights(path, PARAMS, MODEL)
+    with safetensors.safe_open(path, framework="numpy") as file:
+        metadata = file.metadata()
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    wider = {name: np.stack([array, array]) for name, array in arrays.items()}
+    safetensors.numpy.save_file(wider, path, metadata)
+    with pytest.raises(InputError) as caught:
+        load(path, verify=False)
+    text = str(caught.value).removeprefix(str(path))
+    count = len(jax.tree.leaves(parameter_shapes(MODEL)))
+    assert text.count("; ") == 3
+    assert text.endswith(f"; and {count - 3} more")
+    assert len(text) < 400
