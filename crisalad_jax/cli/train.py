@@ -26,7 +26,6 @@ COMMON = (
     "out",
     "place-radius",
     "place-frames",
-    "positions",
     "val",
     "weights",
     "backbone",
@@ -41,8 +40,6 @@ COMMON = (
     "optimiser.learning-rate",
     "trainable",
     "model.aggregator",
-    "micro-batch",
-    "patience",
     "on-bad-image",
     "json",
 )

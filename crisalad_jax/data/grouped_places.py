@@ -14,7 +14,7 @@ import numpy as np
 
 from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.metres import continuous, to_metres
+from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.own_places import OwnPlaces
 from crisalad_jax.data.positions import AXES, Positions, read_positions, utm_positions
 from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
@@ -147,10 +147,7 @@ def _positions(
 def _points(positions: Positions, names: list[str]) -> Float64[np.ndarray, "images axis"]:
     """Return points in metres whose straight distances are those on the ground."""
     points = np.array([positions.of[name] for name in names], np.float64)
-    if positions.axes != AXES[1]:
-        return points
-    latitude, longitude = points.T
-    return np.stack(to_metres(latitude, continuous(longitude)), axis=1)
+    return comparable(*points.T) if positions.axes == AXES[1] else points
 
 
 def _centres(

@@ -81,6 +81,19 @@ def test_degrees_are_metres_of_utm(tmp_path):
     assert _near(places) == [[1], [0], []]
 
 
+def test_degrees_of_two_zones_of_utm(tmp_path):
+    # At 50 degrees 0.0002 of longitude are 111,320 m x cos 50 x 0.0002 = 14.3 m; zone 32 begins
+    # at 6 degrees east.
+    for name in "ab":
+        (tmp_path / f"{name}.jpg").write_bytes(b"")
+    (tmp_path / "t.csv").write_text("name,lat,lon\na.jpg,50,5.9999\nb.jpg,50,6.0001\n")
+    counts = [
+        read_places(tmp_path / "t.csv", place_radius=radius, min_images=1).image_counts.tolist()
+        for radius in (14, 15)
+    ]
+    assert counts == [[1, 1], [2]]
+
+
 def test_names_say_where(tmp_path):
     for east in (500_000, 500_003, 500_500):
         write_picture(tmp_path / f"@{east}.00@5000000.00@10@T@@@@@@@@@@@.jpg", 0)
