@@ -340,7 +340,7 @@ def test_missing_files_are_listed_to_be_skipped(root, tmp_path):
     assert source.names == [*missing, "run/right/2.jpg"]
     (root / "some.csv").write_text("name,x,y\n" + "".join(f"{line},1,2\n" for line in missing[::2]))
     source = open_source(root / "some.csv", on_bad_image="skip")
-    assert source.positions == (("x", "y"), dict.fromkeys(missing[::2], (1.0, 2.0)))
+    assert source.positions[:2] == (("x", "y"), dict.fromkeys(missing[::2], (1.0, 2.0)))
     assert open_source(root / "gone.jpg", on_bad_image="skip").names == ["gone.jpg"]
     batches = image_batches(source.paths, image_size=(9, 9), batch_size=2, on_bad_image="skip")
     assert [batch.valid.tolist() for batch in batches] == [[False, False]]

@@ -83,7 +83,7 @@ def test_what_is_shown_is_of_the_right_class(params, benchmark):
     """Each is one line that names the argument; the order of a model's calls is refused too."""
     picture = PIL.Image.open(benchmark.queries[0])
     for arguments, words in (
-        ((picture, params, MODEL), "image: found JpegImageFile, expected uint8 of shape"),
+        ((picture, params, MODEL), "image: found JpegImageFile, expected uint8 or uint16"),
         ((params, picture, MODEL), "image: found parameters, .* show_transport\\(image, params, c"),
     ):
         with pytest.raises(cj.InputError, match=words):
