@@ -22,7 +22,7 @@ from crisalad_jax.checkpoints.layouts import (
     LAYOUTS,
     State,
     check_holds,
-    infer,
+    identify,
     public_shapes,
     renamed_to,
     to_params,
@@ -140,11 +140,12 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     if is_ours(path):
         params, config = load_weights(path, verify=verify)
         return Checkpoint(params, config, load_extras(path), None)
-    state, config = _unwrap(_read(path), path)
-    layout = "reference"
+    content = _read(path)
+    state, config = _unwrap(content, path)
+    layout, metadata = "reference", {}
     if config is None:
         text = state.settings
-        layout, config, state = infer(state, source=str(path))
+        layout, config, state = identify(state, source=str(path))
         if text is not None:
             ours = from_plain(ModelConfig, _json(text, path), source=f"{path} ({_SETTINGS})")
             config = with_free_fields_of(ours, config)
@@ -156,9 +157,15 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
         )
     else:
         state = renamed_to(state, public_shapes(config, layout).keys())
+        metadata = content.get("aggregator", {})
     state = {name: _float32(name, array, path) for name, array in state.items()}
     params, extras = to_params(state, config, layout, source=str(path))
-    return Checkpoint(jax.tree.map(jnp.asarray, params), config, extras, layout)
+    params = jax.tree.map(jnp.asarray, params)
+    if metadata:
+        own = config.aggregator.with_metadata(params.aggregator, metadata)
+        config.aggregator.check_backbone(own, params.backbone, str(path))
+        params = dataclasses.replace(params, aggregator=own)
+    return Checkpoint(params, config, extras, layout)
 
 
 def read_vocabulary(
@@ -432,6 +439,8 @@ def write_checkpoint(
         (content,) = content.values()
     if layout == "reference":
         content["config"] = json.dumps(to_plain(config))
+        if own := config.aggregator.metadata(params.aggregator):
+            content["aggregator"] = own
     # Pass an open file, because torch writes the name of a path into the archive.
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         try:

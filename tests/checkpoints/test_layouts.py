@@ -71,7 +71,7 @@ def expected(name: str) -> tuple[str, ModelConfig]:
 @pytest.mark.parametrize("name", PUBLIC)
 def test_a_public_layout_is_read_to_the_name_and_its_model_inferred(name: str) -> None:
     shapes = inner(name)
-    layout, config, _ = infer(blank(shapes), source=name)
+    layout, config = infer(blank(shapes), source=name)
     assert (layout, config) == expected(name)
     assert list(public_shapes(config, layout).items()) == list(shapes.items())
 
@@ -264,7 +264,7 @@ def test_what_is_no_model_is_refused(change, words: str) -> None:
 def test_a_missing_block_leaves_those_after_it_unknown() -> None:
     shapes = inner("dinov2_vits14")
     state = blank({k: s for k, s in shapes.items() if not k.startswith("blocks.5.")})
-    layout, config, _ = infer(state, source="file.pth")
+    layout, config = infer(state, source="file.pth")
     assert config.backbone.depth == 5
     with pytest.raises(InputError, match=r"of 5 blocks|5 blocks: blocks.6.attn.proj.bias unknown"):
         to_params(state, config, layout, source="file.pth")
@@ -298,7 +298,7 @@ def test_unusual_widths_are_inferred() -> None:
         cross_image=CrossImageConfig(layers=1, feedforward=40),
     )
     state = blank(public_shapes(config, "reference"))
-    assert infer(state, source="state")[:2] == ("reference", config)
+    assert infer(state, source="state") == ("reference", config)
 
 
 @pytest.mark.parametrize("dustbin", ["token", "mass", "none"])

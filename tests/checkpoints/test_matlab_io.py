@@ -40,7 +40,7 @@ def matlab_state(hloc: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def small_network(average: np.ndarray) -> dict[str, np.ndarray]:
     """A whole NetVLAD of two clusters and three numbers, with an average image."""
     config = dataclasses.replace(
-        infer(blank(zoo.layout("netvlad_vgg16_hloc_mat")), source="zoo").config,
+        infer(blank(zoo.layout("netvlad_vgg16_hloc_mat")), source="zoo")[1],
         aggregator=NetVladConfig(clusters=2),
         projection=ProjectionConfig(dim=3),
     )
@@ -166,7 +166,7 @@ def test_matlabs_file_is_hlocs_module_and_goes_back(tmp_path: pathlib.Path) -> N
     write_matlab(tmp_path / "Pitts30K_struct.mat", state, None)
     read = read_checkpoint(tmp_path / "Pitts30K_struct.mat")
     assert read.layout == "netvlad-matlab"
-    layout, config, _ = infer(hloc, source="hloc")
+    layout, config = infer(hloc, source="hloc")
     assert (layout, read.config) == ("netvlad-hloc", config)
     params, _ = to_params(hloc, config, layout, source="hloc")
     jax.tree.map(np.testing.assert_array_equal, read.params, params)

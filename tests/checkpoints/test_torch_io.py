@@ -24,6 +24,7 @@ from crisalad_jax.checkpoints.torch_io import (
 )
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -250,6 +251,24 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
         for each in (content, whole):
             del each["config"]
         assert same_bits(content, whole)
+
+
+def test_a_vocabulary_comes_back_with_its_backbones_digest(tmp_path: pathlib.Path) -> None:
+    config = dataclasses.replace(
+        MODEL, aggregator=AnyLocConfig(layer=0), cross_image=CrossImageConfig(layers=0)
+    )
+    params = random_params(config)
+    bound = config.aggregator.bind(params.aggregator, params.backbone)
+    save_weights(
+        tmp_path / "ours.safetensors", dataclasses.replace(params, aggregator=bound), config
+    )
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", "reference")
+    again = read_checkpoint(tmp_path / "back.pth")
+    assert again.params.aggregator.backbone == bound.backbone is not None
+    content = torch.load(tmp_path / "back.pth")
+    content["state_dict"]["backbone.norm.bias"] += 1
+    with pytest.raises(InputError, match="found a vocabulary of another backbone"):
+        read_checkpoint(save(tmp_path / "other.pth", content))
 
 
 def test_settings_of_a_file_that_are_none_are_refused(tmp_path: pathlib.Path) -> None:

@@ -84,7 +84,7 @@ def test_vgg_16s_names_and_shapes() -> None:
     assert len(shapes) == 32
     assert sum(int(np.prod(shape)) for shape in shapes.values()) == 138_357_544
     blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
-    layout, found, _ = infer(blank, source="vgg16.pth")
+    layout, found = infer(blank, source="vgg16.pth")
     assert (layout, found.backbone) == ("torchvision-vgg", VggConfig())
 
 

@@ -13,6 +13,7 @@ from crisalad_jax.checkpoints.layouts.base import LAYOUTS as LAYOUTS
 from crisalad_jax.checkpoints.layouts.base import Layout as Layout
 from crisalad_jax.checkpoints.layouts.base import State as State
 from crisalad_jax.checkpoints.layouts.table import check_holds as check_holds
+from crisalad_jax.checkpoints.layouts.table import identify as identify
 from crisalad_jax.checkpoints.layouts.table import infer as infer
 from crisalad_jax.checkpoints.layouts.table import public_shapes as public_shapes
 from crisalad_jax.checkpoints.layouts.table import renamed_to as renamed_to

@@ -49,7 +49,12 @@ class Inferred(NamedTuple):
     """The arrays by the layout's own names."""
 
 
-def infer(state: State, *, source: str) -> Inferred:
+def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
+    """Return the layout and the configuration that `identify` infers, and raise what it raises."""
+    return identify(state, source=source)[:2]
+
+
+def identify(state: State, *, source: str) -> Inferred:
     """Infer the layout and the configuration of a state, from its names and shapes.
 
     Settings that no shape shows are the published ones: heads of width 64 in the backbone, 16 heads
@@ -146,7 +151,7 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
     shapes = public_shapes(config, layout)
     blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
     blank |= {line.theirs: line.stored(extras or {}) for line in lines}
-    read_back = infer(blank, source=f"layout {layout}").config
+    read_back = infer(blank, source=f"layout {layout}")[1]
     wrong = differences(_told(with_free_fields_of(config, read_back)), _told(config))
     if wrong:
         raise InputError(
