@@ -16,7 +16,7 @@ from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.own_places import OwnPlaces
-from crisalad_jax.data.positions import AXES, Positions, read_positions, utm_positions
+from crisalad_jax.data.positions import AXES, Positions, positions_of, utm_positions
 from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.utils.errors import InputError
@@ -135,13 +135,7 @@ def _positions(
         if found.of or len(pictures) < len(source.paths):
             return found
         return exif_positions(zip(source.names, pictures, strict=True))
-    found = read_positions(table)
-    if found.of.keys().isdisjoint(source.names):
-        raise InputError(
-            f"{table}: found none of the {len(source.names)} images of {root}, expected names such "
-            f"as {source.names[0]!r}"
-        )
-    return found
+    return positions_of(table, source.names, root)
 
 
 def _points(positions: Positions, names: list[str]) -> Float64[np.ndarray, "images axis"]:

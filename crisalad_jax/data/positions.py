@@ -11,6 +11,7 @@ import numpy as np
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.named_table import NamedRow, named_rows
+from crisalad_jax.data.names import matched
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64
 
@@ -201,6 +202,33 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
     positions = _read_table(pathlib.Path(path), must=True).positions
     assert positions is not None
     return positions
+
+
+def positions_of(
+    given: Positions | str | os.PathLike[str],
+    names: Sequence[str],
+    images: str | os.PathLike[str],
+) -> Positions:
+    """Return given positions, or those of a table, under the names that images have on disk.
+
+    Args:
+        given: by name, or a table's file; names of other images stay in it.
+        names: of the images.
+        images: where these are, for messages.
+
+    Raises:
+        InputError: none of the images is named; or what `read_positions` raises.
+    """
+    positions = given if isinstance(given, Positions) else read_positions(given)
+    meant = matched(positions.of, frozenset(names))
+    if not meant:
+        source = "positions" if isinstance(given, Positions) else given
+        raise InputError(
+            f"{source}: found none of the {len(names)} images of {images}, expected names such as "
+            f"{names[0]!r}"
+        )
+    of = {meant.get(name, name): position for name, position in positions.of.items()}
+    return positions._replace(of=of)
 
 
 def read_image_table(path: str | os.PathLike[str]) -> ImageTable:

@@ -94,6 +94,19 @@ def test_degrees_of_two_zones_of_utm(tmp_path):
     assert counts == [[1, 1], [2]]
 
 
+def test_places_across_zones_and_across_the_world(tmp_path):
+    """14 m apart across the edge of zones 31 and 32 is one place; equal numbers are two."""
+    names = ("@0720065.35@5415121.13@31@U@.jpg", "@0279934.65@5415121.13@32@U@.jpg")
+    far = "@0720065.35@5415121.13@10@U@.jpg"
+    for name in (*names, far):
+        (tmp_path / name).write_bytes(b"")
+    places = read_places(tmp_path, place_radius=20, min_images=1)
+    found = {places.names[place]: [] for place in range(2)}
+    for file, place in zip(places.files, places.image_place, strict=True):
+        found[places.names[place]].append(file)
+    assert sorted(map(sorted, found.values())) == sorted([[far], sorted(names)])
+
+
 def test_names_say_where(tmp_path):
     for east in (500_000, 500_003, 500_500):
         write_picture(tmp_path / f"@{east}.00@5000000.00@10@T@@@@@@@@@@@.jpg", 0)

@@ -8,8 +8,8 @@ import pytest
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.names import Disk, matched
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.positions import positions_of
 from crisalad_jax.data.sources import open_source
-from crisalad_jax.retrieval.maps.build import _positions
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.test_netvlad import write as write_mat
 from tests.data.benchmarks.trees import lists_of, touch
@@ -56,7 +56,7 @@ def test_every_table_finds_its_images(tmp_path, cafe, written):
     assert source.positions.of == {name: (1, 2)}
     (folder / "list.txt").write_text(f"{written}\n", encoding="utf-8")
     assert open_source(folder / "list.txt").names == [name]
-    assert _positions(folder / "images.csv", folder, [name]).of == {name: (1, 2)}
+    assert positions_of(folder / "images.csv", [name], folder).of == {name: (1, 2)}
 
 
 @pytest.mark.parametrize(("cafe", "written"), WAYS)

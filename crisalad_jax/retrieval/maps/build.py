@@ -14,8 +14,7 @@ from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.names import matched
-from crisalad_jax.data.positions import AXES, Positions, read_positions, utm_positions
+from crisalad_jax.data.positions import AXES, Positions, positions_of, utm_positions
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig
@@ -256,7 +255,10 @@ def index(
     source = open_source(images, fps=fps, on_bad_image=on_bad_image)
     check_rate_used(fps, source.paths)
     table = source.positions if positions is None else positions
-    known = _positions(table, images, source.names)
+    if table is None:
+        known = utm_positions(source.names)
+    else:
+        known = positions_of(table, source.names, images)
     by_exif = table is None and not known.of
     if table is None and known.axes == AXES[1] and description is None:
         tell(f"{images}: the names are of several zones of UTM: positions become lat, lon")
@@ -390,27 +392,6 @@ def _index_share(
         positions=sum(each["positions"] for each in counts),
         unreadable=[name for each in counts for name in each["unreadable"]],
     )
-
-
-def _positions(
-    given: Positions | str | os.PathLike[str] | None,
-    images: str | os.PathLike[str],
-    names: Sequence[str],
-) -> Positions:
-    """Read the positions of the images; a table has to name at least one of them."""
-    if given is None:
-        return utm_positions(names)
-    positions = given if isinstance(given, Positions) else read_positions(given)
-    meant = matched(positions.of, frozenset(names))
-    of = {meant.get(name, name): position for name, position in positions.of.items()}
-    positions = positions._replace(of=of)
-    if positions.of.keys().isdisjoint(names):
-        source = "positions" if isinstance(given, Positions) else given
-        raise InputError(
-            f"{source}: found none of the {len(names)} images of {images}, expected names such as "
-            f"{names[0]!r}"
-        )
-    return positions
 
 
 def _by_exif(target: Map | None, names: Sequence[str], paths: Sequence[pathlib.Path]) -> Positions:

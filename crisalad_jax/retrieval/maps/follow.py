@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from crisalad_jax.config.concise import brief
-from crisalad_jax.data.metres import continuous, to_metres
+from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.moments import moment_of
-from crisalad_jax.data.positions import AXES, utm_position
+from crisalad_jax.data.positions import AXES, utm_positions
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.sequence import BayesFilter, SequenceState
 from crisalad_jax.utils.notes import tell
@@ -136,14 +136,13 @@ def _when(name: str) -> _Spot | None:
 
 
 def _where(name: str) -> _Spot | None:
-    position = utm_position(pathlib.PurePath(name).name)
-    return position and ("", position)
+    found = utm_positions([pathlib.PurePath(name).name])
+    # Two zones are two clocks: their metres say nothing of how far the camera moved.
+    return (str(found.zone), next(iter(found.of.values()))) if found.of else None
 
 
 def _metres(places: Map) -> Sequence[_Spot | None]:
     positions = [image.position for image in places.images]
     if places.axes == AXES[1] and None not in positions:
-        latitude, longitude = np.array(positions).T
-        east, north = to_metres(latitude, continuous(longitude))
-        positions = zip(east.tolist(), north.tolist(), strict=True)
+        positions = map(tuple, comparable(*np.array(positions).T).tolist())
     return [each and ("", each) for each in positions]
