@@ -527,12 +527,13 @@ def test_files_that_need_a_part_that_is_not_there_name_its_plug_in(
     ],
 )
 def test_where_a_part_is_from(module: str, home: str | None, monkeypatch) -> None:
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", "/some/where/train_mine.py")
+    path = "/some/where/train_mine.py"
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", path, raising=False)
     assert plugins.home_of(module) == home
 
 
 def test_of_a_notebook_nothing_is_recorded(monkeypatch) -> None:
-    monkeypatch.delattr(sys.modules["__main__"], "__file__")
+    monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
     assert plugins.home_of("__main__") is None
 
 
@@ -572,7 +573,8 @@ def test_a_step_a_dustbin_and_a_loss_are_trained_saved_and_told(
     assert 1e-4 < abs(learnt["step.log_epsilon"]) < 3e-3
     assert 1e-4 < abs(learnt["dust_bin.out"]).max() < 3e-3
     told = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert told["loss"]["kind"] == {"name": "soft-triplet", "scale": 10.0}
+    kind = {"name": "soft-triplet", "scale": 10.0, "plugin": "loss.py"}
+    assert told["loss"]["kind"] == kind
     # Another source behind the name is told, and nothing else is.
     data = ("evaluate", "--data", shared / "town", "--weights", weights, "--plugin", *files)
     rest = ("--batch-size", BATCH, "--grouping", "single", "--quiet")

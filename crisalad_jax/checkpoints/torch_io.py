@@ -192,8 +192,8 @@ def read_vocabulary(
     words = _read(path)
     if not isinstance(words, np.ndarray):
         raise InputError(
-            f"{path}: found {type(words).__name__}, expected one tensor by itself, of a "
-            "vocabulary's words"
+            f"{path}: found {'dict' if isinstance(words, dict) else type(words).__name__}, "
+            "expected one tensor by itself, of a vocabulary's words"
         )
     words = _float32("the vocabulary", words, path)
     base = read_checkpoint(backbone)

@@ -676,16 +676,15 @@ def self_mask(count: Any) -> Bool[Array, "image image"]:
 def valid_mask(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
     """Return the mask that lets valid images attend to each other, and the others to themselves.
 
-        Args:
-            valid: which images are no padding.
+    Args:
+        valid: which images are no padding.
 
-        Returns:
-            A mask for `describe`.
+    Returns:
+        A mask for `describe`.
 
-        Example:
-            >>> import jax.numpy as jnp
-    import numpy as np
-            >>> valid_mask(jnp.array([True, False])).tolist()
-            [[True, False], [False, True]]
+    Example:
+        >>> import jax.numpy as jnp
+        >>> valid_mask(jnp.array([True, False])).tolist()
+        [[True, False], [False, True]]
     """
     return valid[None, :] & valid[:, None] | jnp.eye(len(valid), dtype=bool)

@@ -158,7 +158,7 @@ TEXTS = [kind for kind in (*NAMES.values(), *RESULTS) if fields_of(kind) and kin
 
 @pytest.mark.parametrize("kind", [kind for kind in TEXTS if kind.__repr__ is not summary])
 def test_help_shows_the_texts_below_the_fields(kind):
-    shown = " ".join(pydoc.plain(pydoc.render_doc(kind)).replace(" | ", " ").split())
+    shown = " ".join(pydoc.plain(pydoc.render_doc(kind)).replace("\n |", "\n").split())
     for name in fields_of(kind).keys() & field_docs(kind).keys():
         assert f" {name}: {' '.join(field_docs(kind)[name].split())}" in shown
 

@@ -422,6 +422,7 @@ def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
         "positive_radius": 4.0,
         "negative_radius": 50.0,
         "images": street,
+        "on_bad_image": "stop",
     }
 
 
@@ -638,17 +639,20 @@ def test_a_set_without_positions_goes_by_its_ground_truth(tmp_path):
     assert [each.tolist() for each in found.near] == [[1, 2], [0]]
 
 
+WHOLE = MiningConfig(kind="whole")
+
+
 @pytest.mark.parametrize(
     ("config", "changes", "message"),
     [
-        (MiningConfig(), {"negatives": 0}, r"MiningConfig\.negatives: found 0"),
+        (WHOLE, {"negatives": 0}, r"MiningConfig\.negatives: found 0"),
         (
-            MiningConfig(),
+            WHOLE,
             {"candidates": 9},
             r"MiningConfig\.candidates: found 9, expected at l",
         ),
-        (MiningConfig(), {"positive_radius": 30.0}, r"positive_radius: found 30.0 beside"),
-        (MiningConfig(), {"margin": -1.0}, r"MiningConfig\.margin: found -1.0"),
+        (WHOLE, {"positive_radius": 30.0}, r"positive_radius: found 30.0 beside"),
+        (WHOLE, {"margin": -1.0}, r"MiningConfig\.margin: found -1.0"),
         (
             CONFIG,
             {"images_per_place": 5},

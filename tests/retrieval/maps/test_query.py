@@ -131,7 +131,12 @@ def test_lines_for_people(answers):
     image = answers.images[0]._replace(name="a[red].jpg", position=None)
     answers = answers._replace(images=[image] * 7)
     head, *lines = answer_lines(answers)
-    assert head.split() == ["rank", "similarity", "east,", "north", "name"]
+    assert head.split() == [
+        "rank",
+        "similarity",
+        *["east,", "north", "(zone", "10", "south)"],
+        "name",
+    ]
     assert lines[0] == answers.queries[0].name
     best = answers.neighbours.similarities[0, 0]
     assert lines[1].split() == ["1", f"{best:.3f}", "-", "a[red].jpg"]
