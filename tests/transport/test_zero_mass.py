@@ -182,6 +182,19 @@ def slope(at: Inputs, weights: Any, way: Way, init: Potentials | None = None) ->
     return jax.jit(jax.grad(loss, has_aux=True))(at)
 
 
+def balanced(gradient: Inputs, at: Inputs) -> Inputs:
+    """Leave out what a gradient says of marginals whose totals differ.
+
+    No balanced plan has them. Once Newton's method has converged, rounding decides whether its last
+    step is Newton's or Sinkhorn's, and these differ there by a multiple of the marginals.
+    """
+    mu, nu = jnp.exp(at.log_mu), jnp.exp(at.log_nu)
+    share = gradient.log_mu.sum(axis=-1, keepdims=True) / mu.sum(axis=-1, keepdims=True)
+    return gradient._replace(
+        log_mu=gradient.log_mu - share * mu, log_nu=gradient.log_nu + share * nu
+    )
+
+
 def assert_is_the_problem_without(found: Any, expected: Any) -> None:
     """Gradient and result, against those of the problem without what has no mass."""
     (gradient, result), (expected_gradient, wanted) = found, expected
@@ -218,6 +231,10 @@ def test_no_mass_is_the_problem_without(name: str) -> None:
     way, at = WAYS[name], whole()
     found = slope(at, jnp.asarray(WEIGHTS), way)
     expected = slope(reduced(at), jnp.asarray(without(WEIGHTS, True, True)), way)
+    if name == "unrolled, newton":
+        found, expected = (
+            (balanced(x[0], y), x[1]) for x, y in ((found, at), (expected, reduced(at)))
+        )
     assert_is_the_problem_without(found, expected)
     assert found[1].converged.all() == (way.config.tolerance is not None)
     # Rounding may decide whether a last change is within 1e-11.
