@@ -162,13 +162,13 @@ def plugin_of(module: str) -> str | None:
     return None if path is None else str(path)
 
 
-def home_of(module: str) -> str | None:
+def home_of(module: str | None) -> str | None:
     """Return what `--plugin` takes to load a part's module: a file's name, or the module.
 
     Files record it: no folder, so that a copy on another machine is the same. None for modules of
-    this package, and where there is no file, as in a notebook.
+    this package, and where there is no file or no module, as in a notebook or in `exec`.
     """
-    if module.partition(".")[0] == __name__.partition(".")[0]:
+    if module is None or module.partition(".")[0] == __name__.partition(".")[0]:
         return None
     file = plugin_of(module)
     if module == "__main__":

@@ -28,8 +28,8 @@ def _files_of(part: type[Part]) -> list[pathlib.Path] | None:
     base = part.registry.base
     classes = [each for each in part.__mro__ if issubclass(each, base) and each is not base]
     files: set[pathlib.Path] = set()
-    # How a part prints changes no descriptor, and `Part` sets it from a module of this package. From
-    # Python 3.13 on dataclasses have `__replace__`, of the standard library.
+    # How a part prints changes no descriptor, and `Part` sets it from a module of this package.
+    # `__replace__` is the standard library's, which Python 3.13 gives to dataclasses.
     unrelated = ("__repr__", "__replace__")
     methods = [f for each in classes for name, f in vars(each).items() if name not in unrelated]
     for member in [part, *methods]:

@@ -268,11 +268,11 @@ def test_an_interrupt_is_no_traceback(capfd, monkeypatch):
 
 def test_the_console_script_and_the_module_are_the_same_thing(tmp_path):
     """One process for real: nothing else may write to stderr, and the code must come through."""
-    write_picture(tmp_path / "a.jpg", 0)
-    spoil(tmp_path / "a.jpg", "cut")
+    write_picture(tmp_path / "photos" / "a.jpg", 0)
+    spoil(tmp_path / "photos" / "a.jpg", "cut")
     save_weights(tmp_path / "w.safetensors", random_params(MODEL), MODEL)
     command = [sys.executable, "-m", "crisalad_jax", "extract", "--quiet"]
-    command += ["--weights", "w.safetensors", "--images", ".", "--out", "d.npy"]
+    command += ["--weights", "w.safetensors", "--images", "photos", "--out", "d.npy"]
     root = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
     done = subprocess.run(
         command,
@@ -282,9 +282,9 @@ def test_the_console_script_and_the_module_are_the_same_thing(tmp_path):
         text=True,
     )
     assert done.returncode == 2
-    assert done.stderr.startswith("crisalad: a.jpg: found an image cut short")
+    assert done.stderr.startswith("crisalad: photos/a.jpg: found an image cut short")
     assert done.stderr.count("\n") == 1
-    assert files_in(tmp_path) == {"a.jpg", "w.safetensors"}
+    assert files_in(tmp_path) == {"photos/a.jpg", "w.safetensors"}
 
 
 @pytest.mark.parametrize("more", [("--help",), ("--preset", "tiny")])
@@ -506,8 +506,9 @@ def test_weights_of_another_configuration(capfd, tmp_path, shared):
     weights = shared / "weights.safetensors"
     fails(
         capfd,
-        *("train", "--preset", "tiny", "--data", shared / "city", "--out", tmp_path / "run"),
-        *("--weights", weights),
+        *("train", "--data", shared / "city", "--out", tmp_path / "run", "--min-images", "2"),
+        *("--places-per-batch", "2", "--images-per-place", "2"),
+        *("--weights", weights, "--model.backbone.dim", "128"),
         words=(f"crisalad: {weights}: ", "another model", "backbone.dim: found 32, expected 128"),
     )
     assert not (tmp_path / "run").exists()
