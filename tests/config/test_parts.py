@@ -3,10 +3,12 @@
 import abc
 import dataclasses
 import functools
+import pathlib
 from typing import Any
 
 import pytest
 
+from crisalad_jax.config import source
 from crisalad_jax.config.parts import (
     REGISTRIES,
     Part,
@@ -263,3 +265,12 @@ def test_fields_of_a_plug_ins_part_are_checked_before_its_own_check(birds: Regis
     assert Goose(eggs=4).eggs == 4
     with pytest.raises(InputError, match=r"^Goose\.eggs: found 'four', expected a whole number$"):
         birds.make("goose", eggs="four")
+
+
+@pytest.mark.parametrize("name", ["resnet", "hog"])
+def test_the_source_of_a_part_is_of_this_package_alone(name: str) -> None:
+    """Python's own files differ from version to version, and so would the digest."""
+    files = source._files_of(REGISTRIES["backbone"].find(name))
+    assert files is not None
+    package = pathlib.Path(source.__file__).parents[1]
+    assert all(package in file.parents for file in files)
