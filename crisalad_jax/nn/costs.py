@@ -150,10 +150,9 @@ def _walk(jaxpr: Any, scope: str, times: int, totals: "collections.Counter[str]"
 def _inner(equation: Any) -> Iterator[Any]:
     """Yield the inner programs (jaxprs) of an equation."""
     for value in equation.params.values():
-        if isinstance(value, core.ClosedJaxpr):
-            yield value.jaxpr
-        elif isinstance(value, core.Jaxpr):
-            yield value
+        inner = getattr(value, "jaxpr", value)  # a closed one has it
+        if isinstance(inner, core.Jaxpr):
+            yield inner
 
 
 def _macs(equation: Any, name: str, scope: str) -> int:

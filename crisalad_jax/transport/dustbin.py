@@ -6,6 +6,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.concise import brief
@@ -212,7 +213,7 @@ def append_dustbin(
 
 
 def log_marginals(
-    rows: int, clusters: int, dtype: jnp.dtype | type = jnp.float32
+    rows: int, clusters: int, dtype: DTypeLike = jnp.float32
 ) -> tuple[Float[Array, " {rows}"], Float[Array, " {clusters}+1"]]:
     """Compute SALAD's marginals: each row has mass 1, each cluster 1, the dustbin the rest.
 

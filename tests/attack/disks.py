@@ -4,7 +4,8 @@
 
 Ways: `disk` is a small file system in memory, which needs root, in a mount namespace of this
 process. `limit` is a limit on the size of a file, which needs nothing. Without --ways the first is
-taken where it can be, else the second. `read-only` and `removed` are folders.
+taken where it can be, else the second. `read-only` and `removed` are folders; root cannot be
+refused a folder where nothing can be mounted.
 """
 
 import argparse
@@ -337,7 +338,9 @@ def main() -> int:
     parser.add_argument("--sizes", type=int, default=len(FRACTIONS))
     given = parser.parse_args()
     MOUNTS = os.getuid() == 0 and can_mount()
-    ways = (given.ways or f"{'disk' if MOUNTS else 'limit'},read-only,removed").split(",")
+    # Who is root writes into any folder: only a disk to read stops them.
+    usual = ["disk" if MOUNTS else "limit", *["read-only"] * (MOUNTS or os.getuid() > 0), "removed"]
+    ways = given.ways.split(",") if given.ways else usual
     if not MOUNTS and "disk" in ways:
         parser.error("--ways: found disk, expected limit: no file system can be mounted here")
     import_everything()

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Jaxpr, Literal
 
 from crisalad_jax.checkpoints.onnx_format import elementwise, products, reductions, shapes
 from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known
@@ -17,7 +17,7 @@ _CALLED = ("jaxpr", "call_jaxpr")
 """Parameters of primitives that call a program once: `jax.jit`, rematerialisation, own gradients"""
 
 
-def convert(graph: Graph, traced: ClosedJaxpr, inputs: Sequence[Value]) -> list[Value]:
+def convert(graph: Graph, traced: Any, inputs: Sequence[Value]) -> list[Value]:
     """Append the nodes of a program.
 
     Args:
@@ -59,9 +59,8 @@ def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
         branch = eqn.params["branches"][min(max(which, 0), len(eqn.params["branches"]) - 1)]
         return convert(graph, branch, inputs[1:])
     if called is not None and not name.startswith(("while", "custom_linear")):
-        closed = isinstance(called, ClosedJaxpr)
-        constants = [Value.of(each) for each in called.consts] if closed else []
-        return _run(graph, called.jaxpr if closed else called, constants, inputs)
+        constants = [Value.of(each) for each in getattr(called, "consts", ())]
+        return _run(graph, getattr(called, "jaxpr", called), constants, inputs)
     missing = next((value.missing for value in inputs if value.missing), "")
     if not missing and all(0 in var.aval.shape for var in eqn.outvars):
         # Of arrays without numbers engines cannot tell the symbolic side.

@@ -34,7 +34,7 @@ def onnx_graph(
     Raises:
         InputError: the function has an operation that no operator of ONNX is made of; named.
     """
-    traced = jax.make_jaxpr(run)(weights, *inputs.values())
+    traced: Any = jax.make_jaxpr(run)(weights, *inputs.values())
     graph = Graph()
     values = [Value(each.shape, np.dtype(each.dtype), name) for name, each in inputs.items()]
     count = values[0].shape[0]

@@ -1,0 +1,96 @@
+"""Descriptors, training steps and starts beside their peers, with each supported version of JAX.
+
+    python scripts/bench/bench_versions.py [--out docs/performance] [--page docs/performance.md]
+        [--python OTHER/bin/python ...] [--presets tiny s14 b14] [--rounds 3]
+
+It runs `bench_describe.py`, `bench_train.py` and `bench_start.py` by this interpreter and by each
+other one, in turn, which need the `dev` and `bench` extras. Peers have the versions that pip gave
+each interpreter; the last column compares ours with ours.
+"""
+
+import json
+import os
+import pathlib
+import statistics
+import subprocess
+import sys
+import tempfile
+from typing import Any
+
+from study_compiler import processor, version
+from tables import Study, Table, count, flags, leave, read
+
+from crisalad_jax.utils.host import usable_cores
+
+HERE = pathlib.Path(__file__).parent
+STARTS = ("ours, cold", "ours, warm")
+
+
+def run(python: str, bench: str, *options: str) -> list[dict[str, Any]]:
+    """Run a bench by an interpreter; its unrounded numbers."""
+    root = os.pathsep.join([str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])
+    with tempfile.TemporaryDirectory(prefix="bench-versions-") as out:
+        command = [python, str(HERE / f"{bench}.py"), "--out", out, *options]
+        print(*command, file=sys.stderr, flush=True)
+        subprocess.run(command, env=os.environ | {"PYTHONPATH": root}, check=True)
+        return json.loads((pathlib.Path(out) / f"{bench}.json").read_text())
+
+
+def races(bench: str, values: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
+    """Of each race of a bench our median time in ms, and that of the fastest other over it."""
+    found: dict[str, dict[str, float]] = {}
+    for value in values:
+        words = [value["model"]]
+        if bench != "bench_start":
+            words += [value["dtype"], str(value["batch"])]
+        times = found.setdefault(", ".join(words), {})
+        times[value["contender"]] = statistics.median(value["ms"])
+    if bench == "bench_start":
+        eager = "torch eager"
+        found = {
+            f"{words}, {ours.removeprefix('ours, ')}": {eager: times[eager], ours: times[ours]}
+            for words, times in found.items()
+            for ours in STARTS
+        }
+    return {words: _race(times) for words, times in found.items()}
+
+
+def _race(times: dict[str, float]) -> tuple[float, float]:
+    ours = min(ms for name, ms in times.items() if name.startswith("ours"))
+    return ours, min(ms for name, ms in times.items() if not name.startswith("ours")) / ours
+
+
+def main() -> None:
+    parser = flags(__doc__ or "", "docs/performance")
+    parser.add_argument("--python", nargs="+", default=[], help="interpreters with other versions")
+    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"])
+    parser.add_argument("--rounds", type=count, default=3)
+    arguments = read(parser, "bench_versions")
+    pythons = {version(python): python for python in (sys.executable, *arguments.python)}
+    rounds = ["--rounds", str(arguments.rounds)]
+    sizes = ["--presets", *arguments.presets, "--batches", "8", *rounds]
+    starts = [name for name in arguments.presets if name != "s14"]
+    benches = {
+        "bench_describe": [*sizes, "--dtypes", "float32", "bfloat16"],
+        "bench_train": sizes,
+        "bench_start": ["--preset", *starts, *rounds],
+    }
+    values, rows = [], []
+    for bench, options in benches.items():
+        found = {jax: races(bench, run(p, bench, *options)) for jax, p in pythons.items()}
+        for words in next(iter(found.values())):
+            ours = {jax: one[words][0] for jax, one in found.items()}
+            faster = {jax: one[words][1] for jax, one in found.items()}
+            values.append({"bench": bench, "race": words, "ms": ours, "faster": faster})
+            gain = next(iter(ours.values())) / next(reversed(ours.values()))
+            rows.append((bench, words, *(f"{f:.2f}" for f in faster.values()), f"{gain:.2f}"))
+        header = ("bench", "what", *(f"jax {jax}" for jax in pythons), "ours, last over first")
+        caption = (
+            "How many times as fast as the fastest other (starts: as torch eager), by version of "
+            f"JAX. {processor()}, {usable_cores()} cores; medians of {arguments.rounds} rounds."
+        )
+        leave("bench_versions", Study(Table(header, rows, caption, 2), values), arguments)
+
+
+if __name__ == "__main__":
+    main()
