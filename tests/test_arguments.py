@@ -72,8 +72,13 @@ CALLS = {
     ),
     "open": (lambda: cj.Map.open(PRESET), f"folder: {NO_PATH}"),
     "open_benchmark": (lambda: cj.open_benchmark(PRESET), f"root: {NO_PATH}"),
+    "by keyword": (lambda: cj.open_benchmark(root=PRESET), f"root: {NO_PATH}"),
     "read_places": (lambda: cj.read_places(PRESET), f"root: {NO_PATH}"),
     "recipe": (lambda: cj.recipe(PRESET), "preset: found ModelConfig, expected text"),
+    "recipe of a model with its parameters": (
+        lambda: cj.recipe(model=cj.Model(PARAMS, PRESET)),
+        "model: found Model, expected ModelConfig, or None",
+    ),
     "from_scratch": (
         lambda: cj.from_scratch(PRESET),
         "config: found ModelConfig, expected TrainConfig",

@@ -523,6 +523,7 @@ def test_files_that_need_a_part_that_is_not_there_name_its_plug_in(
     [
         ("crisalad_jax.transport.steps", None),
         ("vpr_parts.gem", "vpr_parts.gem"),
+        ("crisalad_jax_more.gem", "crisalad_jax_more.gem"),
         ("__main__", "train_mine.py"),
     ],
 )

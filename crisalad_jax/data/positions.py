@@ -75,7 +75,7 @@ class Positions(NamedTuple):
             if (away > _NEAR).any():
                 name = list(self.of)[int(away.argmax())]
                 raise InputError(
-                    f"{source}: found {name!r} {away.max():.0f} degrees of longitude from the "
+                    f"{source}: found {name!r} {away.max():.3g} degrees of longitude from the "
                     f"middle of zone {zone}, whose metres the map has, expected at most {_NEAR:g}; "
                     "a new map of all images can have lat, lon"
                 )

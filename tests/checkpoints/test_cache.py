@@ -215,9 +215,11 @@ def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
     monkeypatch.delenv("CRISALAD_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert user_cache() == tmp_path / "xdg" / "crisalad-jax"
-    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # which its specification ignores
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert user_cache() == tmp_path / "home" / ".cache" / "crisalad-jax"
+    monkeypatch.setenv("CRISALAD_CACHE", "~/own")
+    assert user_cache() == tmp_path / "home" / "own"
 
 
 # Faults. Those of single answers are in tests/utils/test_download.py.

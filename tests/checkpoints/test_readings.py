@@ -281,7 +281,9 @@ def test_the_teacher_of_a_training_is_a_backbone(tmp_path: pathlib.Path, kind: s
     net = network()
     content, left_out = training(kind, net)
     path = save(tmp_path / "training.pth", content)
-    with pytest.warns(Note, match=f"left out {left_out}$") as notes:
+    with pytest.warns(
+        Note, match=rf"under (teacher\.)?backbone, and left out {left_out}$"
+    ) as notes:
         found = read_checkpoint(path)
     assert len(notes) == 1
     plain = read_quietly(save(tmp_path / "plain.pth", net.state_dict()))

@@ -193,7 +193,11 @@ def test_no_command_prints_the_usage(capfd):
         ),
         ("train --data d --out o --model.image-size 9 9 9", "found '9 9 9', expected 2 values"),
         ("query a --map m --runtime tvm", "--runtime: found 'tvm', expected one of jax, onnxrunt"),
-        ("index --images a --out m --dtype int8", "--dtype: found 'int8', expected one of float"),
+        (
+            "index --images a --out m --dtype int8",
+            r"--dtype: found 'int8', expected one of float\d\d, float\d\d \(see",
+        ),
+        ("evaluate --data d --image-size 9 9 --image-size 200", "--image-size: found '200', exp"),
         (
             "index --images a b --out m",
             r"--images: found 'a b', expected one value \(quote",
@@ -233,6 +237,12 @@ def test_bad_arguments(capfd, tmp_path, monkeypatch, arguments, words):
     assert re.search(words, error), error
     assert os.environ["COLUMNS"] == "80"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_refusal_leaves_no_width_behind(capfd, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    fails(capfd, "query", "a", "--map", "m", "--k", "five", words=("--k",))
+    assert "COLUMNS" not in os.environ
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from crisalad_jax.config.io import differences
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import MiningConfig
+from crisalad_jax.training.start import read_start
 from crisalad_jax.utils.notes import Note
 from tests.conftest import MODEL, RECIPE
 
@@ -85,6 +86,12 @@ def test_python_tells_of_weights_for_other_images(shared, tmp_path):
     words = r"found weights for images at 28 x 42, .* this run trains and is saved with 42 x 56,"
     with pytest.warns(Note, match=words):
         cj.train(config, city, tmp_path / "a", weights=file, quiet=True)
+    area = dataclasses.replace(MODEL.preprocessing, filter="area")
+    save_weights(
+        tmp_path / "area.safetensors", params, dataclasses.replace(MODEL, preprocessing=area)
+    )
+    with pytest.warns(Note, match=r"images at 42 x 56, area.* saved with 42 x 56, b"):
+        read_start(config, weights=tmp_path / "area.safetensors", backbone=None)
     own = dataclasses.replace(config, model=cj.load(file).config)
     cj.train(own, city, tmp_path / "b", weights=file, quiet=True)
     assert cj.load(tmp_path / "b" / "last.safetensors").config.image_size == (28, 42)

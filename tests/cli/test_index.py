@@ -14,6 +14,7 @@ import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.cli import main
+from crisalad_jax.cli.info import _map_lines
 from crisalad_jax.data.images import list_images
 from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
@@ -216,6 +217,19 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
     both = "info", "--map", folder, "--batch-size", 4
     fails(capfd, *both, words=("--batch-size: found beside --map",))
     fails(capfd, "info", "--map", folder, "--verify", words=("descriptors 0 to 6 have changed",))
+    # Of a large map with videos, of an older version.
+    days = ({"folder": str(day), "images": 2, "first": "1d", "last": "2d"} for day in range(11))
+    more = {"folders": [{"folder": "a.avi", "images": 1, "first": 0.5, "last": 12.25}, *days]}
+    more |= {"additions": [{"day": None, "root": "/r", "images": 23}], "extent": None}
+    lines = list(_map_lines(summary | more | {"stale_search": "faiss"}))
+    assert [line for name, line in lines if name in ("folders", "additions", "search")] == [
+        "a.avi: 1 image, 0.5 to 12.25 s",
+        *(f"{day}: 2 images, 1d to 2d" for day in range(9)),
+        "and 2 more",
+        "day unknown: 23 images of /r",
+        "exact; faiss lacks images",
+    ]
+    assert "positions" not in dict(lines)
 
 
 def test_positions_come_from_a_table(shared, database, tmp_path, capfd):

@@ -101,9 +101,7 @@ def fields_of(kind):
     names = getattr(kind, "_fields", ())
     if dataclasses.is_dataclass(kind):
         names = [field.name for field in dataclasses.fields(kind)]
-    texts = {
-        k: v for each in kind.__mro__ for k, v in vars(each).get("__annotations__", {}).items()
-    }
+    texts = {k: v for each in kind.__mro__ for k, v in inspect.get_annotations(each).items()}
     return {name: str(texts.get(name, "")) for name in names}
 
 
@@ -128,12 +126,17 @@ def test_a_result_takes_a_line_for_each_field_whatever_its_size():
         ")",
     ]
     paths = tuple(pathlib.Path("set", f"{i}.jpg") for i in range(10_000))
-    benchmark = cj.Benchmark("set", pathlib.Path("set"), paths, paths[:2], None, "25 m <> 0")
+    given = ("n" * 200, pathlib.Path("set"), paths, paths[:2], None, "25 m <> 0")
+    benchmark = cj.Benchmark(*given, np.zeros((10_000, 2)), radius=54321.5)
     assert repr(benchmark).splitlines()[3:5] == [
         "    database=('set/0.jpg', ... 9,999 more),",
         "    queries=('set/0.jpg', 'set/1.jpg'),",
     ]
+    lines = repr(benchmark).splitlines()
+    assert lines[-3:] == ["    database_positions=float64[10000, 2],", "    radius=54321.5,", ")"]
     page = benchmark._repr_html_()
+    assert "n" * 80 in page
+    assert "n" * 90 not in page
     assert "<th>rule</th><td>&#x27;25 m &lt;&gt; 0&#x27;</td>" in page
     assert len(page) < 1000
 
@@ -171,6 +174,24 @@ def test_help_of_a_configuration_a_part_and_a_result():
         cj.FitResult: " |      params: Parameters after the last step.",
     }.items():
         assert text in pydoc.plain(pydoc.render_doc(kind))
+
+
+@dataclasses.dataclass
+class Base:
+    a: int = 1
+    """Of the base."""
+    b: int = 2
+    """Of the base too."""
+
+
+@dataclasses.dataclass
+class Derived(Base):
+    a: int = 3
+    """Of its own."""
+
+
+def test_a_class_says_more_than_its_base():
+    assert field_docs(Derived) == {"a": "Of its own.", "b": "Of the base too."}
 
 
 def test_an_import_reads_no_sources():

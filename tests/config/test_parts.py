@@ -62,6 +62,11 @@ class Named(Duck):
 
 
 @dataclasses.dataclass(frozen=True)
+class Plugged(Duck):
+    plugin: str = "ducks.py"
+
+
+@dataclasses.dataclass(frozen=True)
 class Mute(Bird):
     pass
 
@@ -149,6 +154,7 @@ def test_a_cell_that_runs_again_brings_the_same_part(birds: Registry[Bird]):
         (int, "found int, which is no frozen dataclass, expected @dataclasses.dataclass\\("),
         (Stone, "found Stone, expected a subclass of Bird$"),
         (Named, "found a field 'name', which files keep the part's own in$"),
+        (Plugged, "found a field 'plugin', which files keep the part's own in$"),
         (Needy, ".* missing 1 required keyword-only argument: 'weight'; expected a default for"),
         (Listed, "unhashable type: 'list'; expected a default for every field, and values that"),
         (Mute, "found no method call, expected it$"),

@@ -70,7 +70,10 @@ def test_what_is_not_finite_is_black():
 
 
 def test_flat_values_and_eight_bits():
-    assert not as_rgb(np.full((4, 6), 8000, np.uint16), "contrast-stretch").any()
+    with np.errstate(all="raise"):
+        assert not as_rgb(np.full((4, 6), 8000, np.uint16), "contrast-stretch").any()
+    three = as_rgb(np.array([[0, 6, 7]], np.uint16), "contrast-stretch")
+    assert three[0, :, 0].tolist() == [0, 219, 255]  # 218.6
     eight = np.array([[100, 110]], np.uint8)
     assert as_rgb(eight, "contrast-stretch")[0, :, 0].tolist() == [100, 110]
 
@@ -95,7 +98,10 @@ def test_wide_sixteen_bits_and_stretched_ones_are_not_noted():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         as_rgb(wide)
+        as_rgb(wide // 4 + wide // 128)  # 98 % of 16,894 is 16,556, and 64 of 256 levels are 16,384
         as_rgb(wide // 32, "contrast-stretch")
+    with pytest.warns(Note, match="become 64 of 256"):
+        as_rgb(wide // 4)  # 98 % of 16,383
 
 
 def test_the_chain_says_how():

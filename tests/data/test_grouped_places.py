@@ -14,6 +14,7 @@ from crisalad_jax.data.places import epoch_batches, read_places
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
 from tests.conftest import RECIPE, write_picture, write_video
+from tests.data.test_sources import write_jpeg
 
 
 def _street(folder, xs, *, table="gps.csv", name="{:02d}.jpg"):
@@ -48,6 +49,9 @@ def test_a_radius_makes_places_as_by_hand(tmp_path):
     assert places.root == root
     # Centres at 0, 11, 30 and 5000: up to 40 m apart they are near.
     assert _near(places) == [[1, 2], [0, 2], [0, 1], []]
+    back = _street(tmp_path / "back", (11, 9))
+    places = read_places(back, place_radius=10, positions=back / "gps.csv", min_images=1)
+    assert places.image_counts.tolist() == [2]
 
 
 def test_places_with_few_images_are_left_out_and_counted(tmp_path):
@@ -112,6 +116,15 @@ def test_names_say_where(tmp_path):
         write_picture(tmp_path / f"@{east}.00@5000000.00@10@T@@@@@@@@@@@.jpg", 0)
     places = read_places(tmp_path, place_radius=5, min_images=1)
     assert places.image_counts.tolist() == [2, 1]
+
+
+def test_exif_data_says_where(tmp_path):
+    # 0.36 seconds of latitude are 111.3 km / 3600 x 0.36 = 11.1 m.
+    for name, seconds in (("a.jpg", 46.56), ("b.jpg", 46.92)):
+        write_jpeg(tmp_path / name, _2=(52.0, 13.0, seconds))
+    for radius, counts in ((10, [1, 1]), (13, [2])):
+        places = read_places(tmp_path, place_radius=radius, min_images=1)
+        assert places.image_counts.tolist() == counts
 
 
 def _near_pairs(places, batch, points):
@@ -179,6 +192,10 @@ def test_every_n_frames_in_order(tmp_path):
     assert places.image_counts.tolist() == [2, 2, 1, 2]
     # The last of one folder is no neighbour of the first of the next.
     assert _near(places) == [[1], [0, 2], [1], []]
+    for name in ("c.avi", "d.avi"):
+        write_video(tmp_path / name, 4, rate=10)
+    places = read_places(tmp_path / "*.avi", place_frames=2, fps=10, min_images=1)
+    assert _near(places) == [[1], [0], [3], [2]]  # nor are those of two videos
 
 
 @pytest.mark.parametrize("cache", [None, ImageCache(), ImageCache(40_000)])
@@ -214,6 +231,7 @@ def test_a_video_trains_as_its_frames(tmp_path, cache):
         ({"place_frames": 1}, r"^--place-frames: found 1, expected at least 2$"),
         ({"place_radius": 5, "place_frames": 4}, r"^--place-frames: found beside --place-radius"),
         ({"positions": "gps.csv"}, r"^--positions: found without --place-radius, expected both$"),
+        ({"place_frames": 2, "positions": "gps.csv"}, r"^--positions: found without --place-rad"),
         ({"fps": 2.0}, r"^--fps: found without --place-radius or --place-frames"),
         ({"place_frames": 4, "fps": 2.0}, r"^--fps: found 2 without a video"),
         ({"place_frames": 4, "cities": ["a"]}, r"^cities: found a for .*walk, expected none"),
@@ -236,6 +254,8 @@ def test_a_source_that_has_no_places_says_which_flags_make_them(tmp_path, shared
     for source in (root / "gps.csv", video):
         with pytest.raises(InputError, match=r"; --place-radius|: --place-radius"):
             read_places(source)
+    with pytest.raises(InputError, match=r"walk\.avi: found no position of \d images"):
+        read_places(video, place_radius=5)
     (tmp_path / "other.csv").write_text("name,x,y\nz.jpg,1,2\n")
     with pytest.raises(InputError, match=r"found none of the 7 images of .*, expected names such"):
         read_places(root, place_radius=5, positions=tmp_path / "other.csv")

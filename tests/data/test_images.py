@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image
+from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image, read_pixels
 from crisalad_jax.data.live import FolderWatch
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.sources import open_source
@@ -126,6 +126,13 @@ def test_sixteen_bit_colour_tiff(tmp_path):
     rgb = np.stack([red, red // 2, red // 3], axis=-1)
     data = cv2.imencode(".tif", rgb[..., ::-1])[1].tobytes()
     np.testing.assert_array_equal(read_bytes(tmp_path, data), rgb >> 8)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".ppm"])
+def test_sixteen_bits_stay_for_the_model_to_reduce(tmp_path, suffix):
+    rgb = (7 + 3000 * np.arange(18, dtype=np.uint16)).reshape(2, 3, 3)
+    cv2.imwrite(str(tmp_path / f"a{suffix}"), rgb[..., ::-1])
+    np.testing.assert_array_equal(read_pixels(tmp_path / f"a{suffix}"), rgb)
 
 
 def test_alpha_of_an_avif_is_dropped(tmp_path):
@@ -357,9 +364,10 @@ def test_list_images(tmp_path):
 
 def test_what_is_no_image_is_counted_in_one_note(tmp_path):
     """Not counted: hidden files, Windows' own, tables, and what is named as an image (sidecars)."""
-    names = ["1.jpg", "sub/2.png"]
+    names = ["1.jpg", "4.raw.jpg", "sub/2.png"]
     counted = ["3.heic", "a.txt", "sub/b.TXT", "walk.mp4", "c.npy", "d.json", "e.xml", "f.dng"]
     quiet = [".DS_Store", "Thumbs.db", "desktop.ini", "positions.csv", "1.json", "sub/2.png.xmp"]
+    quiet += ["4.raw"]
     for name in (*names, *counted, *quiet, "1.heic"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()

@@ -66,5 +66,9 @@ def test_points_are_drawn_where_they_are():
     drawn = flattened(points) / np.deg2rad(6_378_137)
     # Rounding of 1e7 m, which are 90 degrees.
     np.testing.assert_allclose(drawn, [[170, 0], [175, 10], [185, -10], [180, 0]], atol=1e-9)
+    # At 60 degrees a degree of longitude is half as long.
+    drawn = flattened(on_ellipsoid(np.full(3, 60.0), np.array([10.0, 11, 12])))
+    expected = [[5, 60], [5.5, 60], [6, 60]]
+    np.testing.assert_allclose(drawn / np.deg2rad(6_378_137), expected, atol=1e-9)  # as above
     plane = np.array([[1.0, 2.0]])
     assert flattened(plane) is plane

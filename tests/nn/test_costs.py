@@ -258,6 +258,11 @@ def test_b14_by_hand() -> None:
     assert costs["cross-image encoder"] == 2 * 66 * (4 * 128**2 + 2 * 128 + 2 * 128 * 2048)
 
 
+def test_a_model_of_float64_costs_the_same() -> None:
+    tiny = PRESETS["tiny"]
+    assert part_costs(dataclasses.replace(tiny, compute_dtype="float64")) == part_costs(tiny)
+
+
 def test_parameters_are_counted_by_part() -> None:
     shapes = parameter_shapes(SMALL)
     total = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))

@@ -170,6 +170,9 @@ def test_what_is_reached_by_hand():
     state = state._replace(belief=np.eye(31)[15])
     (reached,) = np.nonzero(settings.predict(state, moved=1.0) > 1e-3)
     assert reached.tolist() == list(range(5, 26))
+    # Rounding takes no image away: 0.5996 seconds are 0.6.
+    (reached,) = np.nonzero(settings.predict(state, moved=0.2998) > 1e-3)
+    assert reached.tolist() == list(range(12, 19))
     # Faster than the map's images: the next image is in reach all the same.
     (reached,) = np.nonzero(settings.predict(state, moved=0.05) > 1e-3)
     assert reached.tolist() == [14, 15, 16]

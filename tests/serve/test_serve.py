@@ -373,6 +373,22 @@ def test_a_frame_of_a_video_is_shown_under_its_name(shared, params, tmp_path):
     assert abs(shown.mean() - 120) < 4  # frame 12 is flat of level 120; two JPEGs move it little
 
 
+def test_a_thermal_picture_is_shown_with_contrast(shared, params, tmp_path):
+    """Of 16 bits, from 7,200 to 8,900, which by their high bytes are 7 levels."""
+    thermal, weights = tmp_path / "thermal.png", shared / "weights.safetensors"
+    cv2.imwrite(str(thermal), np.tile(np.linspace(7200, 8900, 70).astype(np.uint16), (50, 1)))
+    out = tmp_path / "map"
+    index(params, MODEL, thermal, out, weights=weights, batch_size=BATCH, quiet=True)
+    with serving(out, params, appends=True) as own:
+        data = own.ask("GET", "/images/0").data
+        # The first position of a map says of which zone all are.
+        path = "/images?name=@0500000.00@5411000.00@32@U@.png"
+        assert own.ask("POST", path, thermal.read_bytes()).status == 201
+        assert own.worker.places.zone == (32, False)
+    shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert np.ptp(shown) > 240
+
+
 def test_a_token(folder, params, pictures):
     token = "0123456789abcdef"
     with serving(folder, params, token=token) as own:

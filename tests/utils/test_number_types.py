@@ -107,7 +107,9 @@ def test_no_number_of_a_program_is_float64() -> None:
         traced = jax.make_jaxpr(functools.partial(describe, config=MODEL))(PARAMS, IMAGES)
         wide = dataclasses.replace(MODEL, compute_dtype="float64")
         truly = jax.make_jaxpr(functools.partial(describe, config=wide))(PARAMS, IMAGES)
+        lowered = describe.lower(PARAMS, IMAGES, config=MODEL).as_text()
     assert not re.search(r"\b[fi]64\b", str(traced))
+    assert "f64" not in lowered
     assert "f64" in str(truly)
 
 

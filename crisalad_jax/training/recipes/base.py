@@ -62,7 +62,7 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
     return decorate
 
 
-@takes(preset=str)
+@takes(preset=str, model=(ModelConfig, type(None)))
 def recipe(
     preset: str = "b14", name: str | None = None, *, model: ModelConfig | None = None
 ) -> TrainConfig:

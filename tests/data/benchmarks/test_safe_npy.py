@@ -387,6 +387,7 @@ def test_an_archive_of_arrays_is_told(tmp_path):
     (tmp_path / "gt.npz").rename(tmp_path / "gt.npy")
     with pytest.raises(InputError, match=r"gt\.npy: found an \.npz archive of matches, other"):
         read_npy(tmp_path / "gt.npy")
-    # What the message says works.
+    # What the message says works, also next to the archive.
     np.save(tmp_path / "one.npy", np.load(tmp_path / "gt.npy")["matches"])
+    np.savez(tmp_path / "one.npz", array)
     assert read_npy(tmp_path / "one.npy").tolist() == [0, 1, 2]

@@ -105,6 +105,7 @@ def test_positives_across_zones_equal_brute_force(tmp_path):
     benchmark = read_utm(tmp_path)
     matches = across = 0
     for query, positives in zip(benchmark.queries, benchmark.ground_truth(), strict=True):
+        assert (np.diff(positives) > 0).all()
         for index, path in enumerate(benchmark.database):
             metres = metres_between(query.name, path.name)
             # UTM's scale is 0.1 % off at most, and names have two decimals.

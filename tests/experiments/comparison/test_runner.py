@@ -337,12 +337,15 @@ def test_rows_draw_seeds_together_where_they_share_them(finished, settings, shar
     trained = read_json(finished / "crisalad" / "seed-0" / "training.json", "a record")
     for variant, seed in prepared.units:
         folder = runner.folder_of(finished, variant.name, seed)
-        write_json(folder / "training.json", trained)
+        factor = 2 if variant.name == "salad" else 1
+        took = {"step_seconds": factor * trained["step_seconds"]}
+        write_json(folder / "training.json", trained | took)
         write_json(folder / "test-0.json", record | {"groupings": {"single": ranks[seed]}})
     speed = read_json(finished / "speed.json", "times")
     write_json(finished / "speed.json", speed | {"rounds": {name: [1.0] for name in names}})
     _, same, alone = comparison.summarise(prepared, finished).rows
     assert same.differences["town"][1].interval == (0, 0)
+    assert (same.training, alone.training) == ((2, 2, 2), None)  # over the reference's
     # All queries hit or miss with their seed: two seeds miss both in a quarter of the resamples.
     assert alone.differences["town"][1].interval == (0, 1)
     notes = " ".join(comparison.summarise(prepared, finished).notes)

@@ -132,6 +132,16 @@ def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
     assert not path.exists()
 
 
+def test_values_of_a_narrow_range_are_shown_with_contrast(tmp_path):
+    """Of 16 bits, half 7,200 and half 8,900, which by their high bytes are both dark grey."""
+    file = tmp_path / "thermal.png"
+    cv2.imwrite(str(file), np.repeat(np.full((60, 2), [7200, 8900], np.uint16), 40, axis=1))
+    pictures = {"queries": [file], "database": [file]}
+    black = is_colour(_gallery(pictures, tmp_path / "g.png", [[0]], None), (0, 0, 0))
+    # Half of the query and of what was found, of 1.7 x 1.275 inches at 120 dots.
+    assert black.sum() > 0.9 * 204 * 153
+
+
 def test_a_picture_of_a_map_that_is_gone_is_a_grey_box_and_a_note(photographs, tmp_path):
     """The first of two answers; it is found where --map-images says."""
     images = [MapImage(path.name, 1, None, str(path.parent)) for path in photographs["database"]]

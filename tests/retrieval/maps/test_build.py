@@ -2,6 +2,7 @@
 
 import pathlib
 import shutil
+import warnings
 
 import numpy as np
 import pyproj
@@ -17,6 +18,7 @@ from crisalad_jax.retrieval.maps.build import index as index_source
 from crisalad_jax.retrieval.maps.manifest import describe_map
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.notes import Note
 from tests.conftest import BATCH, MODEL
 
 
@@ -192,7 +194,9 @@ def test_images_of_several_zones_make_a_map_of_degrees(params, database, tmp_pat
     with pytest.warns(UserWarning, match="of several zones of UTM: positions become lat, lon"):
         first = index_folder(tmp_path / "map", params, tmp_path / "images")
     assert (first.added, first.positions) == (2, 2)
-    again = index_folder(tmp_path / "map", params, tmp_path / "images")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)  # that is known by now
+        again = index_folder(tmp_path / "map", params, tmp_path / "images")
     assert (again.added, again.there) == (0, 2)
     with Map.open(tmp_path / "map") as places:
         assert places.axes == ("lat", "lon")

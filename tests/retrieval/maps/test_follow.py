@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.moments import moment_of
-from crisalad_jax.data.positions import Positions
+from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.retrieval.maps.follow import Follower
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.sequence import BayesFilter
@@ -117,6 +117,16 @@ def test_two_videos_have_two_clocks(tmp_path):
     # A frame that tells nothing: where the camera may be is all that it leaves.
     left = follower.answer(np.full((1, 6), 6**-0.5, np.float32), 6, frames[2:])
     np.testing.assert_allclose(left.probabilities, 1 / 6, rtol=1e-9)
+
+
+def test_metres_come_before_seconds_and_are_of_one_zone(tmp_path):
+    names = [f"@500000.0@{4_000_000 + 3 * s}.0@32@N@140363657{s}@.jpg" for s in range(3)]
+    places = made(tmp_path, names, np.eye(3), utm_positions(names))
+    follower = Follower(places, BayesFilter())
+    follower.answer(np.eye(3, dtype=np.float32)[:1], 1, [pathlib.Path(names[0])])
+    assert follower.state.along.tolist() == [0, 3, 6]
+    assert follower._moved(pathlib.Path(names[1])) == 3
+    assert follower._moved(pathlib.Path(names[2].replace("@32@", "@33@"))) == np.inf
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.head import check_model, write_record
 from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, read_description
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.shared import _add
 from crisalad_jax.utils.checksums import sealed_json
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
@@ -563,6 +564,10 @@ def test_a_map_has_metres_of_one_zone(folder):
         target.append([NEXT], [7], rows(8, 1), root="/", positions=utm_positions([NEXT]))
         degrees = Positions(("lat", "lon"), {"a.jpg": (48.85, 9.0)})
         target.append(["a.jpg"], [7], rows(9, 1), root="/", positions=degrees)
+        beyond = Positions(("lat", "lon"), {"b.jpg": (48.85, 18.1)})
+        with pytest.raises(InputError, match=r"'b.jpg' 9.1 degrees .*, expected at most 9;"):
+            target.append(["b.jpg"], [7], rows(10, 1), root="/", positions=beyond)
+        target.fitted(["b.jpg"], Positions(("lat", "lon"), {"b.jpg": (48.85, 17.9)}))
         far = FIRST.replace("@32@", "@10@")
         with pytest.raises(
             InputError, match=r"132 degrees of longitude .* of zone 32 north, whose"
@@ -572,6 +577,10 @@ def test_a_map_has_metres_of_one_zone(folder):
         first, second, third = (image.position for image in places.images[-3:])
         assert (places.axes, places.zone) == (("east", "north"), (32, False))
         assert places.summary()["zone"] == "32 north"
+        # As a process adds its share of the images.
+        with open_for_appending(folder.parent / "whole", description("files")) as whole:
+            _add(whole, places.images[-3:], rows(7, 3), places)
+            assert (whole.axes, whole.zone) == (places.axes, places.zone)
     assert first == (499000.0, 5411000.0)
     # Rounded to a tenth of a millimetre; the series is as exact.
     np.testing.assert_allclose(second, into.transform(939500, 5420600), atol=3e-4)
