@@ -74,6 +74,17 @@ CALLS = {
     "open_benchmark": (lambda: cj.open_benchmark(PRESET), f"root: {NO_PATH}"),
     "by keyword": (lambda: cj.open_benchmark(root=PRESET), f"root: {NO_PATH}"),
     "read_places": (lambda: cj.read_places(PRESET), f"root: {NO_PATH}"),
+    "load_pca": (lambda: cj.load_pca(PRESET), f"path: {NO_PATH}"),
+    "read_image": (lambda: cj.read_image(IMAGES), "path: found ndarray, expected a path"),
+    "convert": (lambda: cj.convert(PRESET, "w"), f"source: {NO_PATH}"),
+    "read_backbone": (
+        lambda: cj.read_backbone(PRESET, "w", None),
+        f"path: {NO_PATH}",
+    ),
+    "search": (
+        lambda: cj.search(np.eye(3), np.eye(3), np.eye(3)),
+        "k: found array([[1., 0., 0.], ..., expected a whole number of at least 1",
+    ),
     "recipe": (lambda: cj.recipe(PRESET), "preset: found ModelConfig, expected text"),
     "recipe of a model with its parameters": (
         lambda: cj.recipe(model=cj.Model(PARAMS, PRESET)),

@@ -38,7 +38,7 @@ from crisalad_jax.checkpoints.weights import (
     load_weights,
     save_weights,
 )
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
@@ -458,6 +458,7 @@ class Conversion(NamedTuple):
     config: ModelConfig
 
 
+@takes(source=PATH, target=PATH)
 def convert(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
@@ -531,6 +532,7 @@ def convert(
     return Conversion(checkpoint.layout, None, checkpoint.config)
 
 
+@takes(path=PATH)
 def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) -> Any:
     """Read the backbone of any checkpoint, for a model of `config`.
 

@@ -64,7 +64,7 @@ def check_count(what: str, count: Any) -> None:
     """
     words, types = _PLAIN[int]
     if not isinstance(count, types) or isinstance(count, bool):
-        raise InputError(f"{what}: found {count!r}, expected {words} of at least 1")
+        raise InputError(f"{what}: found {in_one_line(count)}, expected {words} of at least 1")
     require(int(count) >= 1, f"{what}: found {count}, expected at least 1")
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import BitDepth
 from crisalad_jax.data.depth import as_rgb
 from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
@@ -64,6 +65,7 @@ _REDUCED = (
 )
 
 
+@takes(path=PATH)
 def read_image(
     path: str | os.PathLike[str],
     size: tuple[int, int] | None = None,

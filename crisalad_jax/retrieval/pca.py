@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.config.checks import check_seed, check_types
+from crisalad_jax.config.checks import PATH, check_seed, check_types, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
@@ -298,6 +298,7 @@ def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
     write_sealed(path, arrays, FORMAT, {"config": to_plain(pca.config)})
 
 
+@takes(path=PATH)
 def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
     """Read components that `save_pca` wrote.
 

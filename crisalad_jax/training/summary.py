@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from crisalad_jax.config.checks import takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
@@ -21,6 +22,7 @@ class AdapterSummary(NamedTuple):
     """Multiply-accumulates as the paper counts: each linear once, convolutions at every patch."""
 
 
+@brief
 class ModelSummary(NamedTuple):
     """Counts of a model's parameters and multiply-accumulates."""
 

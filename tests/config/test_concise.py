@@ -25,11 +25,13 @@ from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.retrieval.maps.build import Indexed
 from crisalad_jax.retrieval.maps.live import LiveAnswer
+from crisalad_jax.retrieval.maps.map import Answer, MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.sets import Extracted
 from crisalad_jax.training.recipes import RECIPES
+from crisalad_jax.training.summary import ModelSummary
 from crisalad_jax.training.vocabulary import Vocabulary
 from crisalad_jax.transport.solve import SinkhornResult
 from crisalad_jax.utils.pytree import summary
@@ -92,7 +94,7 @@ LARGE = re.compile(
 RESULTS = [
     *(value for name in cj.__all__ if inspect.isclass(value := getattr(cj, name))),
     *(GroupingResult, PrecisionRecall, Answers, LiveAnswer, Indexed, Extracted, Neighbours, Pca),
-    *(Places, Vocabulary, SinkhornResult, ImageBatch, Frame, Runtime),
+    *(Places, Vocabulary, SinkhornResult, ImageBatch, Frame, Runtime, ModelSummary, Answer),
 ]
 
 
@@ -148,6 +150,17 @@ def test_a_runs_result_prints_the_number_of_parameters():
     # docs/architecture.md: 11,495,105 trainable and 86,579,712 frozen.
     assert f"leaves, {11_495_105 + 86_579_712:,} parameters, 392.3 MB" in text
     assert "qkv" not in text
+
+
+def test_an_answer_of_a_map_prints_in_short_lines():
+    image = MapImage("a.jpg", 7176, (500000.0, 5000200.25), "/photographs/of/a/corridor")
+    assert repr(Answer(1, 0.7421999573707581, image)).splitlines() == [
+        "Answer(",
+        "    rank=1,",
+        "    similarity=0.7422,",
+        "    image=MapImage(name='a.jpg', bytes=7176, position=(500000.0, 5000200.25), root=' ...,",
+        ")",
+    ]
 
 
 def test_a_line_has_a_width():

@@ -20,6 +20,7 @@ import numpy as np
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.config.checks import PATH, check_count, takes
+from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
@@ -64,6 +65,7 @@ if TYPE_CHECKING:  # a map is searched without JAX
     from crisalad_jax.retrieval.maps.manifest import MapDescription
 
 
+@brief
 class MapImage(NamedTuple):
     """An image of a map: everything but its descriptor."""
 
@@ -75,6 +77,7 @@ class MapImage(NamedTuple):
     root: str
 
 
+@brief
 class Answer(NamedTuple):
     """One image of a map, as an answer to a query."""
 
