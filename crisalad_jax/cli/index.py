@@ -200,7 +200,9 @@ def _words(result: Indexed) -> list[str]:
             f"{len(unmatched)} positions given are of no image here, {unmatched[0]!r} the first"
         )
     if result.unreadable:
-        words.append(f"{len(result.unreadable)} unreadable left out")
+        words.append(
+            f"{len(result.unreadable)} unreadable left out, {result.unreadable[0]} the first"
+        )
     length, store = description.descriptor_length, description.store
     words.append(f"{counted(result.images, 'descriptor')} of {length} numbers ({store})")
     if result.recall is not None:

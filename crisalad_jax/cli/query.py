@@ -61,7 +61,7 @@ class Query:
     camera: str | None = None
     """Number from 0, URL or video file: answer its newest frame, time and again."""
     fps: float | None = None
-    """Frames a second taken of a video, by default 1; of --camera at most so many."""
+    """Frames a second taken of a video, by default 1; the most that --camera answers."""
     window: int = 1
     """Frames described together, each with those just before it: a moving camera's."""
     weights: pathlib.Path | None = None
@@ -75,8 +75,8 @@ class Query:
     """A query to which no image is that similar is of an unknown place; by default what `crisalad
     calibrate` measured for this map. -1 answers every query."""
     sequence: Literal["bayes"] | None = None
-    """The queries are consecutive frames of one camera: bayes weighs those so far, by a filter over
-    the map's images in their order (docs/maps.md)."""
+    """The queries are consecutive frames of one camera: bayes, a filter, weighs those so far
+    (docs/maps.md)."""
     sequence_reach: float | None = None
     """How many times as fast as the map's camera this one moves, at most; by default 2. Where names
     say no times or positions, images of the map a frame."""

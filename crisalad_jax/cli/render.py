@@ -60,7 +60,7 @@ def run(arguments: Render) -> None:
     say(
         f"{arguments.out}: {'there already, ' * is_there}{counted(places, 'place')} with "
         f"{counted(config.images_per_place, 'image')} each in {arguments.out / 'train'}; "
-        f"{counted(tests, 'other')} in {arguments.out / 'test'}"
+        f"{counted(tests, 'other place')} in {arguments.out / 'test'}"
     )
     give_json(
         arguments.json,

@@ -479,7 +479,7 @@ def _alike(
 def _must(image: Pixels | InputError) -> Pixels:
     """Return an image; raise the error that stands in its place."""
     if isinstance(image, InputError):
-        raise image
+        raise InputError(f"{image} (--on-bad-image skip leaves it out)") from image
     return image
 
 

@@ -52,6 +52,8 @@ def progress_bar(
     try:
         import rich.console
         import rich.progress as parts
+        import rich.table
+        import rich.text
     except ModuleNotFoundError:
         yield _Lines()
         return
@@ -61,15 +63,24 @@ def progress_bar(
             speed = task.finished_speed or task.speed
             return "" if speed is None else f"{speed:.1f} {unit}/s"
 
+    class Note(parts.ProgressColumn):
+        def render(self, task: parts.Task) -> rich.text.Text:
+            return rich.text.Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
+
+    def whole() -> rich.table.Column:
+        return rich.table.Column(no_wrap=True)
+
+    console = rich.console.Console(stderr=True)
+    # The note alone gives way where the terminal is narrow.
     progress = parts.Progress(
-        parts.TextColumn("{task.description}"),
-        parts.BarColumn(bar_width=28),
-        parts.TaskProgressColumn(),
-        parts.TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        Rate(),
-        parts.TimeRemainingColumn(elapsed_when_finished=True),
-        parts.TextColumn("{task.fields[note]}"),
-        console=rich.console.Console(stderr=True),
+        parts.TextColumn("{task.description}", table_column=whole()),
+        parts.BarColumn(bar_width=28 if console.width >= 120 else 8),
+        parts.TaskProgressColumn(table_column=whole()),
+        parts.TextColumn("{task.completed:.0f}/{task.total:.0f}", table_column=whole()),
+        Rate(table_column=whole()),
+        parts.TimeRemainingColumn(elapsed_when_finished=True, table_column=whole()),
+        Note(),
+        console=console,
     )
     with progress:
         task = progress.add_task(label, total=total, completed=done, note="")  # pyright: ignore
