@@ -103,6 +103,20 @@ CALLS = {
         "config: found ModelConfig, expect",
     ),
     "write_export": (lambda: cj.write_export(PRESET, PARAMS, "o"), f"out: {NO_PATH}"),
+    "a number for a key": (
+        lambda: cj.init_crisalad(0, PRESET),
+        "key: found 0, expected Array",
+    ),
+    "metric_loss swapped": (
+        lambda: cj.metric_loss(np.zeros(4, np.int32), np.zeros((4, 8)), cj.LossConfig()),
+        "descriptors, labels: found shapes (4,) and (4, 8), expected (image, descriptor) and",
+    ),
+    "load_plugin": (lambda: cj.load_plugin(PRESET), "plugin: found ModelConfig, expected text"),
+    "FolderWatch": (lambda: cj.FolderWatch(3), "folder: found 3, expected a path"),
+    "Camera": (
+        lambda: cj.Camera(PRESET),
+        "camera: found ModelConfig, expected a whole number, or",
+    ),
     "compare": (lambda: compare("out", TRAINING), "config: found 'out', expected ComparisonConfig"),
 }
 

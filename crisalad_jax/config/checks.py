@@ -187,7 +187,10 @@ def _words(hint: Any) -> str:
         return f"a tuple{length}, each {_words(arguments[0])}"  # no tuple here mixes types
     if hint in _PLAIN:
         return _PLAIN[hint][0]
-    return "None" if hint is type(None) else getattr(hint, "__name__", str(hint))
+    if hint is type(None):
+        return "None"
+    # jaxlib's Array has its module in its name.
+    return hint.__name__.rpartition(".")[2] if hasattr(hint, "__name__") else str(hint)
 
 
 def require_positive(config: object, *names: str) -> None:

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Callable
 from types import ModuleType
 
+from crisalad_jax.config.checks import takes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 
@@ -26,6 +27,7 @@ _LOADED: set[str] = set()
 """Source files of all loaded plug-ins."""
 
 
+@takes(plugin=str)
 def load_plugin(plugin: str) -> None:
     r"""Import a plug-in, once, so that its parts are registered.
 

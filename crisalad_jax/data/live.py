@@ -12,6 +12,7 @@ from typing import NamedTuple, Self
 import cv2
 import numpy as np
 
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.images import SELF_CHECKED, is_image, read_pixels
@@ -70,6 +71,7 @@ class FolderWatch:
     dropped = 0
     """Number of frames passed over for newer ones: none."""
 
+    @takes(folder=PATH)
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Note what is there.
 
@@ -176,6 +178,7 @@ class Camera:
         (0.15, (60, 80, 3))
     """
 
+    @takes(camera=(int, str, os.PathLike))
     def __init__(self, camera: int | str | os.PathLike[str], *, fps: float | None = None) -> None:
         """Open the camera.
 

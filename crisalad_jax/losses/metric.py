@@ -150,6 +150,11 @@ def metric_loss(
         >>> float(result.easy_anchor_fraction)
         0.0
     """
+    require(
+        descriptors.ndim == 2 and labels.shape == descriptors.shape[:1],
+        f"descriptors, labels: found shapes {descriptors.shape} and {labels.shape}, expected "
+        "(image, descriptor) and (image,)",
+    )
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
     valid = jnp.ones(len(labels), bool) if valid is None else valid
     every = all_pairs(labels, valid=valid) if pairs is None else pairs

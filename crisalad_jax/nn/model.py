@@ -60,7 +60,7 @@ class Crisalad:
     """Parameters of `ModelConfig.projection`; None without one."""
 
 
-@takes(config=ModelConfig)
+@takes(config=ModelConfig, key=jax.Array)
 def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
     """Draw random parameters in float32.
 
