@@ -326,7 +326,7 @@ def _read_features(
             unreadable += [paths[i] for i in batch.indices[there & ~batch.valid]]
             bar.advance(int(there.sum()))
     if unreadable:
-        tell(f"images: left out {len(unreadable)} unreadable of {len(paths)}, {unreadable[0]} the first")
+        tell(f"images: {len(unreadable)} unreadable left out, {unreadable[0]} the first")
     return np.concatenate(parts) if parts else np.empty((0, config.backbone.dim), np.float32)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import pathlib
-import re
 
 import jax
 import jax.numpy as jnp
@@ -159,7 +158,7 @@ def test_unreadable_images_stop_or_are_left_out(fresh, paths, built, tmp_path) -
     with pytest.raises(InputError, match=f"{bad}: found 8 bytes that do not decode"):
         with_vocabulary(fresh, ANYLOC, [*paths, bad], batch_size=BATCH)
     options = {"seed": 3, "batch_size": BATCH, "on_bad_image": "skip"}
-    with pytest.warns(Note, match=rf"left out 1 unreadable of {len(paths) + 1}, .*bad.jpg the first"):
+    with pytest.warns(Note, match=f"images: 1 unreadable left out, {bad} the first"):
         assert_equal(with_vocabulary(fresh, ANYLOC, [*paths, bad], **options), built)
     with pytest.raises(InputError, match="found 0 features in those that can be read, expected at"):
         with_vocabulary(fresh, ANYLOC, [bad], **options)
