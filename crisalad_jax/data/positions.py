@@ -123,7 +123,7 @@ def utm_zones(names: Sequence[str]) -> list[Zone | None]:
         if number is None or south is None:
             raise InputError(
                 f"{name}: found no zone with a letter, expected @east@north@zone@letter@...: the "
-                "images are of several zones of UTM"
+                "images are of several zones of UTM (evaluate --ignore-zones takes them as one)"
             )
         zones.append(Zone(number, south))
     return zones

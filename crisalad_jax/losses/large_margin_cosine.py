@@ -107,7 +107,7 @@ def large_margin_cosine_loss(
     images = jnp.maximum(counted.sum(), 1)
     loss = -jnp.where(counted, log_share, 0).sum() / images
     right = counted & (cosines.argmax(axis=1) == labels)
-    return LossValue(loss, right.sum() / images)
+    return LossValue(loss, right.sum(dtype=loss.dtype) / images)
 
 
 def _directions(x: Float[Array, "row column"]) -> Float[Array, "row column"]:

@@ -188,5 +188,6 @@ def metric_loss(
     loss = jnp.where(jnp.isfinite(similarities).all(), loss, jnp.nan)
     # In tuples only queries are anchors.
     anchors = batch.anchors if pairs is None else jnp.maximum(pairs.positives.any(axis=1).sum(), 1)
-    easy = 1 - mined.positives.any(axis=1).sum() / anchors
+    # Of two whole numbers JAX's 64-bit mode makes a float64.
+    easy = 1 - mined.positives.any(axis=1).sum(dtype=wide.dtype) / anchors
     return LossResult(loss, easy, value.accuracy)

@@ -82,6 +82,7 @@ class MapService:
             "name": places.folder.resolve().name,
             "images": len(places),
             "axes": places.axes,
+            "zone": places.zone and str(places.zone),
             "positions": known[::step],
             "positions_known": len(known),
             "appends": self.appends,

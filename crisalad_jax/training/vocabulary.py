@@ -34,6 +34,7 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target
+from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.progress import progress_bar
 
 IMAGES = 500
@@ -312,6 +313,7 @@ def _read_features(
     params = devices.replicate(cast_params(params, config))
     generator = np.random.default_rng(seed)
     parts: list[np.ndarray] = []
+    unreadable: list[pathlib.Path] = []
     with progress_bar("vocabulary", len(paths), "images", quiet=quiet) as bar:
         for batch in batches:
             features = jax.device_get(
@@ -320,7 +322,11 @@ def _read_features(
             for image in features[batch.valid]:
                 chosen = np.sort(generator.permutation(len(image))[:PATCHES])
                 parts.append(image[chosen].astype(np.float32))
-            bar.advance(int((batch.indices >= 0).sum()))
+            there = batch.indices >= 0
+            unreadable += [paths[i] for i in batch.indices[there & ~batch.valid]]
+            bar.advance(int(there.sum()))
+    if unreadable:
+        tell(f"images: {len(unreadable)} unreadable left out, {unreadable[0]} the first")
     return np.concatenate(parts) if parts else np.empty((0, config.backbone.dim), np.float32)
 
 

@@ -193,7 +193,7 @@ def test_a_camera_of_a_video(folder, tmp_path, capfd):
     lines = [json.loads(line) for line in out.splitlines()]
     assert lines[-1]["query"] == "walk.avi#t=0.400"
     assert lines[-1]["time"] == 0.4
-    assert set(lines[-1]) == {"query", "time", "latency_ms", "neighbours"}
+    assert set(lines[-1]) == {"query", "time", "latency_ms", "zone", "neighbours"}
     ready, summary = error.splitlines()
     assert ready == f"crisalad: ready, taking frames from {video}"
     assert summary.startswith(f"crisalad: {len(lines)} answers, latency median ")

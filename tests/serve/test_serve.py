@@ -277,7 +277,7 @@ def test_health_and_interface(service, folder):
             places.description.model,
         )
         described = service.ask("GET", "/map").json
-        assert described["axes"] == ["east", "north"]
+        assert (described["axes"], described["zone"]) == (["east", "north"], "10 south")
         assert described["positions"] == [
             [number, *image.position] for number, image in enumerate(places.images)
         ]

@@ -23,6 +23,7 @@ from crisalad_jax.checkpoints.starter import FILE
 from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.data.places import read_places
 from crisalad_jax.losses import LOSSES, LossConfig, metric_loss
+from crisalad_jax.losses.large_margin_cosine import large_margin_cosine_loss
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.base import TokenShape
 from crisalad_jax.nn.config import PRESETS, ModelConfig, with_aggregator
@@ -146,7 +147,17 @@ def test_losses_of_float32_are_float32(name: str) -> None:
     if config.kind.grouping is not None or config.kind.reads_dense:
         pytest.skip("takes more than descriptors; the training step is tested above")
     with jax.enable_x64(True):
-        assert metric_loss(jnp.asarray(rows), jnp.asarray(LABELS), config).loss.dtype == jnp.float32
+        result = metric_loss(jnp.asarray(rows), jnp.asarray(LABELS), config)
+    assert {leaf.dtype for leaf in jax.tree.leaves(result)} == {jnp.dtype("float32")}
+
+
+def test_so_is_the_accuracy_of_a_classification() -> None:
+    with jax.enable_x64(True):
+        rows = jnp.eye(4, dtype=jnp.float32)
+        found = large_margin_cosine_loss(rows, jnp.asarray(LABELS), rows, scale=1.0, margin=0.0)
+    assert found.accuracy is not None
+    # Images 0 to 3 are nearest to the classes 0 to 3, and are of 0, 0, 1 and 1.
+    assert (found.accuracy.dtype, float(found.accuracy)) == (jnp.float32, 0.25)
 
 
 def test_files_and_digests_are_the_same(tmp_path: pathlib.Path) -> None:

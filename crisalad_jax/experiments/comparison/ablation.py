@@ -223,7 +223,7 @@ def _paper_macs(kind: AdapterKind) -> int:
 
 def _race(kinds: tuple[AdapterKind, ...], rounds: int, images: int) -> Race:
     dim, patches = ViTConfig().dim, 16 * 16
-    tokens = jnp.ones((images, 1 + patches, dim))
+    tokens = jnp.ones((images, 1 + patches, dim), jnp.float32)
 
     @functools.partial(jit, static_argnames="grid")
     def apply(params: Any, tokens: jax.Array, grid: tuple[int, int]) -> jax.Array:

@@ -304,22 +304,24 @@ def json_lines(answers: Answers) -> Iterator[str]:
     """Yield a line of JSON for each query: its name, and its answers' names and positions.
 
     Names of queries are relative to their source, as those of a map's images are.
-    Frames of videos have a `time` in seconds, too. Where answers must have a similarity, the line
-    says whether the query is of a `known` place; the answers of an unknown one are listed all the
-    same. Where a name has letters that no text shows, or bytes that are no UTF-8, they are escaped.
+    Frames of videos have a `time` in seconds, too, and metres of UTM their `zone`. Where answers
+    must have a similarity, the line says whether the query is of a `known` place; the answers of an
+    unknown one are listed all the same. Where a name has letters that no text shows, or bytes that
+    are no UTF-8, they are escaped.
     """
     return map(json_text, json_rows(answers))
 
 
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     """Yield what `json_lines` writes of each query."""
+    zone = {} if answers.zone is None else {"zone": str(answers.zone)}
     for name, known, (path, ranked) in zip(
         answers.names, answers.known, answers.rows(), strict=True
     ):
         neighbours = [
             answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in ranked
         ]
-        row = {"query": name, **_time(path), "neighbours": neighbours}
+        row = {"query": name, **_time(path), **zone, "neighbours": neighbours}
         yield row if answers.min_similarity is None else row | {"known": bool(known)}
 
 

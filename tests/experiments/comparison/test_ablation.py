@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import pytest
 
 from crisalad_jax.experiments.comparison import (
@@ -35,6 +36,12 @@ def test_table_3_to_the_unit():
     assert costs["multi-resolution"].parameters == 761_472 + 432 + 4 * 432
     assert costs["mlp"].parameters == linears + 384 + 768
     assert costs["depthwise"].macs == 257 * linears + 256 * depthwise
+
+
+@pytest.mark.filterwarnings("error:Explicitly requested dtype float64")
+def test_adapters_are_timed_in_float32_in_the_64_bit_mode() -> None:
+    with jax.enable_x64(True):
+        assert all(cost.time is not None for cost in adapter_costs(rounds=1, images=1))
 
 
 def test_rows_change_one_thing_each():

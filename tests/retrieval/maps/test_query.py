@@ -96,6 +96,7 @@ def test_lines_of_json(answers, tmp_path):
     first = json.loads(lines[0])
     ((path, found), *_) = answers.rows()
     assert first["query"] == path.name  # the source is its folder
+    assert first["zone"] == "10 south"  # of names with @10@S@, and too far north for band S
     assert first["neighbours"][1] == {
         "rank": 2,
         "name": found[1].image.name,
