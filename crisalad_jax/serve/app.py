@@ -102,6 +102,7 @@ class Places:
     name: str
     images: int
     axes: tuple[str, str] | None
+    zone: str | None
     positions: list[tuple[int, float, float]]
     """(number, position), evenly chosen where there are many."""
     positions_known: int
