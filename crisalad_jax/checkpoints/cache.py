@@ -107,7 +107,7 @@ def _record(model: Published) -> dict[str, Any] | None:
     path = _folder(model) / CACHE_RECORD
     if not path.exists():
         return None
-    record = read_json(path, "the record of a download", must=lambda _: True)
+    record = read_json(path, "the record of a download", sealed=True)
     wrong = not isinstance(record, dict) or {"sha256", "version"} - record.keys()
     if wrong:
         raise InputError(f"{path}: found no record of a download, expected one, or no such file")

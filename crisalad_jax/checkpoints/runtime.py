@@ -209,7 +209,7 @@ def _manifest(folder: pathlib.Path, engine: EngineName) -> dict[str, Any]:
     """Read the manifest of an export that the engine reads."""
     path = folder / MANIFEST
     expected = "the manifest of `crisalad export`"
-    manifest = read_json(path, expected, must=lambda _: True)
+    manifest = read_json(path, expected, sealed=True)
     found = manifest.get("format") if isinstance(manifest, dict) else None
     if found != FORMAT:
         raise InputError(f"{path}: found format {found!r}, expected {FORMAT!r}: {expected}")
@@ -325,7 +325,7 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any] | None:
 
     Returns:
         The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values; None where
-        the file has none: it is of an older version, or is no such file.
+        the file is no such file.
     """
     import safetensors
 

@@ -8,7 +8,7 @@ import os
 import pathlib
 import stat
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -196,7 +196,7 @@ def read_json(
     path: str | os.PathLike[str],
     expected: str,
     *,
-    must: Callable[[Any], bool] = lambda _: False,
+    sealed: bool = False,
     quiet: bool = False,
 ) -> Any:
     """Read the value of a JSON file, and check the checksum that `write_json` put into it.
@@ -204,7 +204,7 @@ def read_json(
     Args:
         path: the file.
         expected: what kind of file, for messages.
-        must: whether a file with this value must hold a checksum.
+        sealed: whether the file must hold a checksum.
         quiet: whether to tell nothing of a file without one, which the caller then does.
 
     Returns:
@@ -219,7 +219,7 @@ def read_json(
         check_sealed(data, value.pop(CHECKSUM), path)
     elif isinstance(value, dict) and has_damaged_key(value):
         raise ChangedFileError(path)
-    elif must(value):
+    elif sealed:
         raise InputError(f"{path}: found no checksum, expected {expected}")
     elif not quiet:
         tell_unchecked(path)

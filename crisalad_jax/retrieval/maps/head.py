@@ -21,10 +21,7 @@ from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.temporaries import LOCK, is_temporary
 
 FORMAT = 4
-"""Newest version of the format that this package reads, and that of a map with components. Others
-are written as format 3, which earlier versions read. Maps of format 2
-have records without checksums; those of format 1 (package version 0.1) also have a hash of all
-fields that a model had then."""
+"""Version of the format."""
 DESCRIPTION, SEGMENTS, LOCKS = "map.json", "segments", (LOCK, ".lock")
 """Names of the description, of the folder of additions, and of the locks for appending, today's
 first."""
@@ -53,7 +50,7 @@ class MapHead:
     pca: str = ""
     """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
     none."""
-    format: int = 3
+    format: int = FORMAT
 
 
 _Head = TypeVar("_Head", bound=MapHead)
@@ -87,11 +84,11 @@ def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[s
         return None
     # Who edits the description removes its checksum. A changed key would be an unknown field.
     value = read_json(path, "a map", quiet=True)
-    version = _version(value)
-    if version > FORMAT:
+    version = value.get("format") if isinstance(value, dict) else None
+    if version != FORMAT:
         raise InputError(
-            f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
-            "crisalad-jax"
+            f"{path}: found a map of format {version}, expected {FORMAT}: `crisalad index` into a "
+            "new folder makes one"
         )
     return value
 
@@ -141,17 +138,6 @@ def read_components(folder: pathlib.Path, description: MapHead) -> Pca | None:
     return pca
 
 
-def _version(value: Any) -> int:
-    """Return the format that a description says; 0 where it says none."""
-    version = value.get("format") if isinstance(value, dict) else None
-    return version if type(version) is int else 0
-
-
-def is_checked(version: int) -> bool:
-    """Return whether the records of a map of this format hold checksums."""
-    return version >= 3
-
-
 def other_files(folder: pathlib.Path, *names: str) -> list[str]:
     """Return the names in `folder` that are neither temporary nor in `names`."""
     if not folder.is_dir():
@@ -174,18 +160,12 @@ def check_model(
 ) -> None:
     """Check that a map was made by the model with the hash `digest`.
 
-    A map of version 0.1 cannot be checked; a note tells so. Another tells where the model is an
-    int8 program of `quantised_from`, which made the map.
+    A note tells where the model is an int8 program of `quantised_from`, which made the map.
 
     Raises:
         InputError: the hashes differ; the message has both.
     """
-    if description.format < 2:
-        tell(
-            f"{folder}: found a map of crisalad-jax 0.1, which cannot tell whether {weights} made "
-            "it; `crisalad index` into a new folder makes one that can"
-        )
-    elif quantised_from == description.model:
+    if quantised_from == description.model:
         tell(
             f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
         )

@@ -41,7 +41,6 @@ from crisalad_jax.retrieval.maps.head import (
     MapHead,
     check_model,
     has_images,
-    is_checked,
     read_components,
     read_head,
     read_value,
@@ -52,7 +51,6 @@ from crisalad_jax.retrieval.maps.store import Store, open_store
 from crisalad_jax.retrieval.maps.unrecorded import check_no_record_lost, remove_unrecorded
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
-from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.locks import one_writer
@@ -146,8 +144,6 @@ class Map:
             listed.discard(path)
         if listed:
             raise InputError(f"{min(listed)}: expected {path.name} before it, found no such file")
-        if not is_checked(head.format):
-            tell_unchecked(folder)
         store.check([(first, count) for first, count, _ in self._segments])
 
     @classmethod
@@ -255,12 +251,7 @@ class Map:
         return self.folder / SEGMENTS / f"{first:010d}.json"
 
     def _read_record(self, path: pathlib.Path) -> None:
-        record = read_json(
-            path,
-            "a record of images",
-            must=lambda _: is_checked(self.head.format),
-            quiet=True,
-        )
+        record = read_json(path, "a record of images", sealed=True)
         try:
             columns = (record["names"], record["bytes"], record["positions"])
             images = [
@@ -275,10 +266,10 @@ class Map:
             if not isinstance(record["root"], str):
                 raise ValueError(f"found root {record['root']!r}, expected text")
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
-            added = record.get("added")  # older records have none
+            added = record["added"]
             if not isinstance(added, str | None):
                 raise ValueError(f"found added {added!r}, expected a time")
-            zone = record.get("zone") and Zone(int(record["zone"][0]), bool(record["zone"][1]))
+            zone = record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
             segment = _Segment(len(self), len(images), str(record["sha256"]))
             if not images:
                 raise ValueError("no images")
