@@ -164,7 +164,7 @@ class StateStore:
     def _check_seal(self, step: int) -> None:
         folder = self._folder / str(step)
         found, saved = _hashes(folder), read_json(folder / _SEAL, "the digests of a state's files")
-        if not isinstance(saved, dict) or not saved:
+        if not saved:
             raise ValueError(f"{_SEAL}: found no digests, expected those of {len(found)} files")
         for name in found.keys() | saved.keys():
             if found.get(name) != saved.get(name):

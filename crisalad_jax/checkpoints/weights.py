@@ -31,6 +31,11 @@ FORMAT = "crisalad-jax 3"
 the version of this package, and the name and source's digest of every part."""
 _DIGEST = "model_sha256"
 """Key of the `model_hash` in the metadata."""
+_KINDS = {
+    **dict.fromkeys(("config", "parts", "source_bytes", "aggregator"), dict),
+    **dict.fromkeys(("version", _DIGEST), str),
+}
+"""Types of the metadata's values."""
 EXTRA = "extra."
 """Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
 
@@ -157,7 +162,7 @@ def load_with_hash(path: str | os.PathLike[str]) -> tuple[Crisalad, ModelConfig,
         InputError: what `load_weights` raises.
     """
     params, config, metadata = _loaded(path, None, verify=True)
-    return params, config, str(metadata.get(_DIGEST))
+    return params, config, metadata[_DIGEST]
 
 
 def _loaded(
@@ -174,7 +179,7 @@ def _loaded(
         raise InputError(
             f"{error}; it is in the cache: once it is removed, the same command makes it anew"
         ) from error
-    same_version = metadata.get("version") == VERSION
+    same_version = metadata["version"] == VERSION
     changed = changed_sources(config, metadata["parts"], same_version, metadata["source_bytes"])
     if changed:
         tell(
@@ -209,11 +214,11 @@ def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     )
     _check_not_public(path, expected)
     plain, arrays = read_sealed(path, FORMAT, expected, but=EXTRA)
-    for name in ("config", "parts", "source_bytes", "aggregator"):
-        value = plain.get(name)
-        if not isinstance(value, dict):
+    for name, kind in _KINDS.items():
+        if not isinstance(value := plain.get(name), kind):
             raise InputError(
-                f"{path} (metadata): found {name} of {type(value).__name__}, expected an object"
+                f"{path} (metadata): found {name} of {type(value).__name__}, expected "
+                f"{kind.__name__}"
             )
     pairs = {field: pair for field, pair in plain["parts"].items() if _is_pair(pair)}
     return arrays, plain | {"parts": pairs}
@@ -248,10 +253,10 @@ def _check_not_public(path: pathlib.Path, expected: str) -> None:
 
 
 def _is_of_another_program(path: pathlib.Path) -> bool:
-    """Return whether a file is a whole one of safetensors without metadata of this package."""
+    """Return whether a file is a whole one of safetensors, and of no format of this package."""
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            return FORMAT not in (file.metadata() or {})
+            return not any(key.startswith("crisalad-jax ") for key in file.metadata() or {})
     except (safetensors.SafetensorError, OSError):
         return False
 

@@ -158,20 +158,19 @@ def _sequence(
     )
 
 
-def read_config(kind: type[_T], path: pathlib.Path, *, quiet: bool = False) -> _T:
+def read_config(kind: type[_T], path: pathlib.Path) -> _T:
     """Read a configuration that a run wrote, or, without a checksum, that a user wrote.
 
     Args:
         kind: its class.
         path: the file.
-        quiet: whether to tell nothing of a file without a checksum.
 
     Raises:
         InputError: the file is missing, is not JSON, was changed since it was written, or holds
             another configuration.
     """
     try:
-        value = read_json(path, "a configuration as JSON", quiet=quiet)
+        value = read_json(path, "a configuration as JSON", sealed=False)
     except ChangedFileError as error:
         raise InputError(f"{error}; to use it as it is, remove the line {CHECKSUM!r}") from error
     return from_plain(kind, value, source=str(path))

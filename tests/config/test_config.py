@@ -344,7 +344,7 @@ def test_every_recipe_fits_every_preset(preset: str, name: str):
 
 def test_the_recipe_of_starter_is_that_of_its_last_run():
     """But for an encoder of no layers, whose fields say nothing."""
-    run = read_config(TrainConfig, ROOT / "docs" / "starter" / "config.json", quiet=True)
+    run = read_config(TrainConfig, ROOT / "docs" / "starter" / "config.json")
     found = recipe("b14", "starter")
     assert found.model.cross_image.layers == run.model.cross_image.layers == 0
     model = dataclasses.replace(found.model, cross_image=run.model.cross_image)
@@ -356,8 +356,8 @@ def test_the_recipe_of_starter_is_that_of_its_last_run():
 
 def test_the_run_without_the_cameras_faults_is_an_epoch_of_starters_but_for_them():
     docs = ROOT / "docs"
-    run = read_config(TrainConfig, docs / "starter" / "first.json", quiet=True)
-    without = read_config(TrainConfig, docs / "small" / "no_faults.json", quiet=True)
+    run = read_config(TrainConfig, docs / "starter" / "first.json")
+    without = read_config(TrainConfig, docs / "small" / "no_faults.json")
     names = [field.name for field in dataclasses.fields(LightAugmentConfig)]
     light = LightAugmentConfig(**{name: getattr(run.augmentation, name) for name in names})
     assert without == dataclasses.replace(run, augmentation=light, epochs=1)

@@ -9,7 +9,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 
 CALIBRATION = "calibration.json"
-"""Name of the file, beside the map's description; versions before it do not look for it."""
+"""Name of the file, beside the map's description."""
 FORMAT = 1
 """Version of the file."""
 
@@ -62,7 +62,7 @@ def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
 
 def _read(path: pathlib.Path, model: str) -> Calibration:
     calibration = from_plain(
-        Calibration, read_json(path, "a map's calibration", quiet=True), source=str(path)
+        Calibration, read_json(path, "a map's calibration", sealed=False), source=str(path)
     )
     if calibration.format != FORMAT:
         raise InputError(f"{path}: found format {calibration.format}, expected {FORMAT}")

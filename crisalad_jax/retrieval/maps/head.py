@@ -22,9 +22,8 @@ from crisalad_jax.utils.temporaries import LOCK, is_temporary
 
 FORMAT = 4
 """Version of the format."""
-DESCRIPTION, SEGMENTS, LOCKS = "map.json", "segments", (LOCK, ".lock")
-"""Names of the description, of the folder of additions, and of the locks for appending, today's
-first."""
+DESCRIPTION, SEGMENTS = "map.json", "segments"
+"""Names of the description, and of the folder of additions."""
 COMPONENTS, SHARES = "pca.safetensors", "shares"
 """Names of the components that shorten descriptors, and of the folder of shares to be joined."""
 
@@ -65,7 +64,7 @@ def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[s
 
     Raises:
         InputError: the folder is a file or holds other things than a map, or the map is damaged or
-            of a newer version of this package.
+            of another format.
     """
     folder = pathlib.Path(folder)
     path = folder / DESCRIPTION
@@ -73,7 +72,7 @@ def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[s
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: found a file, expected a map's folder")
         # A process killed before it has made the map leaves its lock and temporary files behind.
-        others = sorted(other_files(folder, *LOCKS, SEGMENTS, COMPONENTS, SHARES))
+        others = sorted(other_files(folder, LOCK, SEGMENTS, COMPONENTS, SHARES))
         if other_files(folder / SEGMENTS):
             others.append(SEGMENTS)
         if others:
@@ -83,7 +82,7 @@ def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[s
             )
         return None
     # Who edits the description removes its checksum. A changed key would be an unknown field.
-    value = read_json(path, "a map", quiet=True)
+    value = read_json(path, "a map", sealed=False)
     version = value.get("format") if isinstance(value, dict) else None
     if version != FORMAT:
         raise InputError(
@@ -98,7 +97,7 @@ def read_head(folder: str | os.PathLike[str]) -> MapHead | None:
 
     Raises:
         InputError: the folder is a file or holds other things than a map, or the map is damaged or
-            of a newer version of this package.
+            of another format.
     """
     folder = pathlib.Path(folder)
     value = read_value(folder, or_new=False)
@@ -171,8 +170,7 @@ def check_model(
         )
     elif digest != description.model:
         file = FILES.get(description.weights)
-        known = None if file is None else read_header(file)
-        is_todays = known is None or known["model_sha256"] == description.model
+        is_todays = file is None or read_header(file)["model_sha256"] == description.model
         version = "" if is_todays else " of another version of this package"
         raise InputError(
             f"{folder}: found a map made by model {description.model[:12]} "

@@ -14,7 +14,6 @@ from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.retrieval.maps.head import (
     COMPONENTS,
     DESCRIPTION,
-    LOCKS,
     SEGMENTS,
     MapHead,
     checked,
@@ -26,7 +25,7 @@ from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.retrieval.model import Model, model_hash
 from crisalad_jax.retrieval.pca import Pca, pca_hash
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.temporaries import remove_temporaries
+from crisalad_jax.utils.temporaries import LOCK, remove_temporaries
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,7 +114,7 @@ def _remove(folder: pathlib.Path) -> None:
     for path in segments.glob("[0-9]*.npy"):
         path.unlink()
     segments.rmdir()
-    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, COMPONENTS, *LOCKS}:
-        for name in (DESCRIPTION, COMPONENTS, *LOCKS):
+    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, COMPONENTS, LOCK}:
+        for name in (DESCRIPTION, COMPONENTS, LOCK):
             (folder / name).unlink(missing_ok=True)
         folder.rmdir()

@@ -166,7 +166,7 @@ class Map:
 
         Raises:
             InputError: there is no map, it has no images yet, or it or its store is damaged,
-                changed, gone, or of a newer version.
+                changed, gone, or of another format.
 
         Example:
             >>> with Map.open("no-map") as places:
@@ -251,7 +251,7 @@ class Map:
         return self.folder / SEGMENTS / f"{first:010d}.json"
 
     def _read_record(self, path: pathlib.Path) -> None:
-        record = read_json(path, "a record of images", sealed=True)
+        record = read_json(path, "a record of images")
         try:
             columns = (record["names"], record["bytes"], record["positions"])
             images = [
@@ -601,8 +601,8 @@ class Map:
             file,
             engine,
             image_size=tuple(config["image_size"]),
-            preprocessing=config.get("preprocessing"),
-            precision=config.get("compute_dtype", "float32"),
+            preprocessing=config["preprocessing"],
+            precision=config["compute_dtype"],
             any_grouping=any_grouping,
             verify=verify,
         )
