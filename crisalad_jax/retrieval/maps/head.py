@@ -103,8 +103,7 @@ def read_head(folder: str | os.PathLike[str]) -> MapHead | None:
     value = read_value(folder, or_new=False)
     if value is None:
         return None
-    if isinstance(value, dict):
-        value.pop("config", None)
+    value.pop("config", None)
     return checked(from_plain(MapHead, value, source=str(folder / DESCRIPTION)), folder)
 
 
