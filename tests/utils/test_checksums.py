@@ -283,9 +283,7 @@ def test_json_without_a_checksum_is_refused_unless_anybody_may_write_it(tmp_path
 def test_safetensors_of_another_format_are_refused(tmp_path, verify):
     path = tmp_path / "a.safetensors"
     write_sealed(path, ARRAYS, "crisalad-jax some 1", VALUE)
-    with pytest.raises(
-        InputError, match=r"a\.safetensors: found metadata \['crisalad-jax some 1'\]"
-    ):
+    with pytest.raises(InputError, match=r"^\S+a\.safetensors: found .*'crisalad-jax some 1'"):
         load(path, verify=verify)
 
 
