@@ -293,15 +293,13 @@ def test_the_recipes_over_resnet_are_as_published():
     assert edtformer.optimiser.step_gamma == 0.7
 
 
-def test_a_part_alone_and_old_names_are_told():
+def test_a_part_alone_is_told():
     with pytest.warns(Note, match=r"^recipe: found gem, which is a part: crisalad\+gem, CriS"):
         assert recipe("tiny", "gem") == recipe("tiny", "crisalad+gem")
-    with pytest.warns(Note, match="^recipe: found eigenplaces, which is called eigenplaces-vit$"):
-        assert recipe("tiny", "eigenplaces") == recipe("tiny", "eigenplaces-vit")
     swapped = recipe("b14", "salad+step:newton")
     assert swapped.model.aggregator.sinkhorn.step.part_name == "newton"
     assert swapped.optimiser == recipe("b14", "salad").optimiser
-    for name in ("crisalad+crisalad", "gem+salad", "crisalad+"):
+    for name in ("crisalad+crisalad", "gem+salad", "crisalad+", "eigenplaces"):
         with pytest.raises(InputError, match=r"^recipe: found '.*', expected one of anyloc"):
             recipe("tiny", name)
 

@@ -80,8 +80,15 @@ def test_fields_left_out_take_their_defaults():
         ({"model": {"imag_size": [98, 98]}}, ["imag_size", "config.model"]),
         ({"model": {"image_size": [100, 98]}}, ["found 100 x 98", "nearest: 98 x 98"]),
         ({"model": {"image_size": [98]}}, ["config.model.image_size"]),
-        ({"model": {"backbone": {"dim": "32"}}}, ["'32'", "expected int", "config.model.backbone"]),
-        ({"model": {"backbone": {"ffn": "relu"}}}, ["relu", "swiglu", "config.model.backbone.ffn"]),
+        (
+            {"model": {"backbone": {"name": "vit", "dim": "32"}}},
+            ["'32'", "expected int", "config.model.backbone"],
+        ),
+        (
+            {"model": {"backbone": {"name": "vit", "ffn": "relu"}}},
+            ["relu", "swiglu", "config.model.backbone.ffn"],
+        ),
+        ({"model": {"backbone": {"dim": 32}}}, ["None", "config.model.backbone"]),
         ({"model": 3}, ["config.model"]),
         ({"model": None}, ["config.model"]),
         ({"epochs": 3.7}, ["3.7", "expected int", "config.epochs"]),
