@@ -6,11 +6,8 @@ reading pictures takes no jax and a model no file formats.
 
 import ast
 import importlib
-import operator
 import os
 import pathlib
-import sys
-import warnings
 from typing import Any
 
 from crisalad_jax.utils.extras import missing_extra
@@ -39,20 +36,8 @@ _HOMES = _homes()
 __all__ = sorted([*_HOMES, "__version__"])
 
 
-_RENAMED = {
-    "alone": "self_mask",
-    "among": "valid_mask",
-    "save": "save_weights",
-    "solve_transport": "sinkhorn.solve",
-}
-"""Public names of version 0.1."""
-
-
 def __getattr__(name: str) -> Any:
     """Import a public name from the module it lives in."""
-    if name in _RENAMED:
-        warnings.warn(f"crisalad_jax.{name} is {_RENAMED[name]} now", FutureWarning, stacklevel=2)
-        return operator.attrgetter(_RENAMED[name])(sys.modules[__name__])
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, attribute = _HOMES[name]

@@ -40,7 +40,7 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     path = folder / "manifest.json"
     data = path.read_bytes()
     manifest = json.loads(data)
-    digest = manifest.pop("checksum", "")
+    digest = manifest.pop("checksum")
     zeros = data.replace(digest.encode(), b"0" * 64, 1)
     if hashlib.sha256(zeros).hexdigest() != digest:
         raise SystemExit(f"{path}: found other bytes than were written")

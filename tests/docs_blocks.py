@@ -20,7 +20,6 @@ import time
 
 import crisalad_jax as cj
 from crisalad_jax import cli
-from crisalad_jax.cli import renamed
 from crisalad_jax.config import parts, plugins
 from crisalad_jax.training.recipes import RECIPES
 
@@ -65,12 +64,7 @@ def parse(command: str) -> None:
     given = list(itertools.takewhile(lambda argument: argument not in ("|", ">"), given))
     given = [argument for argument in given if argument not in ("--help", "--help-all")]
     cli._load_plugins(given)
-
-    def refuse(line: str) -> None:
-        raise cj.InputError(line)
-
     if given:
-        renamed.today(given, refuse)
         cli._parse(
             verb, importlib.import_module(f"crisalad_jax.cli.{verb.replace('-', '_')}"), given
         )

@@ -107,9 +107,8 @@ def _record(model: Published) -> dict[str, Any] | None:
     path = _folder(model) / CACHE_RECORD
     if not path.exists():
         return None
-    record = read_json(path, "the record of a download", must=lambda _: True)
-    wrong = not isinstance(record, dict) or {"sha256", "version"} - record.keys()
-    if wrong:
+    record = read_json(path, "the record of a download")
+    if {"sha256", "version"} - record.keys():
         raise InputError(f"{path}: found no record of a download, expected one, or no such file")
     return record
 

@@ -209,11 +209,11 @@ def _manifest(folder: pathlib.Path, engine: EngineName) -> dict[str, Any]:
     """Read the manifest of an export that the engine reads."""
     path = folder / MANIFEST
     expected = "the manifest of `crisalad export`"
-    manifest = read_json(path, expected, must=lambda _: True)
-    found = manifest.get("format") if isinstance(manifest, dict) else None
+    manifest = read_json(path, expected)
+    found = manifest.get("format")
     if found != FORMAT:
         raise InputError(f"{path}: found format {found!r}, expected {FORMAT!r}: {expected}")
-    kind = manifest.get("program_format", "stablehlo")
+    kind = manifest["program_format"]
     if kind not in _READS[engine]:
         raise InputError(
             f"{folder}: found a program of format {kind}, expected {' or '.join(_READS[engine])} "
@@ -292,9 +292,9 @@ def _exported(
     any_grouping: bool,
 ) -> pathlib.Path:
     """Return the exported folder of a file of weights in the cache; export it the first time."""
-    known = read_header(weights)
-    plain = {} if known is None else known["config"]
-    settings = {
+    header = read_header(weights)
+    plain = header["config"]
+    settings = {  # a damaged file may lack some, which `_export` refuses
         "image_size": list(image_size or plain.get("image_size", ())),
         "preprocessing": plain.get("preprocessing")
         if preprocessing is None
@@ -303,11 +303,10 @@ def _exported(
         "grouping": "any" if any_grouping else "single",
         "version": VERSION,
     }
-    if known is not None:
-        folder = _cached(known["model_sha256"], settings)
-        if (folder / MANIFEST).is_file():
-            return folder
-    return _export(weights, settings)
+    folder = _cached(header["model_sha256"], settings)
+    if not (folder / MANIFEST).is_file():
+        _export(weights, settings, folder)
+    return folder
 
 
 def _cached(digest: str, settings: Mapping[str, Any]) -> pathlib.Path:
@@ -315,7 +314,7 @@ def _cached(digest: str, settings: Mapping[str, Any]) -> pathlib.Path:
     return user_cache() / "exports" / hashlib.sha256(key.encode()).hexdigest()[:32]
 
 
-def read_header(weights: str | os.PathLike[str]) -> dict[str, Any] | None:
+def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
     """Read what a file of weights says of its model, without its arrays.
 
     Its bytes are not compared with its checksum: the export is, and it was made of bytes that were.
@@ -324,8 +323,10 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any] | None:
         weights: the file.
 
     Returns:
-        The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values; None where
-        the file has none: it is of an older version, or is no such file.
+        The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values.
+
+    Raises:
+        InputError: what `load_weights` raises, for a file without such metadata.
     """
     import safetensors
 
@@ -335,46 +336,42 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any] | None:
         for value in values:
             if isinstance(value, dict) and {"model_sha256", "config"} <= value.keys():
                 return value
-    return None
+    from crisalad_jax.checkpoints.weights import load_weights
+
+    load_weights(weights)
+    raise AssertionError("no header")  # which `load_weights` has told of
 
 
 def read_model(weights: str | os.PathLike[str]) -> "ModelConfig":
-    """Read the configuration in a file of weights, without its arrays where it has metadata.
+    """Read the configuration in a file of weights, without its arrays.
 
     Raises:
-        InputError: what `load_weights` raises, for a file without `read_header`.
+        InputError: what `read_header` raises, or of the configuration.
     """
     from crisalad_jax.config.io import from_plain
     from crisalad_jax.nn.config import ModelConfig
 
-    header = read_header(weights)
-    if header is None:
-        from crisalad_jax.checkpoints.weights import load_weights
-
-        return load_weights(weights)[1]
-    return from_plain(ModelConfig, header["config"], source=f"{weights} (metadata)")
+    return from_plain(ModelConfig, read_header(weights)["config"], source=f"{weights} (metadata)")
 
 
-def _export(weights: pathlib.Path, settings: Mapping[str, Any]) -> pathlib.Path:
+def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.Path) -> None:
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
-    from crisalad_jax.checkpoints.weights import load_with_hash
+    from crisalad_jax.checkpoints.weights import load_weights
 
-    params, config, digest = load_with_hash(weights)
-    plain = settings["preprocessing"]
-    if settings["image_size"]:
-        config = dataclasses.replace(config, image_size=tuple(settings["image_size"]))
-    if plain is not None:
-        config = dataclasses.replace(config, preprocessing=_as_config(plain))
-    config = dataclasses.replace(config, compute_dtype="float32")
+    params, config = load_weights(weights)
+    config = dataclasses.replace(
+        config,
+        image_size=tuple(settings["image_size"]),
+        preprocessing=_as_config(settings["preprocessing"]),
+        compute_dtype="float32",
+    )
     if config.preprocessing.size_rule != "fixed":
         raise InputError(
             f"{weights}: found images of size rule {config.preprocessing.size_rule}, expected "
             "fixed: a program takes one size (--resize fixed)"
         )
-    folder = _cached(digest, settings)
     with next_writer(folder.parent):
         if not (folder / MANIFEST).is_file():
             tell(f"{weights}: exporting it for --runtime, once; into {folder}")
             how = ExportConfig(settings["grouping"], format=settings["format"])
             write_export(folder, params, config, how)
-    return folder

@@ -11,7 +11,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from crisalad_jax.utils.checksums import CHECKSUM, seal_safetensors, tell_unchecked, with_blank
+from crisalad_jax.utils.checksums import CHECKSUM, seal_safetensors, with_blank
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, parse_json
 
@@ -19,7 +19,6 @@ from crisalad_jax.utils.files import atomic_path, check_source, parse_json
 class Contents(NamedTuple):
     """What a file holds."""
 
-    format: str
     value: Any
     """The object beside the arrays, without its checksum."""
     arrays: dict[str, np.ndarray]
@@ -78,15 +77,12 @@ def _write(
     temporary.chmod(0o644)
 
 
-def read_sealed(
-    path: pathlib.Path, forms: Sequence[str], expected: str, *, but: str = "\0"
-) -> Contents:
+def read_sealed(path: pathlib.Path, form: str, expected: str, *, but: str = "\0") -> Contents:
     """Read a file that `write_sealed` wrote; `checksums.checked_safetensors` checks its bytes.
 
     Args:
         path: the file.
-        forms: formats, today's first. Files of others may lack a checksum: a note tells of one that
-            does.
+        form: its format.
         expected: what kind of file, for messages.
         but: beginning of the names of arrays that are not read.
 
@@ -97,8 +93,7 @@ def read_sealed(
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            form = next((form for form in forms if form in metadata), None)
-            if form is None:
+            if form not in metadata:
                 raise InputError(f"{path}: found metadata {sorted(metadata)}, expected {expected}")
             names = [name for name in file.keys() if not name.startswith(but)]  # noqa: SIM118
         arrays = _views(path, names)
@@ -107,13 +102,10 @@ def read_sealed(
             f"{path}: not a whole safetensors file ({error}), expected {expected}"
         ) from error
     value = parse_json(metadata[form], f"{path} (metadata)", expected)
-    if isinstance(value, dict) and CHECKSUM in value:
-        del value[CHECKSUM]
-    elif form == forms[0]:
+    if not isinstance(value, dict) or CHECKSUM not in value:
         raise InputError(f"{path} (metadata): found no {CHECKSUM}, expected one in {form!r}")
-    else:
-        tell_unchecked(path)
-    return Contents(form, value, arrays)
+    del value[CHECKSUM]
+    return Contents(value, arrays)
 
 
 _TYPES = {

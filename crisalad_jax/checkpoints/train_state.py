@@ -11,7 +11,7 @@ import pathlib
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -133,7 +133,6 @@ class StateStore:
             # another thread.
             self._check_seal(step)
             stored = self._manager.item_metadata(step)["state"].tree
-            arrays = {_name_among(stored, name): shape for name, shape in arrays.items()}
             _check_arrays(arrays, stored)
         except (OSError, ValueError) as error:
             older = [other for other in self._manager.all_steps() if other != step]
@@ -150,7 +149,7 @@ class StateStore:
         )
         # Convert by numpy: arrays that orbax commits to a device would recompile the step.
         leaves = [
-            jnp.asarray(np.asarray(saved["state"].get(_name_among(stored, name), leaf)))
+            jnp.asarray(np.asarray(saved["state"].get(name, leaf)))
             for name, leaf in named_leaves(template).items()
         ]
         state = jax.tree.unflatten(jax.tree.structure(template), leaves)
@@ -165,7 +164,7 @@ class StateStore:
     def _check_seal(self, step: int) -> None:
         folder = self._folder / str(step)
         found, saved = _hashes(folder), read_json(folder / _SEAL, "the digests of a state's files")
-        if not isinstance(saved, dict) or not saved:
+        if not saved:
             raise ValueError(f"{_SEAL}: found no digests, expected those of {len(found)} files")
         for name in found.keys() | saved.keys():
             if found.get(name) != saved.get(name):
@@ -217,12 +216,6 @@ def _hashes(folder: pathlib.Path) -> dict[str, str]:
 def _stored(state: PyTree) -> dict[str, Any]:
     """Return the leaves by name, without empty ones, which orbax refuses."""
     return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}
-
-
-def _name_among(stored: Mapping[str, Any], name: str) -> str:
-    """Return an array's stored name; version 0.1 named the encoder otherwise."""
-    old = name.replace(".cross_image.layers.", ".encoder.layers.")
-    return old if old in stored else name
 
 
 def _check_arrays(expected: dict[str, jax.ShapeDtypeStruct], stored: dict[str, Any]) -> None:

@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import pathlib
-import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -30,16 +29,13 @@ from crisalad_jax.utils.version import VERSION
 FORMAT = "crisalad-jax 3"
 """Only key of a weight file's metadata. Its value is JSON: the file's checksum, the configuration,
 the version of this package, and the name and source's digest of every part."""
-FORMAT_2 = "crisalad-jax 2"
-"""Metadata key of files without a checksum."""
-FORMAT_1 = "crisalad-jax 1"
-"""Metadata key of version 0.1, whose value was the configuration alone."""
-_MARK = "aggregator.backbone"
-"""Array in files of version 0.1: a checksum of the backbone of AnyLoc's vocabulary; 0 before one is
-built."""
-_FORMATS = {FORMAT, FORMAT_2, FORMAT_1}
 _DIGEST = "model_sha256"
 """Key of the `model_hash` in the metadata."""
+_KINDS = {
+    **dict.fromkeys(("config", "parts", "source_bytes", "aggregator"), dict),
+    **dict.fromkeys(("version", _DIGEST), str),
+}
+"""Types of the metadata's values."""
 EXTRA = "extra."
 """Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
 
@@ -109,7 +105,7 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
     """Return whether this is a whole safetensors file that `save_weights` wrote."""
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            return not _FORMATS.isdisjoint(file.metadata() or {})
+            return FORMAT in (file.metadata() or {})
     except (safetensors.SafetensorError, OSError):
         return False
 
@@ -130,8 +126,7 @@ def load_weights(
 ) -> tuple[Crisalad, ModelConfig]:
     """Read the parameters and configuration that `save_weights` wrote.
 
-    Files of version 0.1 load too. A note tells of a file without a checksum, and if a part's source
-    has changed since the weights were written.
+    A note tells if a part's source has changed since the weights were written.
 
     Args:
         path: the file.
@@ -161,14 +156,13 @@ def load_weights(
 def load_with_hash(path: str | os.PathLike[str]) -> tuple[Crisalad, ModelConfig, str]:
     """Read what `load_weights` reads, and the `model_hash` of the parameters as they were written.
 
-    The file's checksum covers both. Files of versions that wrote none are digested.
+    The file's checksum covers both.
 
     Raises:
         InputError: what `load_weights` raises.
     """
     params, config, metadata = _loaded(path, None, verify=True)
-    digest = metadata.get(_DIGEST)
-    return params, config, digest if isinstance(digest, str) else model_hash(params, config)
+    return params, config, metadata[_DIGEST]
 
 
 def _loaded(
@@ -185,10 +179,8 @@ def _loaded(
         raise InputError(
             f"{error}; it is in the cache: once it is removed, the same command makes it anew"
         ) from error
-    same_version = metadata.get("version") == VERSION
-    changed = changed_sources(
-        config, metadata.get("parts", {}), same_version, metadata.get("source_bytes")
-    )
+    same_version = metadata["version"] == VERSION
+    changed = changed_sources(config, metadata["parts"], same_version, metadata["source_bytes"])
     if changed:
         tell(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
@@ -208,34 +200,25 @@ def _load(
         if wrong:
             raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
     params = _fill(config, arrays, path)
-    own = config.aggregator.with_metadata(params.aggregator, metadata.get("aggregator", {}))
-    mark = metadata.get(_MARK)
-    if mark:
-        _check_mark(mark, params.backbone, str(path))
-        own = config.aggregator.bind(own, params.backbone)
+    own = config.aggregator.with_metadata(params.aggregator, metadata["aggregator"])
     params = dataclasses.replace(params, aggregator=own)
     config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
     return params, config, metadata
 
 
 def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays by name, and the metadata in today's format."""
+    """Read the arrays by name, and the metadata."""
     expected = (
         f"a .safetensors file of weights ({FORMAT!r}), as this package writes it; `crisalad "
         "convert` reads public checkpoints"
     )
     _check_not_public(path, expected)
-    key, plain, arrays = read_sealed(path, (FORMAT, FORMAT_2, FORMAT_1), expected, but=EXTRA)
-    if key == FORMAT_1:
-        mark = arrays.pop(_MARK, np.zeros(()))
-        return dict(_renamed(arrays)), {"config": plain, _MARK: float(mark.max(initial=0))}
-    if not isinstance(plain, dict) or "config" not in plain:
-        raise InputError(f"{path}: found no configuration in its metadata, expected 'config'")
-    for name in ("parts", "source_bytes", "aggregator"):
-        value = plain.setdefault(name, {})
-        if not isinstance(value, dict):
+    plain, arrays = read_sealed(path, FORMAT, expected, but=EXTRA)
+    for name, kind in _KINDS.items():
+        if not isinstance(value := plain.get(name), kind):
             raise InputError(
-                f"{path} (metadata): found {name} of {type(value).__name__}, expected an object"
+                f"{path} (metadata): found {name} of {type(value).__name__}, expected "
+                f"{kind.__name__}"
             )
     pairs = {field: pair for field, pair in plain["parts"].items() if _is_pair(pair)}
     return arrays, plain | {"parts": pairs}
@@ -270,11 +253,10 @@ def _check_not_public(path: pathlib.Path, expected: str) -> None:
 
 
 def _is_of_another_program(path: pathlib.Path) -> bool:
-    """Return whether a file is a whole one of safetensors without metadata of this package."""
+    """Return whether a file is a whole one of safetensors, and of no format of this package."""
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            return not any(form in metadata for form in (FORMAT, FORMAT_2, FORMAT_1))
+            return not any(key.startswith("crisalad-jax ") for key in file.metadata() or {})
     except (safetensors.SafetensorError, OSError):
         return False
 
@@ -282,25 +264,6 @@ def _is_of_another_program(path: pathlib.Path) -> bool:
 def _is_pair(value: Any) -> bool:
     """Return whether this is a part's name and its source's digest."""
     return isinstance(value, list) and len(value) == 2
-
-
-def _renamed(arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield arrays of version 0.1 under today's names."""
-    for name, array in arrays.items():
-        inside = name.startswith("encoder.")
-        yield (f"cross_image.{name.removeprefix('encoder.')}" if inside else name), array
-
-
-def _check_mark(mark: float, backbone: Any, source: str) -> None:
-    """Raise InputError where a vocabulary of version 0.1 is of another backbone."""
-    value = 0
-    for name, leaf in named_leaves(backbone).items():
-        value = zlib.crc32(np.ascontiguousarray(leaf).data, zlib.crc32(name.encode(), value))
-    if mark != 1 + value % (2**24 - 1):  # whole numbers that float32 holds
-        raise InputError(
-            f"{source}: found a vocabulary of another backbone, expected one of these weights' "
-            "(`crisalad vocabulary` builds it)"
-        )
 
 
 def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
@@ -364,8 +327,6 @@ def model_hash(params: Crisalad, config: ModelConfig) -> str:
         SHA-256 in hexadecimal digits.
     """
     plain = essence(config)
-    # Where earlier versions had its fields; what is free in it leaves nothing.
-    plain |= plain.pop("preprocessing", {})
     if config.aggregator.fixed_grid:
         plain["image_size"] = list(config.image_size)
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())

@@ -115,13 +115,10 @@ def _limit_pixels(given: Sequence[str]) -> None:
         os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = pixels
 
 
-def _run(name: str, given: list[str], keep_programs: bool) -> None:
-    from crisalad_jax.cli import renamed
-
-    require("" not in given, "arguments: found an empty one, expected a value")
-    _limit_pixels(given)
-    _load_plugins(given)
-    arguments = renamed.today(given, lambda line: print(f"crisalad: note: {line}", file=sys.stderr))
+def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
+    require("" not in arguments, "arguments: found an empty one, expected a value")
+    _limit_pixels(arguments)
+    _load_plugins(arguments)
     module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
     if hasattr(module, "prepare"):
         arguments = module.prepare(arguments)

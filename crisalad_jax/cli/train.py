@@ -182,7 +182,7 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
         for flag in ("--preset", "--recipe"):
             if find_flag(arguments, flag) is not None:
                 raise InputError(f"{flag}: found beside --config, expected only one of the two")
-        return read_config(TrainConfig, pathlib.Path(given), quiet=True)
+        return read_config(TrainConfig, pathlib.Path(given))
     weights = find_flag(arguments, "--weights")
     model = read_model(weights) if weights is not None and os.path.isfile(weights) else None
     preset = find_flag(arguments, "--preset") or "b14"

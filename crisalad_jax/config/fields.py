@@ -46,10 +46,10 @@ def essence(config: Any) -> Any:
         return to_plain_value(config)
     plain = {NAME: config.part_name} if isinstance(config, Part) else {}
     for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if is_free(field) or value == _default(field):
-            continue
-        plain[field.name] = essence(value)
+        value = essence(getattr(config, field.name))
+        # Not the configurations themselves, which may differ in what is free inside them alone.
+        if not is_free(field) and value != essence(_default(field)):
+            plain[field.name] = value
     return plain
 
 

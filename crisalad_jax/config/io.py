@@ -10,7 +10,6 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from crisalad_jax.config.aliases import upgrade
 from crisalad_jax.config.concise import fields_in_use
 from crisalad_jax.config.parts import Part
 from crisalad_jax.config.plugins import home_of
@@ -51,7 +50,7 @@ def _plain(value: Any) -> Any:
 def from_plain(kind: type[_T], value: Any, *, source: str) -> _T:
     """Make the configuration of class `kind` from the values that `to_plain` returned.
 
-    Missing fields take their defaults. Names of earlier versions are accepted.
+    Missing fields take their defaults.
 
     Args:
         kind: the class.
@@ -87,7 +86,6 @@ def _config(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
         except InputError as error:
             problems.append(f"{error} @ {path}")
             return None
-    value = upgrade(kind, value)
     hints = typing.get_type_hints(kind)
     fields = {field.name: field for field in dataclasses.fields(kind)}
     unknown = sorted(value.keys() - fields.keys())
@@ -160,20 +158,19 @@ def _sequence(
     )
 
 
-def read_config(kind: type[_T], path: pathlib.Path, *, quiet: bool = False) -> _T:
+def read_config(kind: type[_T], path: pathlib.Path) -> _T:
     """Read a configuration that a run wrote, or, without a checksum, that a user wrote.
 
     Args:
         kind: its class.
         path: the file.
-        quiet: whether to tell nothing of a file without a checksum.
 
     Raises:
         InputError: the file is missing, is not JSON, was changed since it was written, or holds
             another configuration.
     """
     try:
-        value = read_json(path, "a configuration as JSON", quiet=quiet)
+        value = read_json(path, "a configuration as JSON", sealed=False)
     except ChangedFileError as error:
         raise InputError(f"{error}; to use it as it is, remove the line {CHECKSUM!r}") from error
     return from_plain(kind, value, source=str(path))

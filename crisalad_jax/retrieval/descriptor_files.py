@@ -289,7 +289,7 @@ def _check_files(path: pathlib.Path, files: Mapping[str, pathlib.Path]) -> None:
         tell_unchecked(path, f"no {record.name} with its checksum")
         return
     value = read_json(record, "a record of descriptors")
-    digests = value.get(_DIGESTS) if isinstance(value, dict) else None
+    digests = value.get(_DIGESTS)
     if not isinstance(digests, dict) or not digests.keys() >= files.keys():
         raise InputError(
             f"{record}: found no digests of {', '.join(files)}, expected them: {path.name} and "

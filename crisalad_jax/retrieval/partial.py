@@ -208,7 +208,7 @@ def _read(
             return
         try:
             with checked_safetensors(path, verify=True):
-                _, value, arrays = read_sealed(path, (FORMAT,), "tokens of images")
+                value, arrays = read_sealed(path, FORMAT, "tokens of images")
             part = FolderTokens(**arrays)
         except (InputError, TypeError):
             return

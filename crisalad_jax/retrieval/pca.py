@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 FORMAT = "crisalad-jax pca 2"
 """The one key of a file's metadata; its value is JSON: the file's checksum and the `PcaConfig`."""
-FORMAT_1 = "crisalad-jax pca 1"
-"""Metadata key of files without a checksum; its value was the `PcaConfig` alone."""
 SAMPLES = 2**14
 """Largest number of descriptors that components are fitted to, as in CricaVPR."""
 _ARRAYS = ("mean", "components", "variances", "total")
@@ -328,12 +326,12 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
 
 
 def _load(path: pathlib.Path, expected: str) -> Pca:
-    form, value, arrays = read_sealed(path, (FORMAT, FORMAT_1), expected)
+    value, arrays = read_sealed(path, FORMAT, expected)
     if arrays.keys() != set(_ARRAYS):
         raise InputError(f"{path}: found arrays {sorted(arrays)[:3]}, expected {expected}")
     # In memory of its own: the file may be written anew while a map uses them.
     arrays = {name: arrays[name].copy() for name in _ARRAYS}
-    plain = value["config"] if form == FORMAT and "config" in value else value
+    plain = value.get("config")
     shape = arrays["components"].shape
     dim, length = shape if len(shape) == 2 else (0, 0)
     shapes = [array.shape for array in arrays.values()]

@@ -214,7 +214,7 @@ class SharedSet(NamedTuple):
         if not all(file.exists() for file in targets(path)):
             return False
         record = read_json(record_of(path), "a record of descriptors")
-        return isinstance(record, dict) and record.get(_SHARES) == self.digest
+        return record.get(_SHARES) == self.digest
 
     def left(self) -> list[Share]:
         """Return the shares that are not there yet; a note tells of those of other images."""

@@ -253,7 +253,7 @@ class Run:
                     "expected the same, or another folder"
                 )
 
-        changed = changed_sources(self.config, saved.get("sources", {}), same_version=False)
+        changed = changed_sources(self.config, saved["sources"], same_version=False)
         if changed:
             raise InputError(
                 f"{self.out}: found another source of {', '.join(changed)} than the run began "

@@ -179,7 +179,7 @@ def claim_run(out: pathlib.Path, config: TrainConfig) -> int | None:
     if not path.exists():
         write_json(path, to_plain(config))
         return None
-    epochs = read_config(TrainConfig, path, quiet=True).epochs
+    epochs = read_config(TrainConfig, path).epochs
     return epochs if epochs < config.epochs else None
 
 
@@ -194,7 +194,7 @@ def extend_run(out: pathlib.Path, config: TrainConfig, step: int) -> None:
         step: the step that it goes on from.
     """
     path, history = out / "config.json", out / "epochs.json"
-    before = read_config(TrainConfig, path, quiet=True).epochs
+    before = read_config(TrainConfig, path).epochs
     known = read_json(history, "the epochs of a run")["before"] if history.exists() else []
     # After a kill between the two files, the last entry is there already.
     known = [each for each in known if each["epochs"] != before]

@@ -74,8 +74,8 @@ class ChangedFileError(InputError):
 
 
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
-    """Tell that a file, as of an earlier version or another program, has no checksum."""
-    tell(f"{path}: found {missing}, as of earlier versions or other programs; not checked")
+    """Tell that a file, as of another program, has no checksum."""
+    tell(f"{path}: found {missing}, as of other programs; not checked")
 
 
 def has_damaged_key(value: Mapping[str, Any]) -> bool:

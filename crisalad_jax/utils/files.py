@@ -8,7 +8,7 @@ import os
 import pathlib
 import stat
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,6 @@ from crisalad_jax.utils.checksums import (
     check_sealed,
     has_damaged_key,
     sealed_json,
-    tell_unchecked,
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
@@ -192,23 +191,16 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return value
 
 
-def read_json(
-    path: str | os.PathLike[str],
-    expected: str,
-    *,
-    must: Callable[[Any], bool] = lambda _: False,
-    quiet: bool = False,
-) -> Any:
+def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = True) -> Any:
     """Read the value of a JSON file, and check the checksum that `write_json` put into it.
 
     Args:
         path: the file.
         expected: what kind of file, for messages.
-        must: whether a file with this value must hold a checksum.
-        quiet: whether to tell nothing of a file without one, which the caller then does.
+        sealed: whether the file must hold a checksum; who edits a configuration removes it.
 
     Returns:
-        The value, without its checksum.
+        The value, without its checksum; an object where the file must hold one.
 
     Raises:
         InputError: as `read_bytes` and `parse_json`; or the bytes are not those that were written.
@@ -219,10 +211,8 @@ def read_json(
         check_sealed(data, value.pop(CHECKSUM), path)
     elif isinstance(value, dict) and has_damaged_key(value):
         raise ChangedFileError(path)
-    elif must(value):
+    elif sealed:
         raise InputError(f"{path}: found no checksum, expected {expected}")
-    elif not quiet:
-        tell_unchecked(path)
     return value
 
 

@@ -86,7 +86,7 @@ def with_encoder(config: TrainConfig) -> TrainConfig:
 
 def small_resnet() -> TrainConfig:
     """A training of the model in the package with half its width and fewer pixels."""
-    start = read_config(TrainConfig, WORLD_BASE, quiet=True)
+    start = read_config(TrainConfig, WORLD_BASE)
     backbone: Any = start.model.backbone
     model = dataclasses.replace(
         start.model, image_size=(96, 96), backbone=dataclasses.replace(backbone, width=16)

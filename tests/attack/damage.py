@@ -3,7 +3,7 @@
     python -m tests.attack.damage --out rows.json [--changes 300] [--seed 0]
 
 A change is refused if the reader raises one line, told if it loads with a note, and silent
-otherwise. Files without a checksum, which earlier versions wrote, are told of.
+otherwise. Descriptors without their record are told of.
 """
 
 import argparse

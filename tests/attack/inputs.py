@@ -822,7 +822,7 @@ SAFETENSORS: Mapping[str, bytes] = {
         b'{"\\u001b[31m\\n":{"dtype":"F32","shape":[16],"data_offsets":[0,64]}}'
     ),
     "metadata nested deep": _safetensors(
-        json.dumps({"__metadata__": {"crisalad-jax weights 3": "[" * 10**5}}).encode(), b""
+        json.dumps({"__metadata__": {"crisalad-jax 3": "[" * 10**5}}).encode(), b""
     ),
 }
 

@@ -506,7 +506,7 @@ def bad_file(folder: pathlib.Path, kind: str) -> pathlib.Path:
     elif kind == "one position":
         torch.save(state | {"pos_embed": torch.zeros(1, 1, 64)}, path)
     elif kind == "a depth for an age":
-        config = json.dumps({"backbone": {"depth": 10**9}})
+        config = json.dumps({"backbone": {"name": "vit", "depth": 10**9}})
         torch.save({"state_dict": state, "config": config}, path)
     elif kind == "a deep configuration":
         torch.save({"state_dict": state, "config": "[" * 10**5}, path)

@@ -10,7 +10,6 @@ import pytest
 from crisalad_jax.checkpoints.train_state import StateStore
 from crisalad_jax.training.step import StepConfig, init_train_state
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, RECIPE, assert_equal
 
 
@@ -35,25 +34,6 @@ def test_a_state_survives_bit_for_bit_and_the_last_ones_stay(tmp_path, state):
     again.close()
     assert saved is not None
     assert (saved.step, saved.record) == (5, {"best": 9.0})
-    assert_equal(saved.state, moved)
-
-
-def test_a_state_under_the_names_of_version_0_1_is_restored(tmp_path, state):
-    """The cross-image encoder was `encoder`, in the parameters and in the optimiser's moments."""
-    moved = jax.tree.map(lambda leaf: leaf + 3, state)
-    names = {name: name.replace(".cross_image.", ".encoder.") for name in named_leaves(moved)}
-    assert {
-        "trainable.encoder.layers.0.attn.qkv.weight",
-        "optimiser.0.mu.encoder.layers.1.linear2.bias",
-        "optimiser.0.nu.encoder.layers.1.norm2.bias",
-    } <= set(names.values())
-    store = StateStore(tmp_path / "state")
-    leaves = named_leaves(moved)
-    store.save(4, {names[name]: leaf for name, leaf in leaves.items()}, {"best": 0.5})
-    saved = store.load(state)
-    store.close()
-    assert saved is not None
-    assert (saved.step, saved.record) == (4, {"best": 0.5})
     assert_equal(saved.state, moved)
 
 

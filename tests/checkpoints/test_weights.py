@@ -1,7 +1,6 @@
 """Weights there and back bit for bit, and files that are none of ours."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import os
@@ -10,7 +9,6 @@ import re
 import struct
 import typing
 import warnings
-import zlib
 from collections.abc import Iterator
 from typing import Any, ClassVar, Literal
 
@@ -24,7 +22,6 @@ from crisalad_jax.checkpoints import weights
 from crisalad_jax.checkpoints.safetensors_io import write_safetensors, write_sealed
 from crisalad_jax.checkpoints.weights import (
     is_ours,
-    load_extras,
     load_weights,
     model_hash,
     save_weights,
@@ -35,12 +32,11 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.parts import Part
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.nn.aggregators import AGGREGATORS
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import parameter_shapes
-from crisalad_jax.sinkhorn import SinkhornConfig, SinkhornStep
+from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
 from crisalad_jax.utils.pytree import named_leaves
@@ -65,7 +61,7 @@ def test_weights_survive_a_file_bit_for_bit(tmp_path, config):
 
 
 def test_the_package_offers_both(tmp_path, params):
-    crisalad_jax.save(tmp_path / "w.safetensors", params, MODEL)
+    crisalad_jax.save_weights(tmp_path / "w.safetensors", params, MODEL)
     found, config = crisalad_jax.load(str(tmp_path / "w.safetensors"))
     assert config == MODEL
     assert_equal(found, params)
@@ -174,32 +170,20 @@ def test_parameters_of_one_image_size_keep_it(tmp_path):
     assert model_hash(params, turned) != model_hash(params, config)
 
 
-def test_aggregators_that_a_model_does_not_have_are_free(tmp_path, shared):
-    """Files of version 0.1 have the settings of all, side by side."""
-    found = []
-    for queries in (64, 8):
-        plain = PLAIN_OF_VERSION_0_1 | {"boq": {"channels": 384, "queries": queries}}
-        path = tmp_path / f"{queries}.safetensors"
-        rewrite(shared, path, lambda arrays: None, {"crisalad-jax 1": json.dumps(plain)})
-        found.append(load_weights(path, expected=MODEL))
-    (params, config), (others, other) = found
-    assert config == other == MODEL
-    assert model_hash(params, config) == model_hash(others, other)
-
-
-def rewrite(shared: pathlib.Path, path: pathlib.Path, change, metadata=None) -> None:
-    """The shared weights with changed arrays, or other metadata; none of them with a checksum."""
+def rewrite(shared: pathlib.Path, path: pathlib.Path, metadata: dict[str, str]) -> None:
+    """The shared weights with other metadata, without a checksum."""
     arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
-    change(arrays)
-    ours = {"crisalad-jax 2": json.dumps({"config": to_plain(MODEL)})}
-    safetensors.numpy.save_file(arrays, path, metadata=ours if metadata is None else metadata)
+    safetensors.numpy.save_file(arrays, path, metadata=metadata)
 
 
 def reseal(shared: pathlib.Path, path: pathlib.Path, value, change=lambda arrays: None) -> None:
-    """The shared weights with other metadata and changed arrays, and the checksum of both."""
+    """The shared weights with other values in the metadata, where None leaves one out, and with
+    changed arrays, and the checksum of all."""
     arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
     change(arrays)
-    write_sealed(path, arrays, weights.FORMAT, value)
+    told = told_of(shared / "weights.safetensors", weights.FORMAT) | value
+    told = {key: each for key, each in told.items() if each is not None}
+    write_sealed(path, arrays, weights.FORMAT, told)
 
 
 def told_of(path: pathlib.Path, key: str) -> dict[str, Any]:
@@ -207,74 +191,28 @@ def told_of(path: pathlib.Path, key: str) -> dict[str, Any]:
         return json.loads(file.metadata()[key])
 
 
-# What version 0.1 wrote for MODEL, to the letter: the settings of eleven aggregators side by side.
-PLAIN_OF_VERSION_0_1 = json.loads(
-    """{"image_size": [42, 56], "normalisation": "imagenet",
-    "backbone": {"dim": 32, "depth": 2, "heads": 2, "mlp_ratio": 4.0, "ffn": "mlp", "registers": 0,
-        "position_grid": 3, "position_start": "random", "layer_scale_start": 1.0,
-        "adapter": {"kind": "depthwise", "bottleneck": 0.5, "kernel_size": 3, "alpha": 0.2}},
-    "aggregator": "salad",
-    "salad": {"clusters": 4, "cluster_dim": 8, "token_dim": 16, "hidden": 16, "dropout": 0.3,
-        "sinkhorn": {"method": "sinkhorn", "dustbin": "column", "epsilon": 1.0, "iterations": 3,
-            "tolerance": null, "must_converge": false, "domain": "scaling", "relaxation": 1.0,
-            "anderson": 0, "row_tau": 1.0, "column_tau": 1.0, "gradient": "unrolled"}},
-    "gem_pyramid": {}, "class_token": {}, "gem": {}, "netvlad": {"clusters": 64},
-    "conv_ap": {"channels": 1024, "side": 2}, "cosplace": {"dim": 512},
-    "mixvpr": {"channels": 1024, "rows": 4, "depth": 4},
-    "anyloc": {"clusters": 32, "layer": -1, "facet": "value"},
-    "boq": {"channels": 384, "queries": 64, "layers": 2, "rows": 32},
-    "transvpr": {"levels": 2, "dim": 256},
-    "encoder": {"layers": 2, "heads": 2, "feedforward": 16, "dropout": 0.1, "global_token": true},
-    "compute_dtype": "float32", "keeps": "products"}"""
-)
-
-
-def under_names_of_version_0_1(params: Any) -> dict[str, np.ndarray]:
-    """The arrays by name; the cross-image encoder's began with `encoder.`."""
-    return {
-        re.sub(r"^cross_image\.", "encoder.", name): np.asarray(leaf)
-        for name, leaf in named_leaves(params).items()
-    }
-
-
-def test_a_file_of_version_0_1_loads_bit_for_bit(tmp_path, params):
+def test_a_file_of_another_format_is_refused(tmp_path, shared):
+    """With a right checksum, too, and whatever has no array of its own."""
     path = tmp_path / "w.safetensors"
-    arrays = under_names_of_version_0_1(params)
-    assert "encoder.layers.0.attn.qkv.weight" in arrays
-    extra = {"extra.backbone.mask_token": np.ones((1, 32), np.float32)}
-    metadata = {"crisalad-jax 1": json.dumps(PLAIN_OF_VERSION_0_1)}
-    safetensors.numpy.save_file(arrays | extra, path, metadata=metadata)
-    # It says nothing of sources.
-    with pytest.warns(Note, match=f"^{path}: found no checksum") as told:
-        found, config = load_weights(path, expected=MODEL)
-    assert len(told) == 1
-    assert config == MODEL
-    assert_equal(found, params)
-    assert is_ours(path)
-    assert load_extras(path).keys() == {"backbone.mask_token"}
-    # As it would be written today.
-    save_weights(tmp_path / "again.safetensors", found, config)
-    assert_equal(load_weights(tmp_path / "again.safetensors")[0], params)
+    arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
+    for form in ("crisalad-jax 2", "crisalad-jax 4", "crisalad-jax pca 2"):
+        told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
+        write_sealed(path, arrays, form, told)
+        assert not is_ours(path)
+        with pytest.raises(InputError) as error:
+            load_weights(path)
+        assert str(error.value) == (
+            f"{path}: found metadata [{form!r}], expected a .safetensors file of weights "
+            "('crisalad-jax 3'), as this package writes it; `crisalad convert` reads public "
+            "checkpoints"
+        )
 
 
-def test_a_file_of_the_second_format_loads_bit_for_bit(tmp_path, shared, params):
-    """Which had all that today's have, but for a checksum."""
+def test_a_file_without_a_checksum_is_refused(tmp_path, shared):
     path = tmp_path / "w.safetensors"
-    value = told_of(shared / "weights.safetensors", "crisalad-jax 3")
-    del value["checksum"]
-    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(value)})
-    with pytest.warns(Note, match=f"^{path}: found no checksum") as told:
-        found, config = load_weights(path, expected=MODEL)
-    assert len(told) == 1
-    assert config == MODEL
-    assert_equal(found, params)
-    assert is_ours(path)
-
-
-def test_a_file_of_the_third_format_without_a_checksum_is_refused(tmp_path, shared):
-    path = tmp_path / "w.safetensors"
-    metadata = {"crisalad-jax 3": json.dumps({"config": to_plain(MODEL)})}
-    rewrite(shared, path, lambda arrays: None, metadata)
+    told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
+    del told["checksum"]
+    rewrite(shared, path, {"crisalad-jax 3": json.dumps(told)})
     for verify in (True, False):
         with pytest.raises(InputError, match=rf"^{path} \(metadata\): found no checksum, expected"):
             load_weights(path, verify=verify)
@@ -298,36 +236,6 @@ def test_weights_that_changed_are_refused_unless_they_are_not_verified(tmp_path,
     assert config.compute_dtype == ("float32" if inside else "bfloat16")
 
 
-@pytest.mark.parametrize(
-    ("inside", "old", "fields"),
-    [
-        ("keeps", "blocks", {"remat": "full"}),
-        ("keeps", "everything", {"remat": "none"}),
-        ("salad.sinkhorn.relaxation", 1.5, {"step": SinkhornStep(relaxation=1.5)}),
-        ("salad.sinkhorn.method", "newton", {"step": "newton"}),
-        ("salad.sinkhorn.anderson", 3, {"anderson_memory": 3}),
-        ("salad.sinkhorn.dustbin", "row and column", {"dustbin": "row and column"}),
-        ("salad.sinkhorn.epsilon", 0.5, {"epsilon": 0.5}),
-        ("salad.sinkhorn.row_tau", 0.9, {"row_tau": 0.9}),
-        ("salad.sinkhorn.column_tau", 0.8, {"column_tau": 0.8}),
-        ("backbone.position_start", "sincos", {"position_init": "sincos"}),
-        ("backbone.layer_scale_start", 0.1, {"layer_scale_init": 0.1}),
-    ],
-)
-def test_settings_of_version_0_1_have_their_places(tmp_path, inside, old, fields):
-    plain = json.loads(json.dumps(PLAIN_OF_VERSION_0_1))
-    *folders, last = inside.split(".")
-    functools.reduce(lambda tree, name: tree[name], folders, plain)[last] = old
-    config = changed(MODEL, fields)
-    params = random_params(config)
-    metadata = {"crisalad-jax 1": json.dumps(plain)}
-    path = tmp_path / "w.safetensors"
-    safetensors.numpy.save_file(under_names_of_version_0_1(params), path, metadata=metadata)
-    found, found_config = load_weights(path)
-    assert found_config == config != MODEL
-    assert_equal(found, params)
-
-
 def changed(config: Any, fields: dict[str, Any]) -> Any:
     """A configuration with other values in the fields of these names, wherever they are inside."""
     changes = {}
@@ -338,43 +246,6 @@ def changed(config: Any, fields: dict[str, Any]) -> Any:
         elif dataclasses.is_dataclass(value):
             changes[field.name] = changed(value, fields)
     return dataclasses.replace(config, **changes)
-
-
-@pytest.mark.parametrize("built", [True, False])
-def test_a_vocabulary_of_version_0_1_is_bound_to_its_backbone(tmp_path, built):
-    """Which a checksum among the parameters told; a vocabulary not yet built had 0."""
-    anyloc_of_then = AnyLocConfig(layer=0, assignment="euclidean")
-    config = dataclasses.replace(WITHOUT_ENCODER, aggregator=anyloc_of_then)
-    params = random_params(config)
-    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
-    checksum = 0
-    for name, leaf in named_leaves(params.backbone).items():
-        checksum = zlib.crc32(np.asarray(leaf).tobytes(), zlib.crc32(name.encode(), checksum))
-    mark = np.float32(1 + checksum % (2**24 - 1) if built else 0)
-    anyloc = {"aggregator": "anyloc", "anyloc": {"clusters": 32, "layer": 0, "facet": "value"}}
-    plain = PLAIN_OF_VERSION_0_1 | anyloc
-    plain["encoder"] = plain["encoder"] | {"layers": 0}
-    path, metadata = tmp_path / "w.safetensors", {"crisalad-jax 1": json.dumps(plain)}
-
-    def write(mark: np.ndarray) -> None:
-        named = arrays | {"aggregator.backbone": np.asarray(mark)}
-        safetensors.numpy.save_file(named, path, metadata=metadata)
-
-    write(mark)
-    found, found_config = load_weights(path)
-    assert found_config == config
-    np.testing.assert_array_equal(found.aggregator.words, params.aggregator.words)
-    save_weights(tmp_path / "again.safetensors", found, config)
-    other = jax.tree.map(lambda leaf: leaf + 1, found.backbone)
-    moved = dataclasses.replace(found, backbone=other)
-    if not built:
-        save_weights(tmp_path / "other.safetensors", moved, config)
-        return
-    with pytest.raises(InputError, match="found a vocabulary of another backbone"):
-        save_weights(tmp_path / "other.safetensors", moved, config)
-    write(mark + np.float32(1))
-    with pytest.raises(InputError, match=f"^{path}: found a vocabulary of another backbone"):
-        load_weights(path)
 
 
 SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
@@ -394,16 +265,12 @@ SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
 )
 def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
     path = tmp_path / "w.safetensors"
-    for write in (
-        functools.partial(rewrite, shared, path, change),
-        functools.partial(reseal, shared, path, {"config": to_plain(MODEL)}, change),
-    ):
-        write()
-        with pytest.raises(InputError, match=f"^{path}: weights do not fit: ") as error:
-            load_weights(path)
-        assert "\n" not in str(error.value)
-        for word in words:
-            assert word in str(error.value)
+    reseal(shared, path, {}, change)
+    with pytest.raises(InputError, match=f"^{path}: weights do not fit: ") as error:
+        load_weights(path)
+    assert "\n" not in str(error.value)
+    for word in words:
+        assert word in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -411,42 +278,10 @@ def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
     [
         ({}, "found a .safetensors file of another program"),
         ({"format": "pt"}, "found a .safetensors file of another program"),
-        ({"crisalad-jax 1": ""}, r"\(metadata\): found no JSON \(Expecting value"),
-        ({"crisalad-jax 1": "{"}, r"\(metadata\): found no JSON \(Expecting property name"),
-        ({"crisalad-jax 1": "[]"}, "found list"),
-        ({"crisalad-jax 1": '{"clusters": 3}'}, "clusters"),
-        ({"crisalad-jax 1": "[" * 10**5}, r"\(metadata\): found no JSON \(nested too deep\)"),
-        ({"crisalad-jax 1": '{"encoder": {"layers": 99999999999}}'}, "of up to 99999999999"),
-        ({"crisalad-jax 1": '{"encoder": {"layers": 900}}'}, "far from the sizes"),
-        (
-            {"crisalad-jax 1": '{"aggregator": "boq", "boq": {"layers": 900}}'},
-            "far from the sizes",
-        ),
-        ({"crisalad-jax 1": '{"backbone": {"dim": 9000000000000}}'}, "of up to 9000000000000"),
-        ({"crisalad-jax 2": '{"a": 1, "a": 2}'}, r"found no JSON \(the key 'a' twice\)"),
-        ({"crisalad-jax 2": ""}, r"\(metadata\): found no JSON \(Expecting value"),
-        ({"crisalad-jax 2": "{"}, r"\(metadata\): found no JSON \(Expecting property name"),
-        ({"crisalad-jax 2": "[]"}, "found no configuration in its metadata, expected 'config'"),
-        ({"crisalad-jax 2": "{}"}, "found no configuration in its metadata, expected 'config'"),
-        ({"crisalad-jax 2": '{"config": []}'}, "found list"),
-        ({"crisalad-jax 2": '{"config": {"clusters": 3}}'}, "clusters"),
-        ({"crisalad-jax 2": "[" * 10**5}, r"\(metadata\): found no JSON \(nested too deep\)"),
-        ({"crisalad-jax 2": '{"config": {}, "parts": []}'}, "found parts of list, expected an ob"),
-        ({"crisalad-jax 2": '{"config": {}, "aggregator": 3}'}, "found aggregator of int, expect"),
-        (
-            {"crisalad-jax 2": '{"config": {"cross_image": {"layers": 99999999999}}}'},
-            "of up to 99999999999",
-        ),
-        ({"crisalad-jax 2": '{"config": {"cross_image": {"layers": 900}}}'}, "far from the sizes"),
-        (
-            {"crisalad-jax 2": '{"config": {"aggregator": {"name": "boq", "layers": 900}}}'},
-            "far from the sizes",
-        ),
-        (
-            {"crisalad-jax 2": '{"config": {"backbone": {"name": "vit", "dim": 9000000000000}}}'},
-            "of up to 9000000000000",
-        ),
+        ({"crisalad-jax 3": '{"a": 1, "a": 2}'}, r"found no JSON \(the key 'a' twice\)"),
         ({"crisalad-jax 3": ""}, r"\(metadata\): found no JSON \(Expecting value"),
+        ({"crisalad-jax 3": "{"}, r"\(metadata\): found no JSON \(Expecting property name"),
+        ({"crisalad-jax 3": "[" * 10**5}, r"\(metadata\): found no JSON \(nested too deep\)"),
         ({"crisalad-jax 3": "[]"}, r"\(metadata\): found no checksum, expected one in 'crisalad-j"),
         ({"crisalad-jax 3": "{}"}, r"\(metadata\): found no checksum, expected one in 'crisalad-j"),
         ({"crisalad-jax 3": '{"checksum": 3}'}, "found other bytes than were written"),
@@ -454,7 +289,7 @@ def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
 )
 def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
     path = tmp_path / "w.safetensors"
-    rewrite(shared, path, lambda arrays: None, metadata)
+    rewrite(shared, path, metadata)
     with pytest.raises(InputError, match=words) as error:
         load_weights(path)
     assert str(error.value).startswith(str(path))
@@ -464,12 +299,17 @@ def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        ({}, "found no configuration in its metadata, expected 'config'"),
-        ({"config": []}, "found list"),
+        ({"config": None}, "found config of NoneType, expected dict"),
+        ({"config": []}, "found config of list, expected dict"),
         ({"config": {"clusters": 3}}, "clusters"),
-        ({"config": {}, "parts": []}, "found parts of list, expected an ob"),
-        ({"config": {}, "aggregator": 3}, "found aggregator of int, expect"),
+        ({"parts": []}, "found parts of list, expected dict"),
+        ({"source_bytes": None}, "found source_bytes of NoneType, expected dict"),
+        ({"aggregator": 3}, "found aggregator of int, expected dict"),
+        ({"version": None}, "found version of NoneType, expected str"),
+        ({"model_sha256": 7}, "found model_sha256 of int, expected str"),
         ({"config": {"cross_image": {"layers": 900}}}, "far from the sizes"),
+        ({"config": {"cross_image": {"layers": 99999999999}}}, "of up to 99999999999"),
+        ({"config": {"aggregator": {"name": "boq", "layers": 900}}}, "far from the sizes"),
         ({"config": {"backbone": {"name": "vit", "dim": 9 * 10**12}}}, "of up to 9000000000000"),
     ],
 )
@@ -496,14 +336,6 @@ def test_a_file_cut_short_is_refused(tmp_path, shared, length, words):
     with pytest.raises(InputError, match=f"^{path}: {words}") as error:
         load_weights(path)
     assert "\n" not in str(error.value)
-
-
-def test_a_file_of_earlier_versions_cut_short_is_refused(tmp_path, shared):
-    whole, path = tmp_path / "whole.safetensors", tmp_path / "w.safetensors"
-    rewrite(shared, whole, lambda arrays: None)
-    path.write_bytes(whole.read_bytes()[:-1])
-    with pytest.raises(InputError, match=f"^{path}: not a whole safetensors file"):
-        load_weights(path)
 
 
 def test_no_file_or_another_one_is_refused(tmp_path):
@@ -575,15 +407,10 @@ def put(config: Any, name: str, value: Any) -> Any:
     return dataclasses.replace(config, **{head: inner})
 
 
-def test_the_hash_is_read_with_the_weights(tmp_path, shared, monkeypatch):
-    """Of a file that holds it nothing is digested; earlier files hold none."""
+def test_the_hash_is_read_with_the_weights(shared, monkeypatch):
+    """Nothing is digested."""
     path = shared / "weights.safetensors"
     expected = model_hash(*load_weights(path))
-    plain = dict(weights._read(path)[1])
-    del plain["model_sha256"]
-    arrays, _ = weights._read(path)
-    write_sealed(tmp_path / "earlier.safetensors", arrays, weights.FORMAT, plain)
-    assert weights.load_with_hash(tmp_path / "earlier.safetensors")[2] == expected
     monkeypatch.setattr(weights, "model_hash", None)
     assert weights.load_with_hash(path)[2] == expected
 
@@ -614,7 +441,7 @@ def test_the_hash_changes_with_every_field_that_matters(params, name):
 @pytest.mark.parametrize(
     ("preset", "digest"),
     [
-        ("tiny", "e064ac7f77c638955e41ca77c627bbf1297c78c165400ad1cef89a100bf7d60f"),
+        ("tiny", "a97f20b37320fc9c113dd2ab7a75949f6e063e57e5294b314ba58bd9c7ac8bd2"),
         ("s14", "56b7d28d5af7a2a29714aca2b61959ab116651154c39e5a4b9cd75168e572ca4"),
     ],
 )
@@ -768,7 +595,6 @@ def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
 def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypatch):
     path = tmp_path / "w.safetensors"
     told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
-    del told["checksum"]
     told["parts"]["aggregator.dustbin"][1] = "0" * 64  # as the checksum is before it is known
     reseal(shared, path, told)
     assert notes_of(path) == []  # the same bytes are the same source
@@ -785,12 +611,8 @@ def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypa
 @pytest.mark.parametrize("parts", [{"aggregator": 3}, {"aggregator": ["salad"]}, {"x": []}])
 def test_sources_that_are_none_are_passed_over(tmp_path, shared, parts):
     path = tmp_path / "w.safetensors"
-    told = {"config": to_plain(MODEL), "version": crisalad_jax.__version__, "parts": parts}
-    reseal(shared, path, told)
+    reseal(shared, path, {"parts": parts})
     assert notes_of(path) == []
-    rewrite(shared, path, lambda arrays: None, {"crisalad-jax 2": json.dumps(told)})
-    (note,) = notes_of(path)
-    assert note.startswith(f"{path}: found no checksum")
 
 
 def test_an_array_in_another_order_is_written_as_it_reads(tmp_path) -> None:

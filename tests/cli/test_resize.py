@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli import renamed
 from crisalad_jax.retrieval.extract import extract
 from tests.cli.test_cli import fails, succeeds
 
@@ -50,14 +49,3 @@ def test_wrong_words_are_one_line(shared: pathlib.Path, capfd: pytest.CaptureFix
     info = ("info", "--weights", shared / "weights.safetensors", "--resize")
     fails(capfd, *info, "cubic", words=("--resize: found 'cubic', expected some of fixed",))
     fails(capfd, *info, "bytes", "floats", words=("expected one of bytes, floats",))
-
-
-@pytest.mark.parametrize(
-    ("old", "new"), [("imagenet", "mean-deviation"), ("local-contrast", "local-contrast")]
-)
-def test_the_old_flag_of_normalisation(old: str, new: str) -> None:
-    told: list[str] = []
-    flag = "--model.preprocessing.normalisation"
-    assert renamed.today(["--model.normalisation", old], told.append) == [flag, new]
-    assert renamed.today([f"--model.normalisation={old}"], told.append) == [f"{flag}={new}"]
-    assert told == [f"--model.normalisation is {flag} now"] * 2

@@ -293,15 +293,13 @@ def test_the_recipes_over_resnet_are_as_published():
     assert edtformer.optimiser.step_gamma == 0.7
 
 
-def test_a_part_alone_and_old_names_are_told():
+def test_a_part_alone_is_told():
     with pytest.warns(Note, match=r"^recipe: found gem, which is a part: crisalad\+gem, CriS"):
         assert recipe("tiny", "gem") == recipe("tiny", "crisalad+gem")
-    with pytest.warns(Note, match="^recipe: found eigenplaces, which is called eigenplaces-vit$"):
-        assert recipe("tiny", "eigenplaces") == recipe("tiny", "eigenplaces-vit")
     swapped = recipe("b14", "salad+step:newton")
     assert swapped.model.aggregator.sinkhorn.step.part_name == "newton"
     assert swapped.optimiser == recipe("b14", "salad").optimiser
-    for name in ("crisalad+crisalad", "gem+salad", "crisalad+"):
+    for name in ("crisalad+crisalad", "gem+salad", "crisalad+", "eigenplaces"):
         with pytest.raises(InputError, match=r"^recipe: found '.*', expected one of anyloc"):
             recipe("tiny", name)
 
@@ -344,7 +342,7 @@ def test_every_recipe_fits_every_preset(preset: str, name: str):
 
 def test_the_recipe_of_starter_is_that_of_its_last_run():
     """But for an encoder of no layers, whose fields say nothing."""
-    run = read_config(TrainConfig, ROOT / "docs" / "starter" / "config.json", quiet=True)
+    run = read_config(TrainConfig, ROOT / "docs" / "starter" / "config.json")
     found = recipe("b14", "starter")
     assert found.model.cross_image.layers == run.model.cross_image.layers == 0
     model = dataclasses.replace(found.model, cross_image=run.model.cross_image)
@@ -356,8 +354,8 @@ def test_the_recipe_of_starter_is_that_of_its_last_run():
 
 def test_the_run_without_the_cameras_faults_is_an_epoch_of_starters_but_for_them():
     docs = ROOT / "docs"
-    run = read_config(TrainConfig, docs / "starter" / "first.json", quiet=True)
-    without = read_config(TrainConfig, docs / "small" / "no_faults.json", quiet=True)
+    run = read_config(TrainConfig, docs / "starter" / "first.json")
+    without = read_config(TrainConfig, docs / "small" / "no_faults.json")
     names = [field.name for field in dataclasses.fields(LightAugmentConfig)]
     light = LightAugmentConfig(**{name: getattr(run.augmentation, name) for name in names})
     assert without == dataclasses.replace(run, augmentation=light, epochs=1)

@@ -518,7 +518,7 @@ def test_a_record_of_something_else_is_refused(tmp_path, record, words):
 
 
 def test_a_set_without_a_record_is_read_with_a_note(tmp_path):
-    """As of earlier versions, of numpy and of hloc."""
+    """As numpy and hloc write them."""
     np.save(tmp_path / "d.npy", np.eye(2, dtype=np.float32))
     (tmp_path / "d.names.txt").write_text("a\nb\n")
     with h5py.File(tmp_path / "d.h5", "w") as file:

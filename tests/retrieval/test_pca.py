@@ -1,7 +1,6 @@
 """Principal components against numpy's singular values, and what they are defined by."""
 
 import dataclasses
-import json
 import pathlib
 
 import numpy as np
@@ -12,7 +11,6 @@ from crisalad_jax.checkpoints.safetensors_io import write_sealed
 from crisalad_jax.retrieval import pca
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, load_pca, save_pca
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
 
 PLAIN = PcaConfig(renormalise=False)
 
@@ -172,6 +170,9 @@ def test_files_of_something_else_are_named(tmp_path):
     safetensors.numpy.save_file({"mean": np.zeros(3, np.float32)}, path)
     with pytest.raises(InputError, match=r"found metadata \[\], expected .*'crisalad-jax pca 2'"):
         load_pca(path)
+    write_sealed(path, {}, "crisalad-jax pca 1", {"config": {}})
+    with pytest.raises(InputError, match=r"^\S+pca\.safetensors: found .*'crisalad-jax pca 1'"):
+        load_pca(path)
     write_sealed(path, {"mean": np.zeros(3, np.float32)}, pca.FORMAT, {"config": {}})
     with pytest.raises(InputError, match=r"found arrays \['mean'\], expected .*of principal comp"):
         load_pca(path)
@@ -208,22 +209,3 @@ def test_components_that_changed_are_refused_unless_they_are_not_verified(tmp_pa
     again = load_pca(path, verify=False)
     assert again.mean[0] != found.mean[0]
     np.testing.assert_array_equal(again.components, found.components)
-
-
-def test_components_of_the_first_format_load_with_a_note(tmp_path):
-    """Whose metadata were the configuration alone."""
-    found = fit_pca(_descriptors(30, 12), 5, PcaConfig(whiten=True, renormalise=False))
-    arrays = {
-        name: np.array(array, order="C")
-        for name, array in found._asdict().items()
-        if name != "config"
-    }
-    path = tmp_path / "pca.safetensors"
-    metadata = {"crisalad-jax pca 1": json.dumps(dataclasses.asdict(found.config))}
-    safetensors.numpy.save_file(arrays, path, metadata=metadata)
-    with pytest.warns(Note, match=r"pca\.safetensors: found no checksum") as told:
-        again = load_pca(path)
-    assert len(told) == 1
-    assert again.config == found.config
-    for a, b in zip(again[:4], found[:4], strict=True):
-        np.testing.assert_array_equal(a, b)

@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.data.places import read_places
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import describe, init_crisalad, train_tokens
 from crisalad_jax.training import run as module
-from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import count_trainable, merge_params
@@ -184,12 +183,3 @@ def test_devices_share_the_statistics_of_the_whole_batch() -> None:
     flags = "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=2"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     subprocess.run([sys.executable, "-c", DEVICES], env=environment, check=True)
-
-
-def test_runs_of_earlier_versions_kept_their_statistics() -> None:
-    plain = to_plain(dataclasses.replace(RECIPE, model=MODEL))
-    del plain["batch_norm"]
-    assert from_plain(TrainConfig, plain, source="config.json").batch_norm == "stored"
-    others = to_plain(RECIPE)
-    del others["batch_norm"]
-    assert from_plain(TrainConfig, others, source="config.json").batch_norm == "batch"

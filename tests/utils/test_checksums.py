@@ -1,4 +1,4 @@
-"""Checksums against hashlib, and files that are changed by a byte or are of earlier versions."""
+"""Checksums against hashlib, and files that are changed by a byte or lack theirs."""
 
 import collections
 import hashlib
@@ -19,7 +19,6 @@ from crisalad_jax.checkpoints.safetensors_io import Contents, read_sealed, write
 from crisalad_jax.utils.checksums import checked_safetensors, sealed_json, sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
-from crisalad_jax.utils.notes import Note
 
 CHANGED = "found other bytes than were written, expected those of its checksum"
 NONE = "found no checksum"
@@ -30,7 +29,7 @@ ARRAYS = {
     "zeros": np.frombuffer(ZEROS.encode(), np.uint8),
     "rows": np.random.default_rng(0).standard_normal((3, 4)).astype(np.float32),
 }
-FORM, OLD_FORM = "crisalad-jax some 2", "crisalad-jax some 1"
+FORM = "crisalad-jax some 2"
 
 
 def by_hashlib(data: bytes) -> tuple[str, str]:
@@ -53,7 +52,7 @@ def flips(data: bytes, count: int) -> Iterator[tuple[int, bytes]]:
 
 def load(path: pathlib.Path, *, verify: bool = True) -> Contents:
     with checked_safetensors(path, verify=verify):
-        return read_sealed(path, (FORM, OLD_FORM), "a file of some arrays")
+        return read_sealed(path, FORM, "a file of some arrays")
 
 
 def with_checksum(value: object) -> bytes:
@@ -83,7 +82,7 @@ def test_json_holds_the_digest_of_its_own_bytes(tmp_path, indent):
     path.write_bytes(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert read_json(path, "some values", must=lambda _: True) == VALUE
+        assert read_json(path, "some values") == VALUE
 
 
 def test_safetensors_hold_the_digest_of_their_own_bytes(arrays):
@@ -96,8 +95,8 @@ def test_safetensors_hold_the_digest_of_their_own_bytes(arrays):
     theirs = safetensors.numpy.load_file(arrays)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        form, value, ours = load(arrays)
-    assert (form, value) == (FORM, VALUE)
+        value, ours = load(arrays)
+    assert value == VALUE
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(theirs[name], array)
         np.testing.assert_array_equal(ours[name], array)
@@ -141,7 +140,7 @@ def test_one_other_byte_of_json_is_refused(tmp_path):
     for place, data in flips(whole, 100):
         path.write_bytes(data)
         with pytest.raises(InputError) as error:
-            read_json(path, "some values", must=lambda _: True)
+            read_json(path, "some values")
         message = str(error.value)
         assert message.startswith(f"{path}: found "), place
         assert "\n" not in message
@@ -265,37 +264,31 @@ def test_the_right_digest_in_uppercase_is_refused(arrays, tmp_path):
             read()
 
 
-# Of earlier versions, and unverified
+# Without a checksum, of another format, and unverified
 
 
-def test_json_without_a_checksum_is_read_with_a_note(tmp_path):
+def test_json_without_a_checksum_is_refused_unless_anybody_may_write_it(tmp_path):
     path = tmp_path / "x.json"
     values: list[Any] = [VALUE, [1, 2], 3, None]
     for value in values:
         path.write_text(json.dumps(value))
-        with pytest.warns(Note, match=rf"x\.json: {NONE}") as told:
-            assert read_json(path, "some values") == value
-        assert len(told) == 1
+        with pytest.raises(InputError, match=r"x\.json: found no checksum, expected some values"):
+            read_json(path, "some values")
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            assert read_json(path, "some values", quiet=True) == value
-        with pytest.raises(InputError, match=r"x\.json: found no checksum, expected some values"):
-            read_json(path, "some values", must=lambda found, same=value: found == same)
+            assert read_json(path, "some values", sealed=False) == value
 
 
 @pytest.mark.parametrize("verify", [True, False])
-def test_safetensors_of_an_earlier_format_are_read_with_a_note(tmp_path, verify):
+def test_safetensors_of_another_format_are_refused(tmp_path, verify):
     path = tmp_path / "a.safetensors"
-    safetensors.numpy.save_file(ARRAYS, path, metadata={OLD_FORM: json.dumps(VALUE)})
-    with pytest.warns(Note, match=rf"a\.safetensors: {NONE}") as told:
-        form, value, found = load(path, verify=verify)
-    assert len(told) == 1
-    assert (form, value) == (OLD_FORM, VALUE)
-    np.testing.assert_array_equal(found["rows"], ARRAYS["rows"])
+    write_sealed(path, ARRAYS, "crisalad-jax some 1", VALUE)
+    with pytest.raises(InputError, match=r"^\S+a\.safetensors: found .*'crisalad-jax some 1'"):
+        load(path, verify=verify)
 
 
 @pytest.mark.parametrize("verify", [True, False])
-def test_safetensors_of_todays_format_without_a_checksum_are_refused(tmp_path, verify):
+def test_safetensors_without_a_checksum_are_refused(tmp_path, verify):
     path = tmp_path / "a.safetensors"
     for value in (VALUE, [], 3):
         safetensors.numpy.save_file(ARRAYS, path, metadata={FORM: json.dumps(value)})

@@ -184,10 +184,9 @@ def adapter_costs_once(out: pathlib.Path) -> list[AdapterCost]:
         write_json(path, {"costs": [cost._asdict() for cost in adapter_costs()]})
     with advised():
         value = read_json(path, "costs of adapters")
-        rows: Any = value.get("costs") if isinstance(value, dict) else value
         try:
-            return [AdapterCost(**row) for row in rows]
-        except TypeError as error:
+            return [AdapterCost(**row) for row in value["costs"]]
+        except (KeyError, TypeError) as error:
             raise InputError(f"{path}: found {error}, expected costs of adapters") from error
 
 

@@ -56,7 +56,7 @@ def numbers_of(out: pathlib.Path, config: ComparisonConfig) -> list[int]:
     Raises:
         InputError: the folder's config.json cannot be read.
     """
-    there: Any = read_json(out / "config.json", "a configuration as JSON", quiet=True)
+    there: Any = read_json(out / "config.json", "a configuration as JSON", sealed=False)
     return [there["test"].index(test) for test in config.test]
 
 

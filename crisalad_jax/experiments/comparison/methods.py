@@ -8,7 +8,6 @@ from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import (
     RECIPES,
-    RENAMED,
     find_part,
     from_scratch,
     mines_tuples,
@@ -52,10 +51,6 @@ METHODS: Mapping[str, ComparedMethod] = {
 """Methods in the order of Table 1. Those with a + have the head of a method whose own backbone is
 another, on CriSALAD's backbone and with its training. Other names are recipes or parts, without a
 second stage."""
-OLD_NAMES: Mapping[str, str] = {
-    **RENAMED,
-}
-"""Names of methods in earlier versions, but those that are now a recipe's or are a part's."""
 
 
 def method_of(name: str, preset: str) -> ComparedMethod:
@@ -87,8 +82,6 @@ def method_of(name: str, preset: str) -> ComparedMethod:
         return METHODS.get(whole, ComparedMethod(whole, whole))
     if name in RECIPES:
         return ComparedMethod(name, name)
-    if name in OLD_NAMES:
-        return METHODS[OLD_NAMES[name]]
     base, part = split_name(name)
     find_part(part, preset, what="--methods", others={*METHODS, *RECIPES})
     whole = f"{base or 'crisalad'}+{part}"
@@ -104,7 +97,7 @@ def is_method(name: str) -> bool:
         >>> is_method("salad"), is_method("crisalad+gem"), is_method("megaloc")
         (True, True, False)
     """
-    named = name in METHODS or name in RECIPES or name in OLD_NAMES
+    named = name in METHODS or name in RECIPES
     return (named and not mines_tuples(name)) or "+" in name or ":" in name
 
 

@@ -22,8 +22,6 @@ def read_result(path: pathlib.Path, **kinds: type) -> dict[str, Any]:
     """
     with advised():
         value = read_json(path, "a result of a comparison")
-        if not isinstance(value, dict):
-            raise InputError(f"{path}: found no object, expected a result of a comparison")
         for key, kind in kinds.items():
             if not isinstance(value.get(key), kind):
                 raise InputError(f"{path}: found no {key!r} of {kind.__name__}, expected it")

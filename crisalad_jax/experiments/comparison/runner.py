@@ -45,7 +45,7 @@ from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.locks import (
     POLL,
     BusyFolderError,
@@ -216,7 +216,7 @@ def time_left(prepared: Prepared, out: pathlib.Path, numbers: list[int]) -> tupl
 
 
 def _seconds_in(path: pathlib.Path, name: str) -> float:
-    return float(read_json(path, "a result of a comparison").get(name, 0.0))
+    return read_result(path, **{name: float})[name]
 
 
 def _start_words(prepared: Prepared) -> str:
@@ -405,14 +405,7 @@ def _count_sitting(folder: pathlib.Path) -> None:
 
 
 def _sittings(path: pathlib.Path) -> int:
-    """Read the number of sittings; the first version of the file held the number alone."""
-    with advised():
-        value = read_json(path, "a number of sittings")
-        if isinstance(value, dict):
-            value = value.get("sittings")
-        if not isinstance(value, int):
-            raise InputError(f"{path}: found {value!r}, expected a number of sittings")
-    return value
+    return read_result(path, sittings=int)["sittings"]
 
 
 def _training_record(folder: pathlib.Path, training: TrainConfig, steps: int) -> dict[str, Any]:

@@ -164,6 +164,7 @@ def _training_records(
             seconds_of_steps=float,
             sittings=int,
             device=str,
+            beside=bool,
         )
         for seed in variant.seeds(prepared.config.seeds)
     ]
@@ -171,7 +172,7 @@ def _training_records(
 
 def _seconds(records: list[dict[str, Any]]) -> list[float]:
     """Return the seconds of the runs that had their device to themselves, if at least two had."""
-    alone = [each["steps"] * each["step_seconds"] for each in records if not each.get("beside")]
+    alone = [each["steps"] * each["step_seconds"] for each in records if not each["beside"]]
     return alone if len(alone) > 1 else []
 
 

@@ -227,7 +227,7 @@ def read_check(path: pathlib.Path) -> CompileCheck:
         InputError: the file cannot be read, or holds something else.
     """
     what = "the JSON of `crisalad compile-check --json`"
-    value = read_json(path, what, quiet=True)
+    value = read_json(path, what, sealed=False)
     for name, kind in (("programs", list), ("config", dict), ("versions", dict)):
         if not isinstance(value, dict) or not isinstance(value.get(name), kind):
             raise InputError(f"{path}: found no {name}, expected {what}")

@@ -33,7 +33,6 @@ _LOSSES = (
     ("loss", "loss", True),
     ("easy_anchor_fraction", "share of anchors without a hard positive", True),
     ("accuracy", "share of images nearest to their class", True),
-    ("b_acc", "b_acc, which version 0.1 wrote for either share", True),
     ("learning_rate", "learning rate", False),
 )
 

@@ -149,7 +149,7 @@ def holds(root: pathlib.Path, identity: dict, file: str, what: str) -> bool:
     if existing == identity:
         return True
     found = "a folder with other content"
-    if existing and isinstance(existing, dict):
+    if existing:
         name = next(
             name for name in identity | existing if existing.get(name) != identity.get(name)
         )

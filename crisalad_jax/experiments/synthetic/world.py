@@ -140,12 +140,8 @@ def has_world(root: str | os.PathLike[str], config: WorldConfig) -> bool:
 def _identity(config: WorldConfig) -> dict[str, Any]:
     """Return what world.json has of a world."""
     lists = {"image_size": list(config.image_size), "sceneries": list(config.sceneries)}
-    found = {"renderer": RENDERER, **dataclasses.asdict(config), **lists}
-    if set(config.varied) == set(VARIATIONS):
-        del found["varied"]  # as worlds of earlier versions have it
-    else:
-        found["varied"] = [name for name in VARIATIONS if name in config.varied]
-    return found
+    varied = [name for name in VARIATIONS if name in config.varied]
+    return {"renderer": RENDERER, **dataclasses.asdict(config), **lists, "varied": varied}
 
 
 def _write(temporary: pathlib.Path, root: pathlib.Path, config: WorldConfig) -> Iterator[None]:

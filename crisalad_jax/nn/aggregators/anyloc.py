@@ -45,8 +45,7 @@ class AnyLocConfig(Aggregator):
     """Facet of the block: queries, keys or values of its attention, or its output tokens."""
     assignment: Literal["cosine", "euclidean"] = "cosine"
     """What the nearest word of a patch is nearest by. The public code takes the angle; so does the
-    k-means that builds a vocabulary. In weight files that are older than this field it is the
-    distance."""
+    k-means that builds a vocabulary."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -77,8 +77,7 @@ class BoqConfig(Aggregator):
     rows: int = 32
     """Number of rows that a linear layer makes of all blocks' answers."""
     last_norm: bool = False
-    """Whether patches go through the backbone's last layer norm. In the public code they do not;
-    they do in weight files of this package that are older than this field."""
+    """Whether patches go through the backbone's last layer norm. In the public code they do not."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

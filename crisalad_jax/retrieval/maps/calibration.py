@@ -9,9 +9,9 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 
 CALIBRATION = "calibration.json"
-"""Name of the file, beside the map's description; versions before it do not look for it."""
+"""Name of the file, beside the map's description."""
 FORMAT = 1
-"""Version of the file that this package writes, and the newest that it reads."""
+"""Version of the file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
     """Read what the map in `folder` remembers; None where it was never calibrated.
 
     Raises:
-        InputError: the file is damaged, of a newer version, or of another model than the map's.
+        InputError: the file is damaged, of another format, or of another model than the map's.
     """
     path = folder / CALIBRATION
     if not path.exists():
@@ -61,14 +61,11 @@ def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
 
 
 def _read(path: pathlib.Path, model: str) -> Calibration:
-    value = read_json(path, "a map's calibration", quiet=True)
-    version = value.get("format") if isinstance(value, dict) else None
-    if type(version) is int and version > FORMAT:
-        raise InputError(
-            f"{path}: found format {version}, expected at most {FORMAT}: it is of a newer "
-            "crisalad-jax"
-        )
-    calibration = from_plain(Calibration, value, source=str(path))
+    calibration = from_plain(
+        Calibration, read_json(path, "a map's calibration", sealed=False), source=str(path)
+    )
+    if calibration.format != FORMAT:
+        raise InputError(f"{path}: found format {calibration.format}, expected {FORMAT}")
     check_min_similarity(calibration.min_similarity, str(path))
     if calibration.model != model:
         raise InputError(

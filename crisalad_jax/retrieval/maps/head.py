@@ -21,13 +21,9 @@ from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.temporaries import LOCK, is_temporary
 
 FORMAT = 4
-"""Newest version of the format that this package reads, and that of a map with components. Others
-are written as format 3, which earlier versions read. Maps of format 2
-have records without checksums; those of format 1 (package version 0.1) also have a hash of all
-fields that a model had then."""
-DESCRIPTION, SEGMENTS, LOCKS = "map.json", "segments", (LOCK, ".lock")
-"""Names of the description, of the folder of additions, and of the locks for appending, today's
-first."""
+"""Version of the format."""
+DESCRIPTION, SEGMENTS = "map.json", "segments"
+"""Names of the description, and of the folder of additions."""
 COMPONENTS, SHARES = "pca.safetensors", "shares"
 """Names of the components that shorten descriptors, and of the folder of shares to be joined."""
 
@@ -53,7 +49,7 @@ class MapHead:
     pca: str = ""
     """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
     none."""
-    format: int = 3
+    format: int = FORMAT
 
 
 _Head = TypeVar("_Head", bound=MapHead)
@@ -68,7 +64,7 @@ def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[s
 
     Raises:
         InputError: the folder is a file or holds other things than a map, or the map is damaged or
-            of a newer version of this package.
+            of another format.
     """
     folder = pathlib.Path(folder)
     path = folder / DESCRIPTION
@@ -76,7 +72,7 @@ def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[s
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: found a file, expected a map's folder")
         # A process killed before it has made the map leaves its lock and temporary files behind.
-        others = sorted(other_files(folder, *LOCKS, SEGMENTS, COMPONENTS, SHARES))
+        others = sorted(other_files(folder, LOCK, SEGMENTS, COMPONENTS, SHARES))
         if other_files(folder / SEGMENTS):
             others.append(SEGMENTS)
         if others:
@@ -86,12 +82,12 @@ def read_value(folder: str | os.PathLike[str], *, or_new: bool = True) -> dict[s
             )
         return None
     # Who edits the description removes its checksum. A changed key would be an unknown field.
-    value = read_json(path, "a map", quiet=True)
-    version = _version(value)
-    if version > FORMAT:
+    value = read_json(path, "a map", sealed=False)
+    version = value.get("format") if isinstance(value, dict) else None
+    if version != FORMAT:
         raise InputError(
-            f"{path}: found a map of format {version}, expected at most {FORMAT}: it is of a newer "
-            "crisalad-jax"
+            f"{path}: found a map of format {version}, expected {FORMAT}: `crisalad index` into a "
+            "new folder makes one"
         )
     return value
 
@@ -101,14 +97,13 @@ def read_head(folder: str | os.PathLike[str]) -> MapHead | None:
 
     Raises:
         InputError: the folder is a file or holds other things than a map, or the map is damaged or
-            of a newer version of this package.
+            of another format.
     """
     folder = pathlib.Path(folder)
     value = read_value(folder, or_new=False)
     if value is None:
         return None
-    if isinstance(value, dict):
-        value.pop("config", None)
+    value.pop("config", None)
     return checked(from_plain(MapHead, value, source=str(folder / DESCRIPTION)), folder)
 
 
@@ -141,17 +136,6 @@ def read_components(folder: pathlib.Path, description: MapHead) -> Pca | None:
     return pca
 
 
-def _version(value: Any) -> int:
-    """Return the format that a description says; 0 where it says none."""
-    version = value.get("format") if isinstance(value, dict) else None
-    return version if type(version) is int else 0
-
-
-def is_checked(version: int) -> bool:
-    """Return whether the records of a map of this format hold checksums."""
-    return version >= 3
-
-
 def other_files(folder: pathlib.Path, *names: str) -> list[str]:
     """Return the names in `folder` that are neither temporary nor in `names`."""
     if not folder.is_dir():
@@ -174,25 +158,18 @@ def check_model(
 ) -> None:
     """Check that a map was made by the model with the hash `digest`.
 
-    A map of version 0.1 cannot be checked; a note tells so. Another tells where the model is an
-    int8 program of `quantised_from`, which made the map.
+    A note tells where the model is an int8 program of `quantised_from`, which made the map.
 
     Raises:
         InputError: the hashes differ; the message has both.
     """
-    if description.format < 2:
-        tell(
-            f"{folder}: found a map of crisalad-jax 0.1, which cannot tell whether {weights} made "
-            "it; `crisalad index` into a new folder makes one that can"
-        )
-    elif quantised_from == description.model:
+    if quantised_from == description.model:
         tell(
             f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
         )
     elif digest != description.model:
         file = FILES.get(description.weights)
-        known = None if file is None else read_header(file)
-        is_todays = known is None or known["model_sha256"] == description.model
+        is_todays = file is None or read_header(file)["model_sha256"] == description.model
         version = "" if is_todays else " of another version of this package"
         raise InputError(
             f"{folder}: found a map made by model {description.model[:12]} "

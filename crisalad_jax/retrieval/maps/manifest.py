@@ -14,8 +14,6 @@ from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.retrieval.maps.head import (
     COMPONENTS,
     DESCRIPTION,
-    FORMAT,
-    LOCKS,
     SEGMENTS,
     MapHead,
     checked,
@@ -27,7 +25,7 @@ from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.retrieval.model import Model, model_hash
 from crisalad_jax.retrieval.pca import Pca, pca_hash
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.temporaries import remove_temporaries
+from crisalad_jax.utils.temporaries import LOCK, remove_temporaries
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,20 +70,16 @@ def describe_map(
         collection=f"crisalad_{uuid.uuid4().hex}",
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         pca="" if pca is None else pca_hash(pca),
-        format=3 if pca is None else FORMAT,
     )
 
 
 def write_description(folder: pathlib.Path, description: MapDescription) -> None:
-    """Write map.json, whole or not at all; a field that is not used is left out for old readers.
+    """Write map.json, whole or not at all.
 
     Raises:
         InputError: the disk is full, or the folder cannot be written to.
     """
-    value = to_plain(description)
-    if not description.pca:
-        del value["pca"]
-    write_record(folder / DESCRIPTION, value, indent=2)
+    write_record(folder / DESCRIPTION, to_plain(description), indent=2)
 
 
 def read_description(folder: str | os.PathLike[str]) -> MapDescription | None:
@@ -120,7 +114,7 @@ def _remove(folder: pathlib.Path) -> None:
     for path in segments.glob("[0-9]*.npy"):
         path.unlink()
     segments.rmdir()
-    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, COMPONENTS, *LOCKS}:
-        for name in (DESCRIPTION, COMPONENTS, *LOCKS):
+    if {path.name for path in folder.iterdir()} <= {DESCRIPTION, COMPONENTS, LOCK}:
+        for name in (DESCRIPTION, COMPONENTS, LOCK):
             (folder / name).unlink(missing_ok=True)
         folder.rmdir()

@@ -42,7 +42,6 @@ from crisalad_jax.retrieval.maps.head import (
     MapHead,
     check_model,
     has_images,
-    is_checked,
     read_components,
     read_head,
     read_value,
@@ -53,7 +52,6 @@ from crisalad_jax.retrieval.maps.store import Store, open_store
 from crisalad_jax.retrieval.maps.unrecorded import check_no_record_lost, remove_unrecorded
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
-from crisalad_jax.utils.checksums import tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.locks import one_writer
@@ -149,8 +147,6 @@ class Map:
             listed.discard(path)
         if listed:
             raise InputError(f"{min(listed)}: expected {path.name} before it, found no such file")
-        if not is_checked(head.format):
-            tell_unchecked(folder)
         store.check([(first, count) for first, count, _ in self._segments])
 
     @classmethod
@@ -173,7 +169,7 @@ class Map:
 
         Raises:
             InputError: there is no map, it has no images yet, or it or its store is damaged,
-                changed, gone, or of a newer version.
+                changed, gone, or of another format.
 
         Example:
             >>> with Map.open("no-map") as places:
@@ -258,12 +254,7 @@ class Map:
         return self.folder / SEGMENTS / f"{first:010d}.json"
 
     def _read_record(self, path: pathlib.Path) -> None:
-        record = read_json(
-            path,
-            "a record of images",
-            must=lambda _: is_checked(self.head.format),
-            quiet=True,
-        )
+        record = read_json(path, "a record of images")
         try:
             columns = (record["names"], record["bytes"], record["positions"])
             images = [
@@ -278,10 +269,10 @@ class Map:
             if not isinstance(record["root"], str):
                 raise ValueError(f"found root {record['root']!r}, expected text")
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
-            added = record.get("added")  # older records have none
+            added = record["added"]
             if not isinstance(added, str | None):
                 raise ValueError(f"found added {added!r}, expected a time")
-            zone = record.get("zone") and Zone(int(record["zone"][0]), bool(record["zone"][1]))
+            zone = record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
             segment = _Segment(len(self), len(images), str(record["sha256"]))
             if not images:
                 raise ValueError("no images")
@@ -613,8 +604,8 @@ class Map:
             file,
             engine,
             image_size=tuple(config["image_size"]),
-            preprocessing=config.get("preprocessing"),
-            precision=config.get("compute_dtype", "float32"),
+            preprocessing=config["preprocessing"],
+            precision=config["compute_dtype"],
             any_grouping=any_grouping,
             verify=verify,
         )

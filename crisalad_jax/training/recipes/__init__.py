@@ -4,7 +4,6 @@ import importlib
 import pkgutil
 
 from crisalad_jax.training.recipes.base import RECIPES as RECIPES
-from crisalad_jax.training.recipes.base import RENAMED as RENAMED
 from crisalad_jax.training.recipes.base import find_part as find_part
 from crisalad_jax.training.recipes.base import from_scratch as from_scratch
 from crisalad_jax.training.recipes.base import mines_tuples as mines_tuples

@@ -19,10 +19,6 @@ Make = Callable[[ModelConfig, str], TrainConfig]
 RECIPES: dict[str, Make] = {}
 """Recipes by name. A published method's name is that of its own training. Rows of Table 2 that are
 missing here differ from `crisalad` by one flag."""
-RENAMED = {
-    "eigenplaces": "eigenplaces-vit",
-}
-"""Recipes of earlier versions by their old names."""
 
 
 def register_recipe(name: str) -> Callable[[Make], Make]:
@@ -99,9 +95,6 @@ def recipe(
         )
     size = choose("preset", preset, PRESETS)
     name = ("scratch" if preset == "tiny" else "crisalad") if name is None else name
-    if name in RENAMED:
-        tell(f"recipe: found {name}, which is called {RENAMED[name]}")
-        name = RENAMED[name]
     if name in RECIPES:
         return _of_model(RECIPES[name](size, preset), model)
     base, part = split_name(name)

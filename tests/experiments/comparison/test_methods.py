@@ -19,12 +19,8 @@ from tests.cli.test_cli import fails
 def test_what_names_stand_for():
     for name in METHODS:
         assert method_of(name, "tiny") is METHODS[name]
-    for name, old in (
-        ("crisalad+netvlad", "netvlad"),
-        ("crisalad+patch-netvlad", "patch-netvlad"),
-        ("eigenplaces-vit", "eigenplaces"),
-    ):
-        assert method_of(old, "tiny") is METHODS[name]
+    for part in ("netvlad", "patch-netvlad"):
+        assert method_of(part, "tiny") is METHODS[f"crisalad+{part}"]
     for name, whole in (
         ("crisalad-1e-4", "crisalad-1e-4"),
         ("step:newton", "crisalad+step:newton"),

@@ -204,12 +204,6 @@ def test_a_map_of_components_shortens_queries_too(shared, params, database, whol
         Map.open(out)
 
 
-def test_a_map_without_components_is_of_the_old_format(whole):
-    value = json.loads((whole / "map.json").read_text())
-    assert value["format"] == 3
-    assert "pca" not in value
-
-
 def test_components_that_leave_lengths_are_refused(shared, params, database, whole, tmp_path):
     with Map.open(whole) as places:
         full = np.concatenate(list(places.descriptors))

@@ -21,7 +21,7 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.head import check_model, write_record
-from crisalad_jax.retrieval.maps.manifest import MapDescription, describe_map, read_description
+from crisalad_jax.retrieval.maps.manifest import describe_map, read_description
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.shared import _add
 from crisalad_jax.utils.checksums import sealed_json
@@ -300,64 +300,13 @@ def test_one_other_byte_anywhere_in_a_map_is_refused(folder, name):
     assert killed_appends.check(folder) == 7
 
 
-# Of earlier versions
+# Checksums and forgeries
 
 
 def unsealed(path: pathlib.Path, **changes) -> None:
     value = json.loads(path.read_text()) | changes
     del value["checksum"]
     path.write_text(json.dumps(value) + "\n")
-
-
-def make_format_2(folder: pathlib.Path) -> None:
-    """As version 0.2 wrote it: no file had a checksum of itself."""
-    unsealed(folder / "map.json", format=2)
-    for path in (folder / "segments").glob("*.json"):
-        unsealed(path)
-
-
-def test_a_map_of_format_2_opens_with_one_note_and_grows(folder):
-    make_format_2(folder)
-    made = dataclasses.replace(description("files"), format=2)
-    for added in (0, 2):
-        with pytest.warns(Note, match="map: found no checksum") as told:
-            found = Map.open(folder)
-        assert len(told) == 1
-        assert found.description == made
-        assert [image.name for image in found.images] == names(0, 7 + added)
-        np.testing.assert_array_equal(np.concatenate(list(found.descriptors)), rows(0, 7 + added))
-        found.close()
-        if not added:
-            with pytest.warns(Note, match="map: found no checksum") as told:
-                append_two(folder, made)
-            assert len(told) == 1
-    assert json.loads((folder / "map.json").read_text())["format"] == 2
-
-
-def append_two(folder: pathlib.Path, made: MapDescription) -> None:
-    with open_for_appending(folder, made) as target:
-        target.append(names(7, 2), [7, 7], rows(7, 2), root="/images")
-
-
-def test_what_was_added_to_a_map_of_format_2_is_checked(folder):
-    make_format_2(folder)
-    made = dataclasses.replace(description("files"), format=2)
-    with pytest.warns(Note):
-        append_two(folder, made)
-    edit(folder / "segments" / "0000000007.json", bytes=[7, 8])
-    words = r"0000000007\.json: found other bytes than were written"
-    with pytest.raises(InputError, match=words), Map.open(folder):
-        pass
-
-
-def test_a_changed_descriptor_of_a_map_of_format_2_is_found(folder):
-    make_format_2(folder)
-    path = folder / "segments" / "0000000001.npy"
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.write_bytes(data)
-    with pytest.warns(Note), pytest.raises(InputError, match="1 to 2 have changed since"):
-        Map.open(folder)
 
 
 @pytest.mark.parametrize(
@@ -379,7 +328,7 @@ def test_a_record_of_no_images_below_its_folder_is_refused(folder, fields, words
         Map.open(folder)
 
 
-def test_a_record_of_format_3_cannot_lose_its_checksum(folder):
+def test_a_record_cannot_lose_its_checksum(folder):
     unsealed(folder / "segments/0000000001.json")
     words = r"0000000001\.json: found no checksum, expected a"
     with pytest.raises(InputError, match=words), Map.open(folder):
@@ -401,7 +350,7 @@ def test_a_description_is_read_as_it_was_written(tmp_path):
         assert target.description == made
     assert read_description(tmp_path / "map") == made
     assert made.descriptor_length == MODEL.descriptor_dim
-    assert (made.grouping, made.format, made.store) == ("single", 3, "files")
+    assert (made.grouping, made.format, made.store) == ("single", 4, "files")
     other = describe_map(random_params(MODEL), MODEL, tmp_path / "w", tmp_path / "map")
     assert made.collection != other.collection
 
@@ -414,12 +363,6 @@ def test_another_model_is_refused_by_both_hashes():
         r"expected the same \(--weights\), or a new map \(`crisalad index` into a new folder\)$"
     )
     with pytest.raises(InputError, match=words):
-        check_model(made, "map", "b" * 64, "new")
-
-
-def test_a_map_of_version_0_1_takes_weights_on_trust_and_says_so():
-    made = dataclasses.replace(description("files"), model="a" * 64, format=1)
-    with pytest.warns(Note, match=r"map: found a map of crisalad-jax 0\.1, which cannot tell"):
         check_model(made, "map", "b" * 64, "new")
 
 
@@ -442,14 +385,21 @@ def test_one_process_appends_at_a_time(folder):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda m: reseal(m / "map.json", format=5), "found a map of format 5, expected at most 4"),
-        (lambda m: edit(m / "map.json", format=4), "map.json: found other bytes than were written"),
-        (lambda m: edit(m / "map.json", format=2), "map.json: found other bytes than were written"),
+        (
+            lambda m: reseal(m / "map.json", format=5),
+            "found a map of format 5, expected 4: `cr",
+        ),
+        (
+            lambda m: reseal(m / "map.json", format=3),
+            "found a map of format 3, expected 4: `cr",
+        ),
+        (lambda m: unsealed(m / "map.json", format=3), "found a map of format 3, expected 4: `cr"),
+        (lambda m: edit(m / "map.json", format=3), "map.json: found other bytes than were written"),
         (lambda m: (m / "map.json").write_text('{"model'), "map.json: found no JSON (Unterminated"),
         (lambda m: reseal(m / "map.json", dtype="int3"), "map.json: dtype: found 'int3', expected"),
         (lambda m: reseal(m / "map.json", store="n"), "map.json: store: found 'n', expected files"),
         (lambda m: edit(m / "map.json", store="n"), "map.json: found other bytes than were"),
-        (lambda m: (m / "map.json").write_text("[]"), "map.json: found list, expected an object"),
+        (lambda m: (m / "map.json").write_text("[]"), "map.json: found a map of format None, exp"),
         (lambda m: (m / "map.json").unlink(), "map: found segments and no map.json"),
         (
             lambda m: (m / "segments" / "0000000001.json").write_text('{"root": "/im'),
