@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from crisalad_jax.config.aliases import upgrade
+
 from crisalad_jax.config.io import differences, from_plain, read_config, to_plain
 from crisalad_jax.losses import LOSSES
 from crisalad_jax.nn.aggregators import AGGREGATORS
