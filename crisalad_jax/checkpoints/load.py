@@ -92,8 +92,7 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
     if name in starter.FILES and not is_there:
         return starter.FILES[name]
     # Imported here: the published models, whose names have no suffix, need JAX.
-    from crisalad_jax.checkpoints.published import PUBLISHED
-    from crisalad_jax.checkpoints.published.base import nearest_names
+    from crisalad_jax.checkpoints.published import PUBLISHED, nearest_names
 
     model = PUBLISHED.get(name)
     if is_there:

@@ -41,7 +41,6 @@ _COMMANDS = {
     "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
     "export": "Write a model as a program that needs nothing of this package.",
     "pca": "Fit principal components to descriptors, for shorter ones.",
-    "compile-check": "Compile for GPUs and TPUs that need not be here, and table memory and work.",
     "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
     "completion": "Print a script that lets bash, zsh or fish complete what is typed.",
 }

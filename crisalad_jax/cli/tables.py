@@ -8,8 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from crisalad_jax.checkpoints.cache import is_cached
-from crisalad_jax.checkpoints.published import Published
-from crisalad_jax.checkpoints.published.base import GITHUB
+from crisalad_jax.checkpoints.published import GITHUB, Published
 from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
 from crisalad_jax.training.summary import ModelSummary

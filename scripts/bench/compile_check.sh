@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 export JAX_PLATFORMS=cpu
 check() {
-  crisalad compile-check --model.compute-dtype bfloat16 "$@"
+  python -m scripts.compile_check --model.compute-dtype bfloat16 "$@"
 }
 check --targets h100 h100-8 v5e-1 v5e-8 v6e-8 v5e-64 --json docs/accelerators/compile_check.json
 check --targets v5e-64 --programs train --batch-size 1536 --json docs/accelerators/grown-64.json

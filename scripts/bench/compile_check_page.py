@@ -1,4 +1,4 @@
-"""Put the figures of `crisalad compile-check` into the page about accelerators.
+"""Put the figures of `scripts/compile_check` into the page about accelerators.
 
     python scripts/bench/compile_check_page.py [--figures docs/accelerators] [--page PAGE.md]
 
@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from tables import Table, splice
 
-from crisalad_jax.experiments.compile_check import ProgramCheck, read_check
-from crisalad_jax.experiments.compile_check.tables import (
+from scripts.compile_check import ProgramCheck, read_check
+from scripts.compile_check.tables import (
     COLUMNS,
     LABELS,
     MADE_OF,

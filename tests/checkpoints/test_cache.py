@@ -28,7 +28,6 @@ from crisalad_jax.checkpoints.layouts import public_shapes
 from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
-from crisalad_jax.checkpoints.published.base import GPL, MIT, NO_LICENCE
 from crisalad_jax.checkpoints.torch_io import read_checkpoint
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.nn.adapter import AdapterConfig
@@ -52,6 +51,11 @@ CONFIG = ModelConfig(
 )
 ROOT = pathlib.Path(__file__).parents[2]
 FILE = "tiny_model.safetensors"
+MIT, GPL = (
+    Licence("MIT", True),
+    Licence("GPL-3.0", True, "copyleft, which what you publish may inherit"),
+)
+NO_LICENCE = Licence("no licence file")
 # Long enough for loopback on a loaded machine where nothing stalls.
 QUICK = Patience(timeout=5.0, least=1, attempts=2, pause=0.01)
 

@@ -160,7 +160,7 @@ def bash(tmp_path_factory):
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
 def test_bash_completes_commands_flags_and_choices(bash):
     assert bash("") == {*COMMANDS}
-    assert bash("comp") == {"compare", "compile-check", "completion"}
+    assert bash("comp") == {"compare", "completion"}
     assert bash("evaluate", "--ra") == {"--radius"}
     assert bash("evaluate", "--on-bad-image", "") == {"stop", "skip"}
     assert bash("train", "--data", "x", "--preset", "") == {"tiny", "s14", "b14", "l14", "g14"}

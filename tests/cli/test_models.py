@@ -11,8 +11,7 @@ import rich.console
 
 from crisalad_jax.checkpoints.cache import cached_weights
 from crisalad_jax.checkpoints.layouts import LAYOUTS
-from crisalad_jax.checkpoints.published import PUBLISHED, Published
-from crisalad_jax.checkpoints.published.base import NO_LICENCE
+from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli import main
 from crisalad_jax.cli.tables import models_table
@@ -36,7 +35,7 @@ def _mirror(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
         descriptor=64,
         parameters=88_640,
         images="56 x 56",
-        licence=NO_LICENCE,
+        licence=Licence("no licence file"),
         repository="https://github.com/nobody/tiny",
         file=FILE,
         url=None,

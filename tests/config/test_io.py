@@ -45,7 +45,6 @@ def test_every_recipe_of_every_preset_survives_json(config: TrainConfig):
     assert to_plain(found) == plain
     model = from_plain(ModelConfig, plain["model"], source="here")
     assert model == config.model
-    # All of it is named as it is today.
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.experiments.compile_check.hlo import Array, Computation, Module, Operation
+from scripts.compile_check.hlo import Array, Computation, Module, Operation
 
 COLLECTIVES = (
     *("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "collective-permute"),

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from crisalad_jax.experiments.compile_check.counts import Counts, count
-from crisalad_jax.experiments.compile_check.hlo import Array, parse_arrays, parse_hlo
 from crisalad_jax.utils.errors import InputError
+from scripts.compile_check.counts import Counts, count
+from scripts.compile_check.hlo import Array, parse_arrays, parse_hlo
 
 
 def counts_of(function, *shapes, dtype=jnp.float32) -> Counts:

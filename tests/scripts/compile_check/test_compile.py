@@ -26,7 +26,7 @@ def compile_check(target: str, *arguments: object) -> subprocess.CompletedProces
         found = None
     if found is None:
         pytest.skip(f"no {module}: pip install -r scripts/bench/compile_check.txt")
-    command = [sys.executable, "-m", "crisalad_jax", "compile-check", "--targets", target]
+    command = [sys.executable, "-m", "scripts.compile_check", "--targets", target]
     return subprocess.run(
         [*command, *map(str, arguments), "--model.compute-dtype", "bfloat16", "--quiet"],
         cwd=ROOT,

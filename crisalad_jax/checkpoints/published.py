@@ -1,11 +1,17 @@
-"""What is known of a published model: its file's address and layout, its licence, its images."""
+"""Models that others published, by name: what published.toml says of their files."""
 
 import dataclasses
 import difflib
+import pathlib
 import re
+import tomllib
+from collections.abc import Iterator
+from typing import Any
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.utils.errors import InputError
+
+GITHUB = "https://github.com/"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,7 +20,7 @@ class Licence:
 
     name: str
     """SPDX identifier, or words where the repository has no licence."""
-    commercial: bool | None
+    commercial: bool | None = None
     """Whether it allows commercial use; None where nothing is said."""
     terms: str = ""
     """What else a user has to know of it, in words."""
@@ -26,13 +32,6 @@ class Licence:
             return f"{self.name}: its authors have not said who may use it"
         terms = self.terms if self.commercial else "no commercial use"
         return f"licence {self.name}" + (f": {terms}" if terms else "")
-
-
-MIT = Licence("MIT", commercial=True)
-APACHE = Licence("Apache-2.0", commercial=True)
-BSD = Licence("BSD-3-Clause", commercial=True)
-GPL = Licence("GPL-3.0", commercial=True, terms="copyleft, which what you publish may inherit")
-NO_LICENCE = Licence("no licence file", commercial=None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,32 +64,21 @@ class Published:
     """What is not certain of these facts, or has to be done by hand."""
 
 
-PUBLISHED: dict[str, Published] = {}
+def _read() -> Iterator[Published]:
+    table = tomllib.loads(pathlib.Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    licences = {fields["name"]: Licence(**fields) for fields in table["licence"]}
+    for family in table["family"]:
+        before = family.pop("url", None)
+        for model in family.pop("models"):
+            fields: dict[str, Any] = {**family, **model}
+            fields["repository"] = GITHUB + fields["repository"]
+            fields["licence"] = licences[fields["licence"]]
+            fields.setdefault("url", before and before + fields["file"])
+            yield Published(**fields)
+
+
+PUBLISHED: dict[str, Published] = {model.name: model for model in _read()}
 """Published models by name."""
-
-
-def register_published(model: Published) -> None:
-    """Register a published model under its name."""
-    PUBLISHED[model.name] = model
-
-
-GITHUB = "https://github.com/"
-
-
-def github(repository: str) -> str:
-    """Return the address of a repository of GitHub, OWNER/NAME."""
-    return f"{GITHUB}{repository}"
-
-
-def release(repository: str, version: str, file: str) -> str:
-    """Return the address of a file of a release on GitHub."""
-    return f"{github(repository)}/releases/download/{version}/{file}"
-
-
-def drive(identifier: str) -> str:
-    """Return the address at which Google Drive sends a file, of any size, without asking."""
-    host = "https://drive.usercontent.google.com"
-    return f"{host}/download?id={identifier}&export=download&confirm=t"
 
 
 def published_model(name: str) -> Published:

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import jax
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.experiments.compile_check.kernels import dump_folder
 from crisalad_jax.utils.errors import InputError
+from scripts.compile_check.kernels import dump_folder
 
 _TPU_ENVIRONMENT = {
     "TPU_SKIP_MDS_QUERY": "1",  # else libtpu asks the cloud which machine this is

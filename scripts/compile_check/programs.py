@@ -10,11 +10,11 @@ import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from crisalad_jax.experiments.compile_check.targets import COMPILER_OPTIONS, Machine, devices_of
 from crisalad_jax.nn.model import cast_params, describe, parameter_shapes
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.step import init_train_state, step_config, train_step
 from crisalad_jax.utils.target import GPU, TPU, lowering_for
+from scripts.compile_check.targets import COMPILER_OPTIONS, Machine, devices_of
 
 _TARGETS = {"tpu": TPU, "cuda": GPU}
 

@@ -11,16 +11,16 @@ import jax
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain, to_plain
-from crisalad_jax.experiments.compile_check.counts import KERNEL, Counts, Work, count
-from crisalad_jax.experiments.compile_check.hlo import parse_hlo
-from crisalad_jax.experiments.compile_check.kernels import kernel_cycles
-from crisalad_jax.experiments.compile_check.programs import PROGRAMS, compile_program
-from crisalad_jax.experiments.compile_check.targets import MACHINES, Card, check_compiler
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.progress import progress_bar
+from scripts.compile_check.counts import KERNEL, Counts, Work, count
+from scripts.compile_check.hlo import parse_hlo
+from scripts.compile_check.kernels import kernel_cycles
+from scripts.compile_check.programs import PROGRAMS, compile_program
+from scripts.compile_check.targets import MACHINES, Card, check_compiler
 
 TOLERANCE = 0.05
 """Largest relative difference from what is expected of memory and operations: another version of
@@ -226,39 +226,14 @@ def read_check(path: pathlib.Path) -> CompileCheck:
     Raises:
         InputError: the file cannot be read, or holds something else.
     """
-    what = "the JSON of `crisalad compile-check --json`"
+    what = "the JSON of `scripts.compile_check --json`"
     value = read_json(path, what, sealed=False)
-    for name, kind in (("programs", list), ("config", dict), ("versions", dict)):
-        if not isinstance(value, dict) or not isinstance(value.get(name), kind):
-            raise InputError(f"{path}: found no {name}, expected {what}")
-    programs = tuple(
-        _program(each, f"{path}: programs[{number}]")
-        for number, each in enumerate(value["programs"])
-    )
-    config = from_plain(TrainConfig, value["config"], source=f"{path} (config)")
-    return CompileCheck(config, programs, (), value["versions"])
-
-
-def _program(value: Any, where: str) -> ProgramCheck:
-    """Make the figures of a program, each of its type."""
-    fields = {field.name: field.type for field in dataclasses.fields(ProgramCheck)}
-    if not isinstance(value, dict) or value.keys() != fields.keys():
-        found = ", ".join(map(str, value)) if isinstance(value, dict) else json.dumps(value)
-        raise InputError(f"{where}: found {found[:200]}, expected {', '.join(fields)}")
-    for name, annotation in fields.items():
-        each = value[name]
-        is_number = isinstance(each, int | float) and not isinstance(each, bool)
-        if name == "collectives":
-            right = isinstance(each, dict) and all(isinstance(n, int) for n in each.values())
-            expected = "an object of numbers"
-        elif annotation is str:
-            right, expected = isinstance(each, str), "a text"
-        else:
-            right = is_number or (each is None and name in ("compiler", "kernels"))
-            expected = "a number"
-        if not right:
-            raise InputError(f"{where}.{name}: found {json.dumps(each)}, expected {expected}")
-    return ProgramCheck(**value)
+    try:
+        programs = tuple(ProgramCheck(**each) for each in value["programs"])
+        config, versions = value["config"], value["versions"]
+    except (LookupError, TypeError) as error:
+        raise InputError(f"{path}: found {error}, expected {what}") from error
+    return CompileCheck(from_plain(TrainConfig, config, source=str(path)), programs, (), versions)
 
 
 def differences(found: CompileCheck, expected: CompileCheck) -> list[str]:

@@ -1,14 +1,14 @@
 """Compile this package's programs for accelerators that are not here, and count what they do."""
 
-from crisalad_jax.experiments.compile_check.check import (
+from scripts.compile_check.check import (
     CompileCheck,
     ProgramCheck,
     compile_check,
     differences,
     read_check,
 )
-from crisalad_jax.experiments.compile_check.programs import PROGRAMS
-from crisalad_jax.experiments.compile_check.targets import MACHINES
+from scripts.compile_check.programs import PROGRAMS
+from scripts.compile_check.targets import MACHINES
 
 __all__ = [
     "MACHINES",

@@ -1,41 +1,27 @@
-"""`crisalad compile-check`."""
+"""Compile describing and training for GPUs and TPUs that need not be here; run nothing.
+
+    python -m scripts.compile_check --targets h100 --preset b14 [--expect FIGURES.json]
+
+`pip install -r scripts/bench/compile_check.txt` brings XLA's compilers. They take minutes on a CPU.
+"""
 
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
 from typing import Any
 
 from crisalad_jax.cli.common import check_json, show, talk_beside, write_or_print_json
 from crisalad_jax.cli.train import defaults
-from crisalad_jax.config.flags import parse_settings, with_settings
+from crisalad_jax.config.flags import parse_settings
 from crisalad_jax.utils.errors import InputError
-
-COMMON = (
-    "targets",
-    "programs",
-    "preset",
-    "recipe",
-    "config",
-    "image-size",
-    "batch-size",
-    "model.aggregator",
-    "micro-batch",
-    "expect",
-    "keep",
-    "json",
-    "quiet",
-)
-EXAMPLE = "crisalad compile-check --targets h100 --preset b14"
+from scripts.compile_check import compile_check, differences, read_check
+from scripts.compile_check.tables import check_tables
+from scripts.compile_check.targets import compile_on_cpu
 
 
 @dataclasses.dataclass(frozen=True)
 class CompileCheck:
-    """Compile describing and training for GPUs and TPUs that need not be here; run nothing.
-
-    `jax[tpu]` and `jax-cuda12-plugin`, of the installed version of JAX, bring XLA's compilers. They
-    take minutes on a CPU.
-    """
+    """Compile describing and training for GPUs and TPUs that need not be here; run nothing."""
 
     settings: Any
     targets: tuple[str, ...] = ("v5e-1", "v5e-8", "v6e-8", "h100", "h100-8")
@@ -60,28 +46,14 @@ class CompileCheck:
     """Existing folder for the texts of the compiled programs (HLO)."""
     json: pathlib.Path | None = None
     """File for the figures as JSON, which --expect reads; - prints it."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
     quiet: bool = False
     """No progress bar."""
 
 
-def parse(program: str, arguments: Sequence[str]) -> CompileCheck:
-    """Parse the flags, with one for every field of the configuration and of its parts."""
-    return parse_settings(CompileCheck, program, arguments, defaults(arguments), ())
-
-
-def command(arguments: Sequence[str]) -> type:
-    """Return the class that these arguments are parsed into, for help and completion."""
-    return with_settings(CompileCheck, arguments, defaults(arguments), ())[0]
-
-
-def run(arguments: CompileCheck) -> None:
+def main() -> None:
     """Print the table of what was compiled, write it as JSON, and compare it where asked."""
-    from crisalad_jax.experiments.compile_check import compile_check, differences, read_check
-    from crisalad_jax.experiments.compile_check.tables import check_tables
-    from crisalad_jax.experiments.compile_check.targets import compile_on_cpu
-
+    given = sys.argv[1:]
+    arguments = parse_settings(CompileCheck, "compile_check", given, defaults(given), ())
     compile_on_cpu()
     check_json(arguments.json)
     talk_beside(arguments.json)
@@ -100,8 +72,12 @@ def run(arguments: CompileCheck) -> None:
     if arguments.json is not None:
         write_or_print_json(arguments.json, check.as_json())
     lines = check.failures if expected is None else differences(check, expected)
-    for line in lines:
-        print(f"crisalad: {line}", file=sys.stderr)
     if lines:
-        what = "programs that do not compile" if expected is None else "differences"
-        raise InputError(f"compile-check: found {len(lines)} {what}, expected none")
+        sys.exit("\n".join(lines))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        sys.exit(str(error))

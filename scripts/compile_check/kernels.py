@@ -15,8 +15,8 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 
-from crisalad_jax.experiments.compile_check.counts import KERNEL
-from crisalad_jax.experiments.compile_check.hlo import Module, Operation
+from scripts.compile_check.counts import KERNEL
+from scripts.compile_check.hlo import Module, Operation
 
 _OPTIONS = (
     "--xla_jf_dump_to={folder}",

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
-from crisalad_jax.experiments.compile_check.check import CompileCheck, ProgramCheck
+from scripts.compile_check.check import CompileCheck, ProgramCheck
 
 _NAMES = ("target", "program", "images")
 _TAKES = (
