@@ -15,7 +15,7 @@ def test_it_says_what_it_wrote(tmp_path: pathlib.Path, capfd: Capture) -> None:
     assert main(given) == 0
     said = " ".join(capfd.readouterr().out.split())
     assert said == (
-        f"{out}: 6 places with 4 images each in {out / 'train'}; 4 others in {out / 'test'}"
+        f"{out}: 6 places with 4 images each in {out / 'train'}; 4 other places in {out / 'test'}"
     )
     assert len(list((out / "train").rglob("*.jpg"))) == 6 * 4
     assert len(list((out / "test").rglob("*.jpg"))) == 4 * 2
