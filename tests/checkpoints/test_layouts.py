@@ -15,7 +15,6 @@ from crisalad_jax.checkpoints.layouts import (
     to_params,
     to_state,
 )
-from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
@@ -161,19 +160,6 @@ def test_heads_have_their_public_names(name: str) -> None:
     shapes = public_shapes(MODELS[name], "reference")
     head = {key: shape for key, shape in shapes.items() if key.startswith("aggregat")}
     assert list(head.items()) == list(PUBLIC_HEADS[name].items())
-
-
-def test_parts_that_a_model_does_not_have_go_to_any_layout() -> None:
-    """Version 0.1 said how large every method's parts are, whichever was chosen."""
-    _, published = expected("dinov2_vitb14")
-    plain = to_plain(published) | {
-        "aggregator": "class-token",
-        "boq": {"queries": 8},
-        "salad": {"clusters": 4},
-    }
-    found = from_plain(ModelConfig, plain, source="file")
-    assert found == published
-    check_holds(found, "dinov2")
 
 
 def test_every_number_has_its_own_place() -> None:

@@ -552,7 +552,8 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
         arrays["aggregator.dust_bin"] = (
             np.zeros(2, np.float32) if kind == "shape" else np.array(np.nan, np.float32)
         )
-        write_sealed(weights, arrays, FORMAT, {"config": to_plain(MODEL)})
+        with safetensors.safe_open(whole, framework="numpy") as file:
+            write_sealed(weights, arrays, FORMAT, json.loads(file.metadata()[FORMAT]))
     before = files_in(tmp_path)
     start = ("--weights", weights)
     town = shared / "town"
