@@ -15,7 +15,6 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.notes import tell
 
 
@@ -56,7 +55,6 @@ def read_start(
     if backbone is None:
         return None
     backbone = find_weights(backbone, quiet=quiet)
-    check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     fresh = init_crisalad(jax.random.key(config.seed), config.model)
     return with_backbone_of(fresh, config.model, backbone)
 

@@ -689,7 +689,8 @@ def test_a_classification_by_hand_trains_its_vectors() -> None:
     config = TrainConfig(model=MODEL, loss=loss)
     params = init_crisalad(jax.random.key(0), MODEL)
     options = {"steps": 5, "classes": (3,)}
-    step, static = make_train_step(config, **options), step_config(config, **options)
+    static = step_config(config, **options)
+    step = make_train_step(static)
     state, frozen = init_train_state(params, "head", static, key=jax.random.key(1))
     before = np.array(state.classifiers.weights)
     assert before.shape == (1, 3, MODEL.descriptor_dim)
@@ -718,10 +719,10 @@ def test_a_classification_needs_classes_and_a_key(params, classes, key, words) -
 @pytest.mark.usefixtures("_unchecked")
 def test_another_configuration_or_loss_is_named(params) -> None:
     config = TrainConfig(model=MODEL)
-    with pytest.raises(InputError, match=r"^config: found TrainConfig, expected the StepConf"):
+    with pytest.raises(InputError, match=r"^config: found TrainConfig, expected StepConfig$"):
         init_train_state(params, "head", config)
     with pytest.raises(InputError, match=r"^loss: found 'triplet', expected a function of"):
-        make_train_step(config, steps=5, loss="triplet")
+        step_config(config, steps=5, loss="triplet")
 
 
 @pytest.mark.slow
@@ -741,7 +742,8 @@ def test_a_setting_of_a_loss_keeps_its_default(params) -> None:
 
 def test_labels_that_32_bits_cannot_tell_apart_are_refused(params) -> None:
     config = TrainConfig(model=MODEL)
-    state, frozen = init_train_state(params, "head", step_config(config, steps=1))
+    static = step_config(config, steps=1)
+    state, frozen = init_train_state(params, "head", static)
     labels = np.array([0, 2**32, 1, 2**32 + 1, 2, 2])
     with pytest.raises(InputError, match=r"^labels: found up to 4294967297, expected numbers bel"):
-        make_train_step(config, steps=1)(state, frozen, pictures(6), labels, jax.random.key(0))
+        make_train_step(static)(state, frozen, pictures(6), labels, jax.random.key(0))

@@ -140,10 +140,8 @@ def test_who_needs_one() -> None:
 
 def test_what_does_not_fit_is_said_before_images_are_read(fresh, tmp_path) -> None:
     nowhere = [tmp_path / "none.jpg"]
-    many = dataclasses.replace(ANYLOC, aggregator=AnyLocConfig(clusters=13, layer=0))
     for config, options, words in (
         (MODEL, {}, "aggregator: found salad, which has no vocabulary, expected .*anyloc, netvlad"),
-        (many, {}, "images: found 1, which is 12 features, expected at least 13"),
         (ANYLOC, {"images": 0}, "images: found 0, expected at least 1"),
         (ANYLOC, {"seed": -1}, "seed: found -1, expected at least 0"),
         (ANYLOC, {"batch_size": 0}, "batch_size: found 0"),
