@@ -44,14 +44,10 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
     """
 
     def decorate(make: Make) -> Make:
-        there = RECIPES.get(name)
-        if there is not None and (there.__module__, there.__qualname__) != (
-            make.__module__,
-            make.__qualname__,
-        ):
+        module = RECIPES[name].__module__ if name in RECIPES else make.__module__
+        if module != make.__module__:
             raise InputError(
-                f"register_recipe {name!r}: found the name taken by {there.__module__}, expected "
-                "another"
+                f"register_recipe {name!r}: found the name taken by {module}, expected another"
             )
         RECIPES[name] = make
         return make
