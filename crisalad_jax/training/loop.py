@@ -44,19 +44,8 @@ from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
 STATUS_STEPS = 5
-"""Several processes exchange their `ProcessStatus` before every so many steps of a round."""
+"""Several processes exchange their status before every so many steps of a round."""
 _T = TypeVar("_T")
-
-
-class ProcessStatus(NamedTuple):
-    """Status flags that processes exchange; each acts on the largest of all."""
-
-    failed: int
-    """0 without an error; 1 where the loss is not finite, which all see; 2 for other errors."""
-    signal: int
-    """Number of the last signal, 0 for none."""
-    save_is_due: int
-    """1 where the last saved state is old."""
 
 
 @brief
@@ -154,17 +143,12 @@ def fit(
         threads=threads,
         cache=cache,
     )
-    steps = data.steps_per_epoch * config.epochs
-    if steps >= 2**31:
-        raise InputError(
-            f"epochs: found {config.epochs}, which is {steps} steps, expected fewer than 2**31, by "
-            "which JAX counts"
-        )
     trainer = Trainer(config, data, initial, shard_state=shard_state)
     checksums["weights"] = checksum(jax.tree.leaves(trainer.initial))
     distributed.check_same("weights", checksums["weights"])
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
     files = RunFiles(pathlib.Path(out), config, record, RunState(trainer.state, data.mined))
+    steps = data.steps_per_epoch * config.epochs
     silent = quiet or not distributed.is_primary()
     with contextlib.closing(files):
         record = files.record
@@ -319,17 +303,19 @@ class _Loop:
 
     def _exchange_status(self, error: Exception | None) -> None:
         """Act on what any process knows: raise an error or a signal, or save."""
-        failed = 0 if error is None else 1 if isinstance(error, LossNotFiniteError) else 2
-        own = ProcessStatus(failed, self.signals.number, self.files.save_is_due())
-        status = ProcessStatus(*distributed.all_max(*own))
-        if status.failed:
+        own = 0 if error is None else 1 if isinstance(error, LossNotFiniteError) else 2
+        failed, number, save_is_due = distributed.all_max(
+            own, self.signals.number, self.files.save_is_due()
+        )
+        if failed:
+            # Where all have found that the loss is not finite, all raise that, and save together.
             another = InputError(distributed.ANOTHER_FAILED)
-            raise error if error and failed == status.failed else another
-        if status.signal or status.save_is_due:
+            raise error if error is not None and own == failed else another
+        if number or save_is_due:
             distributed.raise_together(self._log_steps)
-        if status.signal:
-            raise Stopped(status.signal)
-        if status.save_is_due:
+        if number:
+            raise Stopped(number)
+        if save_is_due:
             self.save()
 
     def _log_steps(self, *, leave: int = 0) -> None:

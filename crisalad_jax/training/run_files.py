@@ -277,6 +277,7 @@ def _text(names: Iterable[Any]) -> np.ndarray:
 
 def checksum(arrays: Iterable[Any]) -> int:
     """Compute the CRC of all arrays, which tells others from the same."""
-    return functools.reduce(
-        lambda crc, each: zlib.crc32(np.asarray(each).tobytes(), crc), arrays, 0
-    )
+    value = 0
+    for each in arrays:
+        value = zlib.crc32(np.asarray(each).tobytes(), value)
+    return value

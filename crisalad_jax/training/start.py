@@ -1,5 +1,6 @@
 """The parameters that a run starts from: a whole model, a backbone, or random numbers."""
 
+import functools
 import os
 
 import jax
@@ -89,19 +90,13 @@ def with_vocabulary_of(
         return initial
     if initial is None:
         initial = init_crisalad(jax.random.key(config.seed), config.model)
-    start = initial
     count = places.database if isinstance(places, QuerySet) else len(places.files)
-    paths = [places.path(image) for image in range(count)]
-
-    def build() -> Crisalad:
-        return with_vocabulary(
-            start,
-            config.model,
-            paths,
-            images=config.model.aggregator.centroid_images,
-            seed=config.seed,
-            on_bad_image=on_bad_image,
-            quiet=quiet or not distributed.is_primary(),
-        )
-
+    build = functools.partial(
+        with_vocabulary,
+        *(initial, config.model, [places.path(image) for image in range(count)]),
+        images=config.model.aggregator.centroid_images,
+        seed=config.seed,
+        on_bad_image=on_bad_image,
+        quiet=quiet or not distributed.is_primary(),
+    )
     return distributed.broadcast(distributed.raise_together(build))
