@@ -30,7 +30,6 @@ from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
     RunState,
-    checksum,
     checksum_of_benchmark,
     checksum_of_places,
 )
@@ -144,16 +143,18 @@ def fit(
         cache=cache,
     )
     trainer = Trainer(config, data, initial, shard_state=shard_state)
-    checksums["weights"] = checksum(jax.tree.leaves(trainer.initial))
+    checksums["weights"] = trainer.initial_checksum
     distributed.check_same("weights", checksums["weights"])
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
-    files = RunFiles(pathlib.Path(out), config, record, RunState(trainer.state, data.mined))
+    files = RunFiles(pathlib.Path(out), config, record)
     steps = data.steps_per_epoch * config.epochs
     silent = quiet or not distributed.is_primary()
     with contextlib.closing(files):
+        state = files.load(RunState(trainer.state, data.mined))
+        trainer.resume(state.training)
+        data.mined = jax.tree.map(np.asarray, state.mined)
+        del state  # whose arrays the trainer has copied
         record = files.record
-        trainer.resume(files.state.training)
-        data.mined = jax.tree.map(np.asarray, files.state.mined)
         if files.is_extended and record.step:
             _warn_of_extension(config, record, files.out)
         bar = progress_bar("training", steps, "steps", quiet=silent, done=record.step)

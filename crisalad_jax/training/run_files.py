@@ -75,34 +75,40 @@ class RunRecord:
 class RunFiles:
     """The files in a run's folder; the primary process alone writes them."""
 
-    def __init__(
-        self, out: pathlib.Path, config: TrainConfig, record: RunRecord, state: RunState
-    ) -> None:
-        """Acquire the folder `out` until it is closed, and load the state there, if there is one.
+    def __init__(self, out: pathlib.Path, config: TrainConfig, record: RunRecord) -> None:
+        """Take the folder, which `load` acquires, and the record of a run before its first step."""
+        self.out, self.record, self._config = out, record, config
+        self.is_extended = False
+        """Whether the configuration gives more epochs than the run had before."""
+        self._opened = contextlib.ExitStack()
+        self._saved: RunRecord | None = None
+        self._saved_at = time.monotonic()
+
+    def load(self, state: RunState) -> RunState:
+        """Acquire the folder until `close`, and load the run there, if there is one.
 
         All processes call it together.
 
         Args:
-            out: the folder.
-            config: the run's configuration.
-            record: that of a run before its first step.
-            state: the same.
+            state: that of a run before its first step.
+
+        Returns:
+            The state to resume from, which `record` is for.
 
         Raises:
             InputError: what `acquire_run` raises; another process writes there; or the run started
                 from something else.
         """
-        self.out, self._config = out, config
-        self.record, self.state = record, state
-        self.is_extended = False
-        """Whether `config` gives more epochs than the run had before."""
-        self._opened = contextlib.ExitStack()
-        self._saved: RunRecord | None = None
-        self.record = RunRecord(**distributed.run_on_primary(self._open))
-        self.state = distributed.broadcast(self.state)
-        self._saved_at = time.monotonic()
 
-    def _open(self) -> dict[str, Any]:
+        def load() -> dict[str, Any]:
+            nonlocal state
+            state = self._load(state)
+            return dataclasses.asdict(self.record)
+
+        self.record = RunRecord(**distributed.run_on_primary(load))
+        return distributed.broadcast(state)
+
+    def _load(self, state: RunState) -> RunState:
         out, config = self.out, self._config
         check_run(out, config)
         with contextlib.ExitStack() as opened:
@@ -114,22 +120,21 @@ class RunFiles:
             opened.enter_context(made_folder(out / "state"))
             self._states = StateStore(out / "state")
             opened.callback(self._states.close)
-            saved = self._states.load(self.state)
+            saved = self._states.load(state)
             if saved is not None:
                 _check_start(out, config, self.record, saved.record)
-                self.record, self.state = RunRecord(**saved.record), saved.state
+                self.record, state = RunRecord(**saved.record), saved.state
                 self._saved = copy.deepcopy(self.record)
+            step, validated = self.record.step, self.record.validated
             with told_of(out):
                 if self.is_extended:
-                    extend_run(out, config, self.record.step)
+                    extend_run(out, config, step)
                 self._drop_old_best()
                 # A validation after the saved state will be repeated, so its line is dropped.
-                self._log = MetricsLog(
-                    out, keep_up_to=self.record.step, validated=self.record.validated
-                )
+                self._log = MetricsLog(out, keep_up_to=step, validated=validated)
                 opened.callback(self._log.close)
             self._opened = opened.pop_all()
-        return dataclasses.asdict(self.record)
+        return state
 
     def log(self, values: Mapping[str, int | float], *, of: str = "") -> None:
         """Append a line to the log; see `MetricsLog.write`."""

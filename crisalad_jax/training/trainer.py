@@ -18,6 +18,7 @@ from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Miner
+from crisalad_jax.training.run_files import checksum
 from crisalad_jax.training.step import (
     Metrics,
     TrainState,
@@ -77,9 +78,10 @@ class Trainer:
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
         # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.
         classifiers_key = jax.random.fold_in(jax.random.key(config.seed), 2)
-        self.initial = init_crisalad(init_key, config.model) if initial is None else initial
+        params = init_crisalad(init_key, config.model) if initial is None else initial
+        self.initial_checksum = checksum(jax.tree.leaves(params))
         self.state, frozen = init_train_state(
-            self.initial, config.trainable, self._step_config, key=classifiers_key
+            params, config.trainable, self._step_config, key=classifiers_key
         )
         self._frozen: PyTree = jax.device_get(frozen)
         self._frozen_on_devices = self._devices.replicate(cast_params(self._frozen, config.model))

@@ -233,7 +233,7 @@ def log_of(run: pathlib.Path) -> list[Any]:
 
 TRAINING = Marks(
     {
-        "opening the run": "crisalad_jax.training.run_files:RunFiles.__init__",
+        "opening the run": "crisalad_jax.training.run_files:RunFiles.load",
         "loading a state": "crisalad_jax.checkpoints.train_state:StateStore.load",
         "steps": "crisalad_jax.training.loop:_Loop._take_round",
         "saving": "crisalad_jax.training.run_files:RunFiles.save",

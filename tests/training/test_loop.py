@@ -79,21 +79,17 @@ def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert_same_params(load_weights(found / name)[0], load_weights(expected / name)[0])
 
 
-def open_files(config, places, out, params) -> RunFiles:
-    """The files of a run as `fit` opens them."""
+def save_steps(config, places, out, params, steps: tuple[int, ...] = (0,)) -> None:
+    """Save a state for each of these steps, with the files of a run as `fit` opens them."""
     weights = checksum(jax.tree.leaves(params))
     checksums = {"places": checksum_of_places(places), "validation": 0, "weights": weights}
     record = RunRecord(checksums, {name: [*each] for name, each in sources_of(config).items()})
     static = step_config(config, steps=STEPS)
     state, _ = init_train_state(params, config.trainable, static)
-    return RunFiles(out, config, record, RunState(state, None))
-
-
-def save_steps(files: RunFiles, params: Crisalad, steps: tuple[int, ...] = (0,)) -> None:
-    """Save a state for each of these steps, as `fit` does, and close the files."""
-    for step in steps:
-        files.record.step = step
-        files.save(files.state, lambda: params)
+    files = RunFiles(out, config, record)
+    state = files.load(RunState(state, None))
+    for files.record.step in steps:
+        files.save(state, lambda: params)
     files.close()
 
 
@@ -591,7 +587,7 @@ def test_what_does_not_fit_is_found_before_anything_is_written(tmp_path, places,
 @pytest.mark.parametrize("trainable", ["adapters+head", "all"])
 def test_a_run_resumes_only_from_the_same_weights_and_places(tmp_path, places, params, trainable):
     config = dataclasses.replace(RECIPE, trainable=trainable)
-    save_steps(open_files(config, places, tmp_path, params), params)
+    save_steps(config, places, tmp_path, params)
     other = jax.tree.map(lambda leaf: leaf + 1, params)
     with pytest.raises(InputError, match=f"{tmp_path}: the run started from other weights"):
         fit(config, places, tmp_path, initial=other)
@@ -601,7 +597,7 @@ def test_a_run_resumes_only_from_the_same_weights_and_places(tmp_path, places, p
 
 
 def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, places, params):
-    save_steps(open_files(RECIPE, places, tmp_path, params), params, (0, 2))
+    save_steps(RECIPE, places, tmp_path, params, (0, 2))
     for path in (tmp_path / "state" / "2" / "state").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[:3])
@@ -637,7 +633,7 @@ def test_hidden_files_of_the_user_outlive_a_run(tmp_path, places, params):
     cut_off = temporary_beside(run / "last.safetensors")
     for name, text in (hidden | {cut_off.name: "cut off"}).items():
         (run / name).write_text(text)
-    save_steps(open_files(RECIPE, places, run, params), params)
+    save_steps(RECIPE, places, run, params)
     assert {p.name: p.read_text() for p in run.glob(".*")} == hidden
 
 
