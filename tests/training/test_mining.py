@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import json
 import pathlib
 import shutil
 
@@ -24,7 +23,7 @@ from crisalad_jax.losses.selavpr import SelaVprLoss
 from crisalad_jax.losses.triplet import TripletConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.model import describe
-from crisalad_jax.training import run_files, trainer
+from crisalad_jax.training import run_files
 from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.mining import (
@@ -39,6 +38,7 @@ from crisalad_jax.training.optimiser import learning_rate_schedule
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import RECIPE, write_picture
+from tests.training.test_loop import Interrupted, assert_same_params, fail_at, metrics_of
 
 ROLES = np.array([[0, 1, 2, 2, 2], [0, 1, 2, 3, 3], [0, 1, 3, 3, 3]])
 """Three tuples: of three negatives, of one, and of none."""
@@ -495,16 +495,6 @@ def test_batches_hold_the_tuples_and_their_roles(street):
     np.testing.assert_array_equal(half.images, first.images[4:])
 
 
-class Interrupted(Exception):
-    """Stands for a kill: nothing is saved on its way out."""
-
-
-def lines_of(out: pathlib.Path) -> list[dict]:
-    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-    times = "images_per_second", "waited_for_images"
-    return [{k: v for k, v in line.items() if k not in times} for line in lines]
-
-
 @pytest.fixture(scope="module")
 def whole(street, tmp_path_factory) -> pathlib.Path:
     out = tmp_path_factory.mktemp("runs") / "whole"
@@ -513,7 +503,7 @@ def whole(street, tmp_path_factory) -> pathlib.Path:
 
 
 def test_a_run_learns_from_its_tuples(whole):
-    lines = lines_of(whole)
+    lines = metrics_of(whole)
     assert [line["epoch"] for line in lines] == [1] * 4 + [2] * 4
     assert all(np.isfinite(line["loss"]) for line in lines)
     assert all(line["gradient_norm"] > 0 for line in lines)
@@ -528,26 +518,15 @@ def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
 ):
     """Ends at a step, or (call 1) as the first tuples were just mined."""
     queries, out = read_query_set(street), tmp_path / "run"
-    step, calls = trainer.train_step, itertools.count(1)
-
-    def interrupted(*arguments):
-        if next(calls) == call:
-            raise Interrupted
-        return step(*arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(trainer, "train_step", interrupted)
+        fail_at(patch, "train_step", call)
         if saves == "always":
             patch.setattr(run_files, "SAVE_SECONDS", -1)
         with pytest.raises(Interrupted):
             fit(CONFIG, queries, out, quiet=True)
     fit(CONFIG, queries, out, quiet=True)
-    assert lines_of(out) == lines_of(whole)
-    for mine, theirs in zip(
-        *(jax.tree.leaves(load_weights(each / "last.safetensors")[0]) for each in (out, whole)),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(mine, theirs)
+    assert metrics_of(out) == metrics_of(whole)
+    assert_same_params(*(load_weights(each / "last.safetensors")[0] for each in (out, whole)))
     assert not [path for path in out.rglob("*") if "tmp" in path.name]
 
 
@@ -601,15 +580,8 @@ def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatc
 def test_an_older_state_has_its_own_tuples(street, whole, tmp_path, monkeypatch):
     """The newest state is damaged and deleted, as the message says: the one before goes on."""
     queries, out = read_query_set(street), tmp_path / "run"
-    step, calls = trainer.train_step, itertools.count(1)
-
-    def interrupted(*arguments):
-        if next(calls) == 5:
-            raise Interrupted
-        return step(*arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(trainer, "train_step", interrupted)
+        fail_at(patch, "train_step", 5)
         patch.setattr(run_files, "SAVE_SECONDS", -1)
         with pytest.raises(Interrupted):
             fit(CONFIG, queries, out, quiet=True)
@@ -620,7 +592,7 @@ def test_an_older_state_has_its_own_tuples(street, whole, tmp_path, monkeypatch)
     assert (newest.name, older.name) == ("4", "3")  # of two rounds
     shutil.rmtree(newest)
     fit(CONFIG, queries, out, quiet=True)
-    assert lines_of(out) == lines_of(whole)
+    assert metrics_of(out) == metrics_of(whole)
 
 
 def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
