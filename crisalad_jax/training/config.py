@@ -230,7 +230,7 @@ class TrainConfig:
         known = TRAINABLE.fullmatch(self.trainable) is not None
         _expect(self, "trainable", known, EXPECTED)
         fits = self.trainable != "adapters+head" or has_adapters(self.model)
-        _expect(self, "trainable", fits, f"{EXPECTED}: the model has no adapters")
+        _expect(self, "trainable", fits, "head, last-N-blocks+head or all without adapters")
         if self.patience is not None:
             require_positive(self, "patience")
         if self.validation_size is not None:
