@@ -14,6 +14,7 @@ from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report import (
@@ -24,7 +25,7 @@ from crisalad_jax.experiments.report import (
     training_curves,
 )
 from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import Model, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -96,16 +97,20 @@ def _demo(config: DemoConfig, out: pathlib.Path, quiet: bool, started: float) ->
     settings = demo_recipe(config)
     untrained = init_crisalad(jax.random.key(config.seed), settings.model)
     measure = functools.partial(
-        evaluate, benchmark=benchmark, groupings=GROUPINGS, seed=config.seed, seeds=1, quiet=quiet
+        evaluate,
+        benchmark=benchmark,
+        groupings=GROUPINGS,
+        seed=config.seed,
+        seeds=1,
+        reading=Reading(quiet=quiet),
     )
-    before = measure(untrained, settings.model)
+    before = measure(Model(untrained, settings.model))
     training_started = time.monotonic()
     fit(settings, places, out / "run", quiet=quiet)
     training_seconds = time.monotonic() - training_started
-    trained, model = load_weights(out / "run" / "last.safetensors")
-    after = measure(trained, model)
+    after = measure(load_weights(out / "run" / "last.safetensors"))
 
-    rows = _rows(benchmark, "HOG, no learning", measure(*load("hog")))
+    rows = _rows(benchmark, "HOG, no learning", measure(load("hog")))
     rows += _rows(benchmark, "untrained", before)
     rows += _rows(benchmark, "trained", after)
     pictures = [out / name for name in ("recall.png", "training.png", "gallery.png")]
