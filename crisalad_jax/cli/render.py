@@ -4,8 +4,15 @@ import dataclasses
 import pathlib
 
 from crisalad_jax.cli.common import give_json, prepare_json, say
-from crisalad_jax.experiments.synthetic import SCENERIES, Scenery, WorldConfig, write_world
-from crisalad_jax.experiments.synthetic.world import VARIATIONS, Variation, has_world
+from crisalad_jax.synthetic import (
+    SCENERIES,
+    VARIATIONS,
+    Scenery,
+    Variation,
+    WorldConfig,
+    has_world,
+    write_world,
+)
 from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.progress import progress_bar
 

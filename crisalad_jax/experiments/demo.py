@@ -23,8 +23,8 @@ from crisalad_jax.experiments.report import (
     recall_markdown,
     training_curves,
 )
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit

@@ -12,9 +12,9 @@ import pytest
 
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
-from crisalad_jax.experiments.synthetic import SCENERIES, View, WorldConfig, render, write_world
-from crisalad_jax.experiments.synthetic.scenes import build_place
-from crisalad_jax.experiments.synthetic.world import VARIATIONS, views
+from crisalad_jax.synthetic import SCENERIES, View, WorldConfig, render, write_world
+from crisalad_jax.synthetic.scenes import build_place
+from crisalad_jax.synthetic.world import VARIATIONS, views
 from crisalad_jax.utils.errors import InputError
 
 SMALL = WorldConfig(

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from crisalad_jax.experiments.synthetic.camera import (
+from crisalad_jax.synthetic.camera import (
     NEAR,
     Camera,
     clip_near,
     project_outlines,
 )
-from crisalad_jax.experiments.synthetic.light import (
+from crisalad_jax.synthetic.light import (
     GLOW,
     GRASS,
     SNOW_COLOUR,
@@ -23,12 +23,12 @@ from crisalad_jax.experiments.synthetic.light import (
     shining,
     sun_direction,
 )
-from crisalad_jax.experiments.synthetic.materials import Kind
-from crisalad_jax.experiments.synthetic.mesh import GROUND_LAYER, Scene, join_scenes
-from crisalad_jax.experiments.synthetic.place import Place
-from crisalad_jax.experiments.synthetic.scenes import build_place
-from crisalad_jax.experiments.synthetic.traffic import build_passers
-from crisalad_jax.experiments.synthetic.view import Scenery, View, check_size
+from crisalad_jax.synthetic.materials import Kind
+from crisalad_jax.synthetic.mesh import GROUND_LAYER, Scene, join_scenes
+from crisalad_jax.synthetic.place import Place
+from crisalad_jax.synthetic.scenes import build_place
+from crisalad_jax.synthetic.traffic import build_passers
+from crisalad_jax.synthetic.view import Scenery, View, check_size
 from crisalad_jax.utils.errors import InputError
 
 _SUPERSAMPLING = 2

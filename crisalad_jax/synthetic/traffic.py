@@ -4,8 +4,8 @@ import functools
 
 import numpy as np
 
-from crisalad_jax.experiments.synthetic.materials import SIGNS, Colour, Kind, pick
-from crisalad_jax.experiments.synthetic.mesh import (
+from crisalad_jax.synthetic.materials import SIGNS, Colour, Kind, pick
+from crisalad_jax.synthetic.mesh import (
     TO_CAMERA,
     UP,
     Front,

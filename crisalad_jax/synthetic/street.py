@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from crisalad_jax.experiments.synthetic.buildings import DEPTH, Habit, building
-from crisalad_jax.experiments.synthetic.materials import GLASS, ROOFS, WALLS, Kind, pick, scaled
-from crisalad_jax.experiments.synthetic.mesh import (
+from crisalad_jax.synthetic.buildings import DEPTH, Habit, building
+from crisalad_jax.synthetic.materials import GLASS, ROOFS, WALLS, Kind, pick, scaled
+from crisalad_jax.synthetic.mesh import (
     GROUND_LAYER,
     TO_CAMERA,
     UP,
@@ -16,8 +16,8 @@ from crisalad_jax.experiments.synthetic.mesh import (
     rectangles,
     street_front,
 )
-from crisalad_jax.experiments.synthetic.place import Body, Place, Reach
-from crisalad_jax.experiments.synthetic.things import lamp, monument, tree, wires
+from crisalad_jax.synthetic.place import Body, Place, Reach
+from crisalad_jax.synthetic.things import lamp, monument, tree, wires
 
 
 def street(rng: np.random.Generator) -> Place:

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from crisalad_jax.experiments.synthetic.materials import Colour, Kind, scaled
-from crisalad_jax.experiments.synthetic.mesh import Scene
-from crisalad_jax.experiments.synthetic.view import Season, Time, View, Weather
+from crisalad_jax.synthetic.materials import Colour, Kind, scaled
+from crisalad_jax.synthetic.mesh import Scene
+from crisalad_jax.synthetic.view import Season, Time, View, Weather
 
 
 class Light(NamedTuple):

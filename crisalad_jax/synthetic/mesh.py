@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from crisalad_jax.experiments.synthetic.materials import Colour, Kind, scaled
-from crisalad_jax.experiments.synthetic.view import EYE
+from crisalad_jax.synthetic.materials import Colour, Kind, scaled
+from crisalad_jax.synthetic.view import EYE
 
 GROUND_LAYER = 1e6
 """Smallest layer of parts on the ground, which are painted below every shadow."""

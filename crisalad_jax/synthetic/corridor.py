@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crisalad_jax.experiments.synthetic.materials import (
+from crisalad_jax.synthetic.materials import (
     SIGNS,
     WALLS,
     Colour,
@@ -10,7 +10,7 @@ from crisalad_jax.experiments.synthetic.materials import (
     pick,
     scaled,
 )
-from crisalad_jax.experiments.synthetic.mesh import (
+from crisalad_jax.synthetic.mesh import (
     GROUND_LAYER,
     TO_CAMERA,
     UP,
@@ -23,7 +23,7 @@ from crisalad_jax.experiments.synthetic.mesh import (
     polygons,
     rectangles,
 )
-from crisalad_jax.experiments.synthetic.place import Place, Reach
+from crisalad_jax.synthetic.place import Place, Reach
 
 _EYE = 1.2
 _DOWN = (0.0, -1.0, 0.0)

@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from crisalad_jax.experiments.synthetic.corridor import corridor
-from crisalad_jax.experiments.synthetic.country import country
-from crisalad_jax.experiments.synthetic.place import Place
-from crisalad_jax.experiments.synthetic.street import street
-from crisalad_jax.experiments.synthetic.view import Scenery
+from crisalad_jax.synthetic.corridor import corridor
+from crisalad_jax.synthetic.country import country
+from crisalad_jax.synthetic.place import Place
+from crisalad_jax.synthetic.street import street
+from crisalad_jax.synthetic.view import Scenery
 
 _BUILDERS: Mapping[Scenery, Callable[[np.random.Generator], Place]] = {
     "street": street,

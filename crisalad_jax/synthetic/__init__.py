@@ -7,42 +7,23 @@ picture is taken); `materials`, `mesh`, `things`, `buildings` and `place` (the c
 (drawing); `city` and `world` (the files).
 """
 
-from crisalad_jax.experiments.synthetic.city import (
-    CITY_NAMES,
-    PLACE_SPACING,
-    RENDERER,
-    SyntheticCityConfig,
-    write_synthetic_city,
-)
-from crisalad_jax.experiments.synthetic.picture import render
-from crisalad_jax.experiments.synthetic.view import (
-    SCENERIES,
-    SEASONS,
-    TIMES,
-    WEATHERS,
-    Scenery,
-    Season,
-    Time,
-    View,
-    Weather,
-)
-from crisalad_jax.experiments.synthetic.world import WorldConfig, write_world
+from crisalad_jax.synthetic.city import SyntheticCityConfig, write_synthetic_city
+from crisalad_jax.synthetic.picture import render
+from crisalad_jax.synthetic.view import SCENERIES, SEASONS, TIMES, WEATHERS, Scenery, View
+from crisalad_jax.synthetic.world import VARIATIONS, Variation, WorldConfig, has_world, write_world
 
 __all__ = [
-    "CITY_NAMES",
-    "PLACE_SPACING",
-    "RENDERER",
     "SCENERIES",
     "SEASONS",
     "TIMES",
+    "VARIATIONS",
     "WEATHERS",
     "Scenery",
-    "Season",
     "SyntheticCityConfig",
-    "Time",
+    "Variation",
     "View",
-    "Weather",
     "WorldConfig",
+    "has_world",
     "render",
     "write_synthetic_city",
     "write_world",

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from crisalad_jax.experiments.synthetic.mesh import Scene
-from crisalad_jax.experiments.synthetic.view import View
+from crisalad_jax.synthetic.mesh import Scene
+from crisalad_jax.synthetic.view import View
 
 NEAR = 0.4
 """Metres from the camera to the plane behind which nothing is seen."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from crisalad_jax.experiments.synthetic.materials import (
+from crisalad_jax.synthetic.materials import (
     GLASS,
     ROOFS,
     SIGNS,
@@ -15,7 +15,7 @@ from crisalad_jax.experiments.synthetic.materials import (
     pick,
     scaled,
 )
-from crisalad_jax.experiments.synthetic.mesh import Front, Number, polygons, rectangles
+from crisalad_jax.synthetic.mesh import Front, Number, polygons, rectangles
 
 _TRIMS: tuple[Colour, ...] = (
     (0.88, 0.87, 0.84),

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from crisalad_jax.experiments.synthetic.buildings import DEPTH, Habit, building
-from crisalad_jax.experiments.synthetic.materials import (
+from crisalad_jax.synthetic.buildings import DEPTH, Habit, building
+from crisalad_jax.synthetic.materials import (
     SIGNS,
     WALLS,
     Colour,
@@ -11,7 +11,7 @@ from crisalad_jax.experiments.synthetic.materials import (
     pick,
     scaled,
 )
-from crisalad_jax.experiments.synthetic.mesh import (
+from crisalad_jax.synthetic.mesh import (
     GROUND_LAYER,
     TO_CAMERA,
     UP,
@@ -22,8 +22,8 @@ from crisalad_jax.experiments.synthetic.mesh import (
     polygons,
     rectangles,
 )
-from crisalad_jax.experiments.synthetic.place import Body, Place, Reach
-from crisalad_jax.experiments.synthetic.things import tree, wires
+from crisalad_jax.synthetic.place import Body, Place, Reach
+from crisalad_jax.synthetic.things import tree, wires
 
 _FIELDS: tuple[Colour, ...] = (
     (0.55, 0.50, 0.28),

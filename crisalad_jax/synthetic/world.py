@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from crisalad_jax.config.checks import check_seed, check_types
-from crisalad_jax.experiments.synthetic.city import (
+from crisalad_jax.synthetic.city import (
     METRES_PER_DEGREE,
     MONTHS,
     UTM_ORIGIN,
@@ -19,10 +19,10 @@ from crisalad_jax.experiments.synthetic.city import (
     write_gsv_table,
     write_jpeg,
 )
-from crisalad_jax.experiments.synthetic.picture import render
-from crisalad_jax.experiments.synthetic.place import Place
-from crisalad_jax.experiments.synthetic.scenes import build_place
-from crisalad_jax.experiments.synthetic.view import (
+from crisalad_jax.synthetic.picture import render
+from crisalad_jax.synthetic.place import Place
+from crisalad_jax.synthetic.scenes import build_place
+from crisalad_jax.synthetic.view import (
     SCENERIES,
     SEASONS,
     TIMES,

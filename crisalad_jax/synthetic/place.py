@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from crisalad_jax.experiments.synthetic.mesh import Scene
+from crisalad_jax.synthetic.mesh import Scene
 
 
 class Body(NamedTuple):

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from crisalad_jax.experiments.synthetic import (
+from crisalad_jax.synthetic import (
     SEASONS,
     SyntheticCityConfig,
     View,
     render,
     write_synthetic_city,
 )
-from crisalad_jax.experiments.synthetic.city import place_seed
+from crisalad_jax.synthetic.city import place_seed
 from crisalad_jax.utils.errors import InputError
 
 SMALL = SyntheticCityConfig(

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from crisalad_jax.experiments.synthetic.materials import WALLS, Kind, pick, scaled
-from crisalad_jax.experiments.synthetic.mesh import (
+from crisalad_jax.synthetic.materials import WALLS, Kind, pick, scaled
+from crisalad_jax.synthetic.mesh import (
     TO_CAMERA,
     Mesh,
     Vector,
