@@ -5,24 +5,25 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from crisalad_jax.synthetic.materials import (
+from crisalad_jax.synthetic.mesh import (
     GLASS,
     ROOFS,
     SIGNS,
     WALLS,
+    Body,
     Colour,
+    Front,
     Kind,
+    Number,
+    palette,
     pick,
+    polygons,
+    rectangles,
     scaled,
+    sheets,
 )
-from crisalad_jax.synthetic.mesh import Front, Number, polygons, rectangles
 
-_TRIMS: tuple[Colour, ...] = (
-    (0.88, 0.87, 0.84),
-    (0.30, 0.27, 0.25),
-    (0.70, 0.66, 0.58),
-    (0.24, 0.33, 0.30),
-)
+_TRIMS = palette("88 87 84, 30 27 25, 70 66 58, 24 33 30")
 
 
 class Habit(NamedTuple):
@@ -40,8 +41,8 @@ DEPTH = 11.0
 """Metres from a building's front to its back."""
 
 
-def building(rng: np.random.Generator, front: Front, width: float, habit: Habit) -> float:
-    """Add a building from u = 0 to `width`; return its height in metres."""
+def building(rng: np.random.Generator, front: Front, width: float, habit: Habit) -> Body:
+    """Add a building from u = 0 to `width`."""
     wall, trim = pick(rng, habit.walls), pick(rng, _TRIMS)
     floors = max(1, habit.floors + int(rng.integers(-2, 3)))
     ground = rng.uniform(3.2, 4.8)
@@ -49,7 +50,7 @@ def building(rng: np.random.Generator, front: Front, width: float, habit: Habit)
     height = ground + storey * floors + rng.uniform(0.2, 1.0)
 
     end = 0.0 if front.sees_start else width
-    side = polygons((end, 0, 0), (end, 0, -DEPTH), (end, height, -DEPTH), (end, height, 0))
+    side = sheets(end, 0, end, -DEPTH, 0, height)
     front.add(side, scaled(wall, 0.85), normal=front.end_normal)
     _roof(rng, front, width, height, wall)
     front.add(rectangles(0, 0, width, height), wall)
@@ -77,7 +78,9 @@ def building(rng: np.random.Generator, front: Front, width: float, habit: Habit)
         u, top = rng.uniform(0.15, 0.85) * width, ground + rng.uniform(1.0, 3.5)
         sign = (u - 0.1, ground - 0.2, u + 0.1, top)
         front.boxes(sign, rng.uniform(0.9, 1.5), pick(rng, SIGNS))
-    return height
+    corners = front.world(np.array(((0, 0, 0), (width, 0, -DEPTH))))
+    (x0, _, z0), (x1, _, z1) = np.sort(corners, axis=0)
+    return x0, x1, z0, z1, height
 
 
 def _axes(width: float, spacing: float) -> tuple[np.ndarray, float]:
@@ -109,19 +112,15 @@ def _roof(
         end = 0.0 if front.sees_start else width
         gable = polygons((end, height, 0), (end, height, -DEPTH), (end, ridge, back))
         front.add(gable, scaled(wall, 0.85), normal=front.end_normal)
-        slope = polygons(
-            (0, height, 0.3), (width, height, 0.3), (width, ridge, back), (0, ridge, back)
-        )
-        front.add(slope, tiles, Kind.ROOF, uphill)
+        front.add(rectangles(0, height, width, ridge, 0.3, back), tiles, Kind.ROOF, uphill)
         u = rng.uniform(0.1, 0.8) * width
         chimney = rectangles(u, (height + ridge) / 2, u + 0.9, ridge + 1.2, back * 0.7)
         front.add(chimney, scaled(wall, 0.8))
     elif shape == "gable":
         rise, steps = width * rng.uniform(0.3, 0.55), int(rng.integers(1, 5))
         if steps == 1:
-            front.add(
-                polygons((0, height, 0), (width, height, 0), (width / 2, height + rise, 0)), wall
-            )
+            gable = polygons((0, height, 0), (width, height, 0), (width / 2, height + rise, 0))
+            front.add(gable, wall)
         else:
             v = height + rise * np.arange(steps) / steps
             inset = width / 2 * np.arange(steps) / steps
@@ -131,8 +130,7 @@ def _roof(
         front.add(eye, GLASS, Kind.GLASS)
     elif shape == "mansard":
         top = height + rng.uniform(2.4, 3.4)
-        slope = polygons((0, height, 0), (width, height, 0), (width, top, -1), (0, top, -1))
-        front.add(slope, tiles, Kind.ROOF, uphill)
+        front.add(rectangles(0, height, width, top, 0, -1), tiles, Kind.ROOF, uphill)
         u, _ = _axes(width, rng.uniform(2.6, 4.5))
         dormers = rectangles(u - 0.75, height + 0.4, u + 0.75, top - 0.3, -0.1)
         front.add(dormers, scaled(wall, 1.1))
@@ -193,14 +191,13 @@ def _windows(
 
     if rng.random() < 0.6:
         front.add(rectangles(left - 0.22, v0 - 0.22, right + 0.22, v1 + 0.22), trim)
-    if style == "shafts":
-        front.add(rectangles(left, v0, right, v1), GLASS, Kind.GLASS)
-        u, v = np.tile(axis, len(levels) - 1), np.repeat(levels[1:], len(axis))
-        half = np.tile(halves, len(levels) - 1)
-        front.add(rectangles(u - half, v, u + half, v + 0.3), trim)
-        return
-    if style == "bands":
-        front.add(rectangles(left, v0, right, v1), GLASS, Kind.GLASS)
+    panes = rectangles(left, v0, right, v1)
+    if style != "grid":
+        front.add(panes, GLASS, Kind.GLASS)
+        if style == "shafts":
+            left, right = (np.tile(axis + sign * halves, len(levels) - 1) for sign in (-1, 1))
+            v = np.repeat(levels[1:], len(axis))
+            front.add(rectangles(left, v, right, v + 0.3), trim)
         return
     if rng.random() < 0.2:
         shutter = pick(rng, _TRIMS)
@@ -209,7 +206,7 @@ def _windows(
     if rng.random() < 0.22:
         _arches(front, u, half, v0, v1, GLASS, Kind.GLASS)
     else:
-        front.add(rectangles(left, v0, right, v1), GLASS, Kind.GLASS)
+        front.add(panes, GLASS, Kind.GLASS)
     if rng.random() < 0.45:
         front.add(rectangles(u - 0.06, v0, u + 0.06, v1), trim)
     if rng.random() < 0.5:
@@ -233,8 +230,7 @@ def _shops(rng: np.random.Generator, front: Front, width: float, lintel: float) 
         front.add(board, pick(rng, SIGNS))
         if rng.random() < 0.4:
             high, low, out = lintel + 0.2, lintel - 0.5, rng.uniform(1.0, 1.6)
-            awning = polygons((u0, high, 0), (u1, high, 0), (u1, low, out), (u0, low, out))
-            front.add(awning, pick(rng, SIGNS), Kind.LEDGE)
+            front.add(rectangles(u0, high, u1, low, 0, out), pick(rng, SIGNS), Kind.LEDGE)
 
 
 def _door(

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from crisalad_jax.synthetic.materials import Colour, Kind, scaled
-from crisalad_jax.synthetic.mesh import Scene
+from crisalad_jax.synthetic.mesh import Colour, Kind, Scene, scaled
 from crisalad_jax.synthetic.view import Season, Time, View, Weather
 
 

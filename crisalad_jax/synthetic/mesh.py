@@ -1,24 +1,117 @@
-"""The geometry of a scene, in metres: x to the right across the street, y up, z along it.
+"""The geometry of a place, in metres: x to the right across the street, y up, z along it.
 
 The camera of the default view stands at x = z = 0. A scene is a list of parts, painted from the far
 ones to the near.
 """
 
+import enum
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from crisalad_jax.synthetic.materials import Colour, Kind, scaled
 from crisalad_jax.synthetic.view import EYE
+
+Colour = tuple[float, float, float]
+"""Red, green and blue, 0 to 1."""
+Vector = tuple[float, float, float]
+Number = int | float | np.ndarray
+Body = tuple[float, float, float, float, float]
+"""A building's x0, x1, z0, z1 and height in metres, for its shadow."""
 
 GROUND_LAYER = 1e6
 """Smallest layer of parts on the ground, which are painted below every shadow."""
-UP = (0.0, 1.0, 0.0)
-TO_CAMERA = (0.0, 0.0, -1.0)
+UP: Vector = (0.0, 1.0, 0.0)
+DOWN: Vector = (0.0, -1.0, 0.0)
+TO_CAMERA: Vector = (0.0, 0.0, -1.0)
 
-Vector = tuple[float, float, float]
-Number = int | float | np.ndarray
+
+class Kind(enum.IntEnum):
+    """Material of a part, which decides how season and light change it."""
+
+    SOLID = 0
+    ROOF = 1
+    LEDGE = 2
+    PAVEMENT = 3
+    ROAD = 4
+    GRASS = 5
+    LEAF = 6
+    NEEDLE = 7
+    GLASS = 8
+    SHOP = 9
+    LAMP = 10
+    HEADLIGHT = 11
+    TAILLIGHT = 12
+    SOIL = 13
+    """A field or ballast: of its own colour, under snow in winter."""
+    BUSH = 14
+    """Leaves that are bare twigs in winter."""
+    WINDOW = 15
+    """An opening to the sky, seen from inside."""
+
+
+def palette(percents: str) -> tuple[Colour, ...]:
+    """Read colours from text: red, green and blue in percent, a comma between colours."""
+    rows = (map(int, colour.split()) for colour in percents.split(","))
+    return tuple((red / 100, green / 100, blue / 100) for red, green, blue in rows)
+
+
+WALLS = palette(
+    "55 29 23, 76 60 36, 84 78 64, 56 56 57, 70 60 48, 74 54 49, 58 66 72, 57 63 50, 86 85 82,"
+    "40 27 24, 66 64 61, 42 45 49, 70 42 30"
+)
+ROOFS = palette("52 27 20, 33 33 36, 42 34 29, 30 42 38")
+SIGNS = palette("70 16 14, 13 28 52, 12 40 24, 85 66 14, 20 18 20, 82 80 76")
+GLASS: Colour = (0.16, 0.20, 0.25)
+
+
+def scaled(colour: Colour, gain: float) -> Colour:
+    """Multiply a colour, or any other vector, by a number."""
+    return (colour[0] * gain, colour[1] * gain, colour[2] * gain)
+
+
+def pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
+    """Draw one of the colours, up to a share `spread` lighter or darker."""
+    colour = colours[rng.integers(len(colours))]
+    return scaled(colour, 1 + rng.uniform(-spread, spread))
+
+
+def polygons(*corners: tuple[Number, Number, Number]) -> Float[np.ndarray, "n corner 3"]:
+    """Make as many polygons as a coordinate's array has numbers; single numbers are repeated."""
+    numbers = [number for corner in corners for number in corner]
+    count = next((len(n) for n in numbers if isinstance(n, np.ndarray)), 1)
+    table = np.empty((count, len(numbers)))
+    for column, number in enumerate(numbers):
+        table[:, column] = number
+    return table.reshape(count, len(corners), 3)
+
+
+def rectangles(
+    x0: Number, y0: Number, x1: Number, y1: Number, z: Number = 0.0, top_z: Number | None = None
+) -> Float[np.ndarray, "n 4 3"]:
+    """Make rectangles between two edges along x, upright unless `top_z` differs from `z`."""
+    top_z = z if top_z is None else top_z
+    return polygons((x0, y0, z), (x1, y0, z), (x1, y1, top_z), (x0, y1, top_z))
+
+
+def flat(
+    x0: Number, z0: Number, x1: Number, z1: Number, y: float = 0.0
+) -> Float[np.ndarray, "n 4 3"]:
+    """Make level rectangles, on the ground unless a height `y` is given."""
+    return rectangles(x0, y, x1, y, z0, z1)
+
+
+def sheets(
+    x0: Number, z0: Number, x1: Number, z1: Number, low: Number, high: Number, lean: Number = 0.0
+) -> Float[np.ndarray, "n 4 3"]:
+    """Make upright sheets over lines on the ground; their tops are moved along x by `lean`."""
+    return polygons((x0, low, z0), (x1, low, z1), (x1 + lean, high, z1), (x0 + lean, high, z0))
+
+
+def discs(x: Number, y: Number, radius: Number, z: float) -> Float[np.ndarray, "n 10 3"]:
+    """Make round polygons that face the camera."""
+    angles = np.arange(10) * (2 * np.pi / 10)
+    return polygons(*((x + radius * np.cos(a), y + radius * np.sin(a), z) for a in angles))
 
 
 class Scene(NamedTuple):
@@ -32,11 +125,6 @@ class Scene(NamedTuple):
     kind: Int[np.ndarray, " part"]
     layer: Float[np.ndarray, " part"]
     """Painting order: larger is farther away."""
-
-
-def join_scenes(first: Scene, second: Scene) -> Scene:
-    """Join the parts of the first scene and those of the second."""
-    return Scene(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
 
 class Mesh:
@@ -55,72 +143,56 @@ class Mesh:
         self,
         polygons: Float[np.ndarray, "polygon corner 3"],
         albedo: Colour,
-        normal: Vector,
         kind: Kind = Kind.SOLID,
+        normal: Vector = TO_CAMERA,
+        layer: float | None = None,
     ) -> None:
-        """Add a part in the present layer; without polygons it is left out."""
+        """Add a part in a layer, the mesh's unless given; without polygons it is left out."""
         count, corners, _ = polygons.shape
         if count:
             self._points.append(polygons.reshape(-1, 3))
             self._polygon_sizes.append(np.full(count, corners))
-            self._parts.append((count, albedo, normal, int(kind), self.layer))
+            layer = self.layer if layer is None else layer
+            self._parts.append((count, albedo, normal, int(kind), layer))
+
+    def ground(
+        self, level: int, polygons: np.ndarray, albedo: Colour, kind: Kind = Kind.SOLID
+    ) -> None:
+        """Add a part of the ground; those of a larger level are painted first."""
+        self.add(polygons, albedo, kind, UP, GROUND_LAYER + level)
+
+    def block(self, low: Vector, high: Vector, albedo: Colour) -> None:
+        """Add an upright box: its top, its side towards the middle of the street, its front."""
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        x, outwards = (x1, 1.0) if x0 + x1 < 0 else (x0, -1.0)
+        self.add(flat(x0, z0, x1, z1, y1), albedo, Kind.ROOF, UP)
+        self.add(sheets(x, z0, x, z1, y0, y1), albedo, normal=(outwards, 0.0, 0.0))
+        self.add(rectangles(x0, y0, x1, y1, z0), albedo)
 
     def scene(self) -> Scene:
         """Make a scene of all parts, of which there has to be at least one."""
-        counts, albedo, normal, kind, layer = zip(*self._parts, strict=True)
-        return Scene(
-            np.concatenate(self._points),
-            np.concatenate(self._polygon_sizes),
-            np.array(counts),
-            np.array(albedo, np.float64),
-            np.array(normal, np.float64),
-            np.array(kind),
-            np.array(layer, np.float64),
-        )
-
-
-def polygons(*corners: tuple[Number, Number, Number]) -> Float[np.ndarray, "n corner 3"]:
-    """Make as many polygons as a coordinate's array has numbers; single numbers are repeated."""
-    numbers = [number for corner in corners for number in corner]
-    count = next((len(n) for n in numbers if isinstance(n, np.ndarray)), 1)
-    table = np.empty((count, len(numbers)))
-    for column, number in enumerate(numbers):
-        table[:, column] = number
-    return table.reshape(count, len(corners), 3)
-
-
-def rectangles(
-    x0: Number, y0: Number, x1: Number, y1: Number, z: Number = 0.0
-) -> Float[np.ndarray, "n 4 3"]:
-    """Make upright rectangles that face along the third axis."""
-    return polygons((x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z))
-
-
-def flat(x0: Number, z0: Number, x1: Number, z1: Number) -> Float[np.ndarray, "n 4 3"]:
-    """Make rectangles on the ground."""
-    return polygons((x0, 0.0, z0), (x1, 0.0, z0), (x1, 0.0, z1), (x0, 0.0, z1))
-
-
-def discs(x: Number, y: Number, radius: Number, z: float) -> Float[np.ndarray, "n 10 3"]:
-    """Make round polygons that face the camera."""
-    angles = np.arange(10) * (2 * np.pi / 10)
-    return polygons(*((x + radius * np.cos(a), y + radius * np.sin(a), z) for a in angles))
+        counts, albedo, normal, kind, layer = map(np.array, zip(*self._parts, strict=True))
+        points, sizes = np.concatenate(self._points), np.concatenate(self._polygon_sizes)
+        return Scene(points, sizes, counts, albedo, normal, kind, layer)
 
 
 class Front:
     """A vertical plane for parts: u runs along it, v up, d out of it towards the street."""
 
-    def __init__(
-        self, mesh: Mesh, origin: Vector, along: Vector, normal: Vector, *, sees_start: bool
-    ) -> None:
-        """Place the plane in the world: `origin` in metres, unit `along` and `normal`."""
+    def __init__(self, mesh: Mesh, x: float, z: float, side: float) -> None:
+        """Place the plane's foot; `side` of the street is -1 or 1, or 0 for a plane across it."""
         self.mesh = mesh
-        self.normal = normal
-        self.sees_start = sees_start
+        self.sees_start = side != 0 or x > 0
         """Whether the camera sees the ends towards small u, or those towards large u."""
-        self.end_normal = scaled(along, -1.0 if sees_start else 1.0)
-        self._origin = np.array(origin)
-        self._axes = np.array((along, UP, normal))
+        along = (0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0)
+        self.normal: Vector = (-side, 0.0, 0.0) if side else TO_CAMERA
+        self.end_normal = scaled(along, -1.0 if self.sees_start else 1.0)
+        self._origin = np.array((x, 0.0, z))
+        self._axes = np.array((along, UP, self.normal))
+
+    def world(self, uvd: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Convert the plane's metres to the world's."""
+        return uvd @ self._axes + self._origin
 
     def add(
         self,
@@ -130,7 +202,7 @@ class Front:
         normal: Vector | None = None,
     ) -> None:
         """Add polygons in the plane's own metres; they face out of it unless `normal` differs."""
-        self.mesh.add(uvd @ self._axes + self._origin, albedo, normal or self.normal, kind)
+        self.mesh.add(self.world(uvd), albedo, kind, normal or self.normal)
 
     def boxes(
         self,
@@ -141,29 +213,53 @@ class Front:
     ) -> None:
         """Add protruding boxes u0, v0, u1, v1: the visible end, the top or underside, the front."""
         u0, v0, u1, v1 = rects
-        u = u0 if self.sees_start else u1
-        end = polygons((u, v0, 0.0), (u, v0, out), (u, v1, out), (u, v1, 0.0))
-        self.add(end, albedo, normal=self.end_normal)
+        end = u0 if self.sees_start else u1
+        self.add(sheets(end, 0.0, end, out, v0, v1), albedo, normal=self.end_normal)
         above = float(np.min(v0)) > self.mesh.eye
         v = v0 if above else v1
-        level = polygons((u0, v, 0.0), (u1, v, 0.0), (u1, v, out), (u0, v, out))
-        self.add(level, albedo, normal=(0.0, -1.0, 0.0) if above else UP)
+        self.add(rectangles(u0, v, u1, v, 0.0, out), albedo, normal=DOWN if above else UP)
         self.add(rectangles(u0, v0, u1, v1, out), albedo, kind)
 
 
-def street_front(mesh: Mesh, x: float, z: float) -> Front:
-    """Make a plane along the street that faces its middle."""
-    normal = (1.0 if x < 0 else -1.0, 0.0, 0.0)
-    return Front(mesh, (x, 0.0, z), (0.0, 0.0, 1.0), normal, sees_start=True)
+class Reach(NamedTuple):
+    """Where cameras stand in a place."""
+
+    height: tuple[float, float]
+    """Least and most metres from the ground."""
+    lateral: float
+    """Most metres to the side."""
+    forward: float
+    """Most metres along it, from a station."""
+    step: float
+    """Metres from one station to the next, which are places of their own that look alike."""
 
 
-def block(mesh: Mesh, low: Vector, high: Vector, albedo: Colour) -> None:
-    """Add an upright box: its top, its side towards the middle of the street, its near face."""
-    (x0, y0, z0), (x1, y1, z1) = low, high
-    left = x0 + x1 < 0
-    x = x1 if left else x0
-    top = polygons((x0, y1, z0), (x1, y1, z0), (x1, y1, z1), (x0, y1, z1))
-    side = polygons((x, y0, z0), (x, y0, z1), (x, y1, z1), (x, y1, z0))
-    mesh.add(top, albedo, UP, Kind.ROOF)
-    mesh.add(side, albedo, (1.0 if left else -1.0, 0.0, 0.0))
-    mesh.add(rectangles(x0, y0, x1, y1, z0), albedo, TO_CAMERA)
+class Place(NamedTuple):
+    """The scene of one place, and the orientation of its street."""
+
+    scene: Scene
+    heading: float
+    """Direction of the default view in degrees clockwise from the street."""
+    lanes: tuple[float, float, float, float]
+    """x of the left fronts, the left kerb, the right kerb and the right fronts."""
+    reach: Reach
+    bearing: float = 0.0
+    """Direction of the street in degrees clockwise from north."""
+    hills: Float[np.ndarray, " bearing"] = np.zeros(96)
+    """Height of the hills over the horizon, as a tangent, at equal steps around the compass."""
+    bodies: tuple[Body, ...] = ()
+    lamps: Float[np.ndarray, "lamp 3"] = np.zeros((0, 3))
+    indoors: bool = False
+    traffic: bool = True
+    """Whether vehicles pass; people do everywhere."""
+
+
+def draw_hills(rng: np.random.Generator, most: float) -> Float[np.ndarray, " bearing"]:
+    """Draw the hills of a place, no steeper than the tangent `most`."""
+    ridge = rng.uniform(0.0, 1.0, 24) ** 2 * rng.uniform(0.02, most)
+    return np.interp(np.arange(96), np.arange(24) * 4.0, ridge, period=96)
+
+
+def join_scenes(first: Scene, second: Scene) -> Scene:
+    """Join the parts of the first scene and those of the second."""
+    return Scene(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))

@@ -23,11 +23,9 @@ from crisalad_jax.synthetic.light import (
     shining,
     sun_direction,
 )
-from crisalad_jax.synthetic.materials import Kind
-from crisalad_jax.synthetic.mesh import GROUND_LAYER, Scene, join_scenes
-from crisalad_jax.synthetic.place import Place
+from crisalad_jax.synthetic.mesh import GROUND_LAYER, Kind, Place, Scene, join_scenes
 from crisalad_jax.synthetic.scenes import build_place
-from crisalad_jax.synthetic.traffic import build_passers
+from crisalad_jax.synthetic.things import build_passers
 from crisalad_jax.synthetic.view import Scenery, View, check_size
 from crisalad_jax.utils.errors import InputError
 

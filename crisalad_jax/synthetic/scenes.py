@@ -7,7 +7,7 @@ import numpy as np
 
 from crisalad_jax.synthetic.corridor import corridor
 from crisalad_jax.synthetic.country import country
-from crisalad_jax.synthetic.place import Place
+from crisalad_jax.synthetic.mesh import Place
 from crisalad_jax.synthetic.street import street
 from crisalad_jax.synthetic.view import Scenery
 

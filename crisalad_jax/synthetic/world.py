@@ -19,8 +19,8 @@ from crisalad_jax.synthetic.city import (
     write_gsv_table,
     write_jpeg,
 )
+from crisalad_jax.synthetic.mesh import Place
 from crisalad_jax.synthetic.picture import render
-from crisalad_jax.synthetic.place import Place
 from crisalad_jax.synthetic.scenes import build_place
 from crisalad_jax.synthetic.view import (
     SCENERIES,
