@@ -15,6 +15,7 @@ from crisalad_jax.synthetic.mesh import (
     Front,
     Kind,
     Number,
+    Rng,
     palette,
     pick,
     polygons,
@@ -41,7 +42,7 @@ DEPTH = 11.0
 """Metres from a building's front to its back."""
 
 
-def building(rng: np.random.Generator, front: Front, width: float, habit: Habit) -> Body:
+def building(rng: Rng, front: Front, width: float, habit: Habit) -> Body:
     """Add a building from u = 0 to `width`."""
     wall, trim = pick(rng, habit.walls), pick(rng, _TRIMS)
     floors = max(1, habit.floors + int(rng.integers(-2, 3)))
@@ -99,9 +100,7 @@ def _arches(
     front.add(arch, albedo, kind)
 
 
-def _roof(
-    rng: np.random.Generator, front: Front, width: float, height: float, wall: Colour
-) -> None:
+def _roof(rng: Rng, front: Front, width: float, height: float, wall: Colour) -> None:
     """Add a pitched, gabled, mansard or flat roof, with dormers, chimneys or tanks."""
     tiles = pick(rng, ROOFS)
     shape = rng.choice(("pitched", "gable", "mansard", "flat"), p=(0.3, 0.17, 0.15, 0.38))
@@ -151,7 +150,7 @@ def _roof(
 
 
 def _windows(
-    rng: np.random.Generator,
+    rng: Rng,
     front: Front,
     width: float,
     levels: Float[np.ndarray, " floor"],
@@ -218,7 +217,7 @@ def _windows(
             front.boxes(rects, 0.9, trim)
 
 
-def _shops(rng: np.random.Generator, front: Front, width: float, lintel: float) -> None:
+def _shops(rng: Rng, front: Front, width: float, lintel: float) -> None:
     """Add shop windows, each with a door and a sign, some with an awning."""
     middle, span = _axes(width, rng.uniform(4.0, 8.0))
     start = middle - span / 2
@@ -233,9 +232,7 @@ def _shops(rng: np.random.Generator, front: Front, width: float, lintel: float) 
             front.add(rectangles(u0, high, u1, low, 0, out), pick(rng, SIGNS), Kind.LEDGE)
 
 
-def _door(
-    rng: np.random.Generator, front: Front, width: float, lintel: float, trim: Colour
-) -> None:
+def _door(rng: Rng, front: Front, width: float, lintel: float, trim: Colour) -> None:
     """Add a house door between windows."""
     u, _ = _axes(width, rng.uniform(2.4, 4.0))
     at = int(rng.integers(len(u)))

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from crisalad_jax.config.checks import check_seed, check_types
-from crisalad_jax.synthetic.picture import render
-from crisalad_jax.synthetic.scenes import build_place
+from crisalad_jax.synthetic.picture import build_place, render
 from crisalad_jax.synthetic.view import (
     EYE,
     PITCH,

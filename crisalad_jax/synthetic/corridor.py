@@ -15,6 +15,7 @@ from crisalad_jax.synthetic.mesh import (
     Mesh,
     Place,
     Reach,
+    Rng,
     discs,
     flat,
     palette,
@@ -40,7 +41,7 @@ class _Box(NamedTuple):
     length: float
 
 
-def corridor(rng: np.random.Generator) -> Place:
+def corridor(rng: Rng) -> Place:
     """Build a corridor; one in four is a wide hall with columns."""
     mesh = Mesh(_EYE)
     hall = rng.random() < 0.25
@@ -83,7 +84,7 @@ def corridor(rng: np.random.Generator) -> Place:
     return Place(mesh.scene(), heading, lanes, reach, indoors=True, traffic=False)
 
 
-def _floor(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
+def _floor(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add the floor, with tiles, a carpet, planks or spots."""
     left, right, _, length = box
     colour = pick(rng, _FLOORS)
@@ -119,7 +120,7 @@ def _floor(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
     mesh.ground(-1, spots, scaled(colour, rng.uniform(0.6, 1.3)))
 
 
-def _ceiling(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
+def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add the ceiling: plain, of panels, with beams, pipes or a skylight; and its lamps."""
     left, right, height, length = box
     colour = pick(rng, _CEILINGS)
@@ -162,7 +163,7 @@ def _ceiling(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
             mesh.add(pipe, pick(rng, SIGNS + WALLS), normal=DOWN)
 
 
-def _end(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
+def _end(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add what closes the corridor: a wall, a door, a window, or a way on."""
     left, right, height, length = box
     wall = pick(rng, WALLS)
@@ -192,7 +193,7 @@ def _end(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
         mesh.add(inner, scaled(wall, shade * rng.uniform(0.5, 1.5)))
 
 
-def _stains(front: Front, rng: np.random.Generator, wall: Colour, box: _Box) -> None:
+def _stains(front: Front, rng: Rng, wall: Colour, box: _Box) -> None:
     """Add bricks, panels or spots to a wall."""
     height, length = box.height, box.length
     kind = rng.choice(("none", "bricks", "panels", "spots"), p=(0.4, 0.15, 0.2, 0.25))
@@ -213,7 +214,7 @@ def _stains(front: Front, rng: np.random.Generator, wall: Colour, box: _Box) -> 
         front.add(spots, scaled(wall, rng.uniform(0.75, 1.2)))
 
 
-def _along_wall(front: Front, rng: np.random.Generator, box: _Box) -> None:
+def _along_wall(front: Front, rng: Rng, box: _Box) -> None:
     """Add doors, windows, boards and furniture along one wall, each at its place."""
     doors, trim = pick(rng, _WOOD), scaled(pick(rng, _WOOD), 0.9)
     # What recurs in this corridor; the distances, and what comes between, make the place.
@@ -259,7 +260,7 @@ def _along_wall(front: Front, rng: np.random.Generator, box: _Box) -> None:
 
 def _door(
     front: Front,
-    rng: np.random.Generator,
+    rng: Rng,
     z: float,
     wide: float,
     top: float,
@@ -281,9 +282,7 @@ def _door(
         front.add(rectangles(end + 0.15, 1.4, end + 0.4, 1.6), pick(rng, SIGNS))
 
 
-def _furniture(
-    front: Front, rng: np.random.Generator, kind: str, z: float, wide: float, height: float
-) -> None:
+def _furniture(front: Front, rng: Rng, kind: str, z: float, wide: float, height: float) -> None:
     """Add what stands out of the wall: a pillar, a cupboard, a bench, a pipe or a box."""
     front.mesh.layer = z
     colour = pick(rng, _WOOD + WALLS)
@@ -307,7 +306,7 @@ def _furniture(
         front.add(gap, scaled(colour, 0.6))
 
 
-def _columns(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
+def _columns(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add two rows of columns, or one."""
     stone, half = pick(rng, WALLS), rng.uniform(0.15, 0.45)
     rows = (box.left * 0.6, box.right * 0.6) if rng.random() < 0.7 else (box.right * 0.5,)
@@ -317,7 +316,7 @@ def _columns(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
             mesh.block((x - half, 0, z), (x + half, box.height, z + 2 * half), stone)
 
 
-def _hanging(mesh: Mesh, rng: np.random.Generator, box: _Box) -> None:
+def _hanging(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add signs under the ceiling, and things that stand about on the floor."""
     left, right, height, length = box
     for z in rng.uniform(4.0, length, int(rng.integers(0, 4))):

@@ -13,6 +13,7 @@ from crisalad_jax.synthetic.mesh import (
     Mesh,
     Place,
     Reach,
+    Rng,
     draw_hills,
     flat,
     palette,
@@ -34,7 +35,7 @@ _FAR = 140.0
 class _Way:
     """The course of the way: x of its middle, a parabola through the camera's foot."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: Rng) -> None:
         self._bend = rng.normal(0.0, 0.0022)
         self._drift = rng.normal(0.0, 0.05)
 
@@ -53,7 +54,7 @@ class _Way:
         return self.band(z[:-1], z[1:], low, high)
 
 
-def country(rng: np.random.Generator) -> Place:
+def country(rng: Rng) -> Place:
     """Build a place in the country."""
     mesh = Mesh()
     way = _Way(rng)
@@ -83,7 +84,7 @@ def country(rng: np.random.Generator) -> Place:
     )
 
 
-def _fields(mesh: Mesh, rng: np.random.Generator) -> None:
+def _fields(mesh: Mesh, rng: Rng) -> None:
     """Add a meadow, fields and tufts."""
     # In bands, because a part has one depth, whose haze it gets.
     for near, far in ((300, 2500), (120, 300), (50, 120), (15, 50), (-20, 15)):
@@ -106,7 +107,7 @@ def _fields(mesh: Mesh, rng: np.random.Generator) -> None:
         mesh.ground(7, half, pick(rng, _FIELDS), Kind.SOIL)
 
 
-def _lay(mesh: Mesh, rng: np.random.Generator, way: _Way, kind: str) -> float:
+def _lay(mesh: Mesh, rng: Rng, way: _Way, kind: str) -> float:
     """Add the way; return half of its width in metres."""
     if kind == "railway":
         return _railway(mesh, rng, way)
@@ -121,7 +122,7 @@ def _lay(mesh: Mesh, rng: np.random.Generator, way: _Way, kind: str) -> float:
     return half
 
 
-def _road(mesh: Mesh, rng: np.random.Generator, way: _Way) -> float:
+def _road(mesh: Mesh, rng: Rng, way: _Way) -> float:
     half = rng.uniform(2.2, 5.0)
     asphalt, white = pick(rng, _ASPHALT), (0.80, 0.80, 0.76)
     mesh.ground(6, way.strip(-half - 0.6, half + 0.6), pick(rng, _STONES), Kind.SOIL)
@@ -135,7 +136,7 @@ def _road(mesh: Mesh, rng: np.random.Generator, way: _Way) -> float:
     return half
 
 
-def _railway(mesh: Mesh, rng: np.random.Generator, way: _Way) -> float:
+def _railway(mesh: Mesh, rng: Rng, way: _Way) -> float:
     """Add one track or two, at times with masts and wires."""
     tracks = (0.0,) if rng.random() < 0.6 else (-2.2, 2.2)
     half = abs(tracks[-1]) + 2.0
@@ -151,7 +152,7 @@ def _railway(mesh: Mesh, rng: np.random.Generator, way: _Way) -> float:
     return half
 
 
-def _masts(mesh: Mesh, rng: np.random.Generator, way: _Way, half: float) -> None:
+def _masts(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     """Add the masts and wires of an electric railway."""
     side, gap = float(rng.choice((-1, 1))), rng.uniform(28.0, 50.0)
     steel = (0.36, 0.37, 0.36)
@@ -167,7 +168,7 @@ def _masts(mesh: Mesh, rng: np.random.Generator, way: _Way, half: float) -> None
         mesh.add(wire, (0.15, 0.15, 0.16), layer=1.0)
 
 
-def _border(mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: float) -> None:
+def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
     """Add a hedge, a wall, a fence, a crash barrier or a cutting along one side of the way."""
     kinds = ("none", "hedge", "wall", "fence", "barrier", "bank")
     kind = rng.choice(kinds, p=(0.3, 0.16, 0.1, 0.2, 0.08, 0.16))
@@ -206,7 +207,7 @@ def _border(mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: 
             mesh.add(rectangles(x0 - 0.06, 0, x0 + 0.06, 1.0, z), (0.42, 0.38, 0.33))
 
 
-def _woods(mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: float) -> None:
+def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
     """Add woods as outlines at several distances, and single trees before them."""
     for z in sorted(rng.uniform(18, 300, int(rng.integers(1, 6))), reverse=True):
         if rng.random() < 0.3:
@@ -238,7 +239,7 @@ def _woods(mesh: Mesh, rng: np.random.Generator, way: _Way, side: float, half: f
         tree(mesh, rng, float(way.at(z)) + side * off, float(z))
 
 
-def _houses(mesh: Mesh, rng: np.random.Generator, way: _Way, half: float) -> list[Body]:
+def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> list[Body]:
     """Add a few houses or barns."""
     bodies = []
     walls = tuple(WALLS[i] for i in rng.choice(len(WALLS), 3, replace=False))
@@ -252,7 +253,7 @@ def _houses(mesh: Mesh, rng: np.random.Generator, way: _Way, half: float) -> lis
     return bodies
 
 
-def _roadside(mesh: Mesh, rng: np.random.Generator, way: _Way, half: float) -> None:
+def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     """Add a sign or a rock."""
     for z in rng.uniform(5, 40, int(rng.integers(0, 3))):
         mesh.layer = float(z)

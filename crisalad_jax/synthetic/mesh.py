@@ -16,6 +16,7 @@ Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
 Number = int | float | np.ndarray
+Rng = np.random.Generator
 Body = tuple[float, float, float, float, float]
 """A building's x0, x1, z0, z1 and height in metres, for its shadow."""
 
@@ -258,8 +259,3 @@ def draw_hills(rng: np.random.Generator, most: float) -> Float[np.ndarray, " bea
     """Draw the hills of a place, no steeper than the tangent `most`."""
     ridge = rng.uniform(0.0, 1.0, 24) ** 2 * rng.uniform(0.02, most)
     return np.interp(np.arange(96), np.arange(24) * 4.0, ridge, period=96)
-
-
-def join_scenes(first: Scene, second: Scene) -> Scene:
-    """Join the parts of the first scene and those of the second."""
-    return Scene(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))

@@ -13,6 +13,7 @@ from crisalad_jax.synthetic.mesh import (
     Mesh,
     Place,
     Reach,
+    Rng,
     Vector,
     draw_hills,
     flat,
@@ -28,7 +29,7 @@ _PAVING = palette("56 54 51, 62 58 52, 50 50 50")
 _ASPHALT = palette("30 30 31, 36 35 34, 42 38 35")
 
 
-def street(rng: np.random.Generator) -> Place:
+def street(rng: Rng) -> Place:
     """Build a street of a city."""
     mesh = Mesh()
     walls = tuple(WALLS[i] for i in rng.choice(len(WALLS), 5, replace=False))
@@ -76,9 +77,7 @@ def street(rng: np.random.Generator) -> Place:
     )
 
 
-def _ground(
-    mesh: Mesh, rng: np.random.Generator, kerbs: tuple[float, float], length: float
-) -> None:
+def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> None:
     """Add pavements, the street, the crossing at its far end, and their lines."""
     paving, asphalt = pick(rng, _PAVING), pick(rng, _ASPHALT)
     left, right = kerbs
@@ -105,7 +104,7 @@ def _ground(
         mesh.ground(6, flat(x - 0.07, -5, x + 0.07, length), (0.20, 0.20, 0.21))
 
 
-def _skyline(mesh: Mesh, rng: np.random.Generator, length: float) -> None:
+def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
     """Add distant towers, and at times a steeple: landmarks that barely move."""
     for _ in range(int(rng.integers(0, 6))):
         z = length + rng.uniform(90, 320)
@@ -135,7 +134,7 @@ def _skyline(mesh: Mesh, rng: np.random.Generator, length: float) -> None:
         mesh.add(bell, (0.12, 0.12, 0.13))
 
 
-def _far_row(mesh: Mesh, rng: np.random.Generator, length: float, habit: Habit) -> list[Body]:
+def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
     """Add the row that closes the street, at varying distances and at times with a gap."""
     reach = 14 + length * 0.7
     stands: list[tuple[float, float, float]] = []
@@ -152,9 +151,7 @@ def _far_row(mesh: Mesh, rng: np.random.Generator, length: float, habit: Habit) 
     return bodies
 
 
-def _row(
-    mesh: Mesh, rng: np.random.Generator, x: float, side: float, length: float, habit: Habit
-) -> list[Body]:
+def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habit) -> list[Body]:
     """Add one side of the street, from the camera to the crossing, with gaps and setbacks."""
     bodies = []
     z = rng.uniform(-9.0, -2.0)
@@ -170,7 +167,7 @@ def _row(
     return bodies
 
 
-def _park(mesh: Mesh, rng: np.random.Generator, x: float, side: float, length: float) -> None:
+def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:
     """Add lawn and trees behind a wall, on a side without houses."""
     mesh.ground(5, flat(x, -5, x + side * 90, length), (0.40, 0.48, 0.30), Kind.GRASS)
     for z in np.arange(rng.uniform(10, 16), length, rng.uniform(5.0, 9.0)):

@@ -12,6 +12,7 @@ from crisalad_jax.synthetic.mesh import (
     Front,
     Kind,
     Mesh,
+    Rng,
     Scene,
     Vector,
     discs,
@@ -28,7 +29,7 @@ _TYRE: Colour = (0.05, 0.05, 0.05)
 _TINTED: Colour = (0.10, 0.12, 0.14)
 
 
-def tree(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     """Add a broad-leaved tree, bare in winter, or an evergreen conifer."""
     mesh.layer = z
     height = rng.uniform(4.5, 8.5)
@@ -72,7 +73,7 @@ def lamp(mesh: Mesh, x: float, z: float, height: float) -> Vector:
     return (tip, height - 0.2, z)
 
 
-def wires(mesh: Mesh, rng: np.random.Generator, x: float, length: float) -> None:
+def wires(mesh: Mesh, rng: Rng, x: float, length: float) -> None:
     """Add a line of poles with sagging wires."""
     height, gap = rng.uniform(7.0, 9.0), rng.uniform(14.0, 20.0)
     t = np.linspace(0, 1, 7)
@@ -89,7 +90,7 @@ def wires(mesh: Mesh, rng: np.random.Generator, x: float, length: float) -> None
             mesh.add(wire, (0.12, 0.12, 0.13))
 
 
-def monument(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     """Add a column with a ball, or an obelisk, on a plinth in the street."""
     mesh.layer = z
     stone = pick(rng, WALLS[2:9])
@@ -138,9 +139,7 @@ def build_passers(
     return mesh.scene()
 
 
-def _vehicle(
-    mesh: Mesh, rng: np.random.Generator, x: float, z: float, *, bus: bool, away: bool
-) -> None:
+def _vehicle(mesh: Mesh, rng: Rng, x: float, z: float, *, bus: bool, away: bool) -> None:
     """Add a car or a bus in its lane; the camera sees its rear if it drives away."""
     paint = pick(rng, SIGNS if bus else _PAINT)
     half, length, height = (1.25, 10.5, 3.0) if bus else (0.9, 4.3, 0.95)
@@ -168,7 +167,7 @@ def _vehicle(
         mesh.add(lights, (0.90, 0.90, 0.82), Kind.HEADLIGHT)
 
 
-def _person(mesh: Mesh, rng: np.random.Generator, x: float, z: float) -> None:
+def _person(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     mesh.layer = z
     tall, stride = rng.uniform(0.9, 1.08), rng.uniform(0.05, 0.3)
     hip, foot = np.array((-0.1, 0.1)) + x, np.array((-stride, stride)) + x

@@ -20,8 +20,7 @@ from crisalad_jax.synthetic.city import (
     write_jpeg,
 )
 from crisalad_jax.synthetic.mesh import Place
-from crisalad_jax.synthetic.picture import render
-from crisalad_jax.synthetic.scenes import build_place
+from crisalad_jax.synthetic.picture import build_place, render
 from crisalad_jax.synthetic.view import (
     SCENERIES,
     SEASONS,
@@ -29,7 +28,7 @@ from crisalad_jax.synthetic.view import (
     WEATHERS,
     Scenery,
     View,
-    check_repaint,
+    check_range,
     check_size,
 )
 from crisalad_jax.utils.errors import InputError
@@ -86,7 +85,7 @@ class WorldConfig:
             value = getattr(self, name)
             if value < 1:
                 raise InputError(f"WorldConfig.{name}: found {value}, expected at least 1")
-        check_repaint("WorldConfig.repaint", self.repaint)
+        check_range("WorldConfig.repaint", self.repaint, 0, 3)
         if not self.sceneries:
             raise InputError("WorldConfig.sceneries: found (), expected at least one scenery")
         check_seed("WorldConfig.seed", self.seed)
