@@ -58,11 +58,12 @@ def run(arguments: Render) -> None:
     given = {name: value for name, value in vars(arguments).items() if name in fields}
     config = WorldConfig(**given)
     places = config.scenes * config.stations
-    total = places + config.test_scenes * config.stations
     is_there = has_world(arguments.out, config)  # a wrong folder is told before there is a bar
     if not is_there:
-        with progress_bar("rendering the world", total, "places", quiet=arguments.quiet) as bar:
-            write_world(arguments.out, config, progress=lambda done, total: bar.advance(1))
+        with progress_bar(
+            "rendering the world", config.images, "images", quiet=arguments.quiet
+        ) as bar:
+            write_world(arguments.out, config, progress=bar.advance)
     tests = config.test_scenes * config.stations
     say(
         f"{arguments.out}: {'there already, ' * is_there}{counted(places, 'place')} with "
