@@ -10,17 +10,17 @@ from crisalad_jax.synthetic.mesh import (
     SIGNS,
     WALLS,
     Colour,
-    Front,
     Kind,
     Mesh,
     Place,
     Reach,
     Rng,
+    bars,
     discs,
     flat,
     palette,
     pick,
-    rectangles,
+    rects,
     scaled,
 )
 
@@ -60,14 +60,14 @@ def corridor(rng: Rng) -> Place:
     _ceiling(mesh, rng, box)
     _end(mesh, rng, box)
     for x, side, wall in ((box.left, -1.0, walls[0]), (box.right, 1.0, walls[1])):
-        front = Front(mesh, x, 0.0, side)
+        front = mesh.front(x, 0.0, side)
         mesh.layer = GROUND_LAYER - 10
-        front.add(rectangles(_START, 0, length, height), wall)
+        front.add(rects(_START, 0, length, height), wall)
         _stains(front, rng, wall, box)
         if band:
-            front.add(rectangles(_START, 0, length, band), dado)
-            front.add(rectangles(_START, band, length, band + 0.06), skirting)
-        front.add(rectangles(_START, 0, length, 0.12), skirting)
+            front.add(rects(_START, 0, length, band), dado)
+            front.add(rects(_START, band, length, band + 0.06), skirting)
+        front.add(rects(_START, 0, length, 0.12), skirting)
         _along_wall(front, rng, box)
     if hall or rng.random() < 0.15:
         _columns(mesh, rng, box)
@@ -152,7 +152,7 @@ def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
         depth = rng.uniform(0.15, 0.6)
         for at in np.arange(length - rng.uniform(0.5, 2), 0, -rng.uniform(2.0, 5.0)):
             mesh.layer = float(at)
-            mesh.add(rectangles(left, height - depth, right, height, at), scaled(colour, 0.8))
+            mesh.add(rects(left, height - depth, right, height, at), scaled(colour, 0.8))
             under = flat(left, at, right, at + 0.3, height - depth)
             mesh.add(under, scaled(colour, 0.9), normal=DOWN)
     if rng.random() < 0.3:
@@ -167,7 +167,7 @@ def _end(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add what closes the corridor: a wall, a door, a window, or a way on."""
     left, right, height, length = box
     wall = pick(rng, WALLS)
-    mesh.add(rectangles(left, 0, right, height, length), wall, layer=GROUND_LAYER - 8)
+    mesh.add(rects(left, 0, right, height, length), wall, layer=GROUND_LAYER - 8)
     mesh.layer = GROUND_LAYER - 9
     middle, half = rng.uniform(0.3, 0.7) * (right - left) + left, rng.uniform(0.2, 0.45)
     half *= min(right - left, 3.0)
@@ -175,46 +175,46 @@ def _end(mesh: Mesh, rng: Rng, box: _Box) -> None:
     low, high = max(left, middle - half), min(right, middle + half)
     if kind == "door":
         door, top = pick(rng, _WOOD), min(2.1, height - 0.1)
-        frame = rectangles(low - 0.08, 0, high + 0.08, top + 0.08, length)
+        frame = rects(low - 0.08, 0, high + 0.08, top + 0.08, length)
         mesh.add(frame, scaled(door, 0.7))
-        mesh.add(rectangles(low, 0, high, top, length), door)
+        mesh.add(rects(low, 0, high, top, length), door)
         if rng.random() < 0.5:
-            pane = rectangles(low + 0.15, 1.1, high - 0.15, top - 0.15, length)
+            pane = rects(low + 0.15, 1.1, high - 0.15, top - 0.15, length)
             mesh.add(pane, (0.8, 0.85, 0.9), Kind.WINDOW)
     elif kind == "window":
         sill, top = rng.uniform(0.0, 1.2), height - rng.uniform(0.1, 0.6)
-        mesh.add(rectangles(low, sill, high, top, length), (1.0, 1.0, 1.0), Kind.WINDOW)
-        bars = np.linspace(low, high, int(rng.integers(2, 6)))
-        mesh.add(rectangles(bars - 0.03, sill, bars + 0.03, top, length), wall)
+        mesh.add(rects(low, sill, high, top, length), (1.0, 1.0, 1.0), Kind.WINDOW)
+        panes = np.linspace(low, high, int(rng.integers(2, 6)))
+        mesh.add(bars(panes, 0.03, sill, top, length), wall)
     elif kind == "way":
         shade = rng.uniform(0.15, 1.2)
-        mesh.add(rectangles(low, 0, high, height * 0.9, length), scaled(wall, shade))
-        inner = rectangles(low + 0.2 * half, 0, high - 0.3 * half, height * 0.75, length)
+        mesh.add(rects(low, 0, high, height * 0.9, length), scaled(wall, shade))
+        inner = rects(low + 0.2 * half, 0, high - 0.3 * half, height * 0.75, length)
         mesh.add(inner, scaled(wall, shade * rng.uniform(0.5, 1.5)))
 
 
-def _stains(front: Front, rng: Rng, wall: Colour, box: _Box) -> None:
+def _stains(front: Mesh, rng: Rng, wall: Colour, box: _Box) -> None:
     """Add bricks, panels or spots to a wall."""
     height, length = box.height, box.length
     kind = rng.choice(("none", "bricks", "panels", "spots"), p=(0.4, 0.15, 0.2, 0.25))
     if kind == "bricks":
         n = 260
         u, v = rng.uniform(_START, length, n), rng.integers(0, int(height / 0.2), n) * 0.2
-        bricks = rectangles(u, v, u + rng.uniform(0.3, 0.5), np.minimum(v + 0.18, height))
+        bricks = rects(u, v, u + rng.uniform(0.3, 0.5), np.minimum(v + 0.18, height))
         front.add(bricks[: n // 2], scaled(wall, 0.82))
         front.add(bricks[n // 2 :], scaled(wall, 1.15))
     elif kind == "panels":
         u = np.arange(_START, length, rng.uniform(0.8, 2.5))
-        front.add(rectangles(u - 0.02, 0, u + 0.02, height), scaled(wall, 0.7))
+        front.add(bars(u, 0.02, 0, height), scaled(wall, 0.7))
     elif kind == "spots":
         n = 30
         u, v = rng.uniform(_START, length, n), rng.uniform(0, height * 0.9, n)
         size = rng.uniform(0.1, 0.7, n)
-        spots = rectangles(u, v, u + size, np.minimum(v + size * rng.uniform(0.3, 2), height))
+        spots = rects(u, v, u + size, np.minimum(v + size * rng.uniform(0.3, 2), height))
         front.add(spots, scaled(wall, rng.uniform(0.75, 1.2)))
 
 
-def _along_wall(front: Front, rng: Rng, box: _Box) -> None:
+def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
     """Add doors, windows, boards and furniture along one wall, each at its place."""
     doors, trim = pick(rng, _WOOD), scaled(pick(rng, _WOOD), 0.9)
     # What recurs in this corridor; the distances, and what comes between, make the place.
@@ -225,32 +225,32 @@ def _along_wall(front: Front, rng: Rng, box: _Box) -> None:
     z = _START + rng.uniform(0.0, 2.0)
     while z < box.length - 1.2:
         kind = rng.choice(kinds, p=weights)
-        front.mesh.layer = GROUND_LAYER - 20 - z * 1e-3
+        front.layer = GROUND_LAYER - 20 - z * 1e-3
         wide = rng.uniform(0.75, 1.1)
         if kind == "door":
             _door(front, rng, z, wide, top, doors, trim)
         elif kind == "recess":
-            front.add(rectangles(z, 0, z + wide * 1.4, top), scaled(trim, 0.5))
-            front.add(rectangles(z + 0.35, 0, z + wide * 1.4, top), doors)
+            front.add(rects(z, 0, z + wide * 1.4, top), scaled(trim, 0.5))
+            front.add(rects(z + 0.35, 0, z + wide * 1.4, top), doors)
         elif kind == "opening":
             wide *= 1.8
-            front.add(rectangles(z, 0, z + wide, top * 1.05), (0.12, 0.12, 0.13))
+            front.add(rects(z, 0, z + wide, top * 1.05), (0.12, 0.12, 0.13))
             inner = scaled((0.8, 0.8, 0.76), rng.uniform(0.2, 0.9))
-            front.add(rectangles(z + wide * 0.5, 0, z + wide, top * 1.05), inner)
+            front.add(rects(z + wide * 0.5, 0, z + wide, top * 1.05), inner)
         elif kind == "window":
             wide *= rng.uniform(1.0, 2.0)
             sill, high = rng.uniform(0.5, 1.2), box.height - rng.uniform(0.2, 0.7)
-            front.add(rectangles(z - 0.08, sill - 0.1, z + wide + 0.08, high + 0.08), trim)
-            front.add(rectangles(z, sill, z + wide, high), (1.0, 1.0, 1.0), Kind.WINDOW)
-            bars = np.linspace(z, z + wide, int(rng.integers(1, 4)) + 1)[1:-1]
-            front.add(rectangles(bars - 0.03, sill, bars + 0.03, high), trim)
+            front.add(rects(z - 0.08, sill - 0.1, z + wide + 0.08, high + 0.08), trim)
+            front.add(rects(z, sill, z + wide, high), (1.0, 1.0, 1.0), Kind.WINDOW)
+            panes = np.linspace(z, z + wide, int(rng.integers(1, 4)) + 1)[1:-1]
+            front.add(bars(panes, 0.03, sill, high), trim)
         elif kind == "board":
             v, tall = rng.uniform(1.0, 1.5), rng.uniform(0.3, 0.9)
             wide *= rng.uniform(0.5, 1.8)
-            front.add(rectangles(z, v, z + wide, v + tall), pick(rng, SIGNS + WALLS, 0.2))
+            front.add(rects(z, v, z + wide, v + tall), pick(rng, SIGNS + WALLS, 0.2))
             n = int(rng.integers(0, 9))
             u, w = z + rng.uniform(0, 0.7, n) * wide, v + rng.uniform(0, 0.7, n) * tall
-            notes = rectangles(u, w, u + 0.25 * wide, w + 0.25 * tall)
+            notes = rects(u, w, u + 0.25 * wide, w + 0.25 * tall)
             front.add(notes[: n // 2], pick(rng, SIGNS, 0.3))
             front.add(notes[n // 2 :], (0.9, 0.9, 0.88))
         else:
@@ -259,7 +259,7 @@ def _along_wall(front: Front, rng: Rng, box: _Box) -> None:
 
 
 def _door(
-    front: Front,
+    front: Mesh,
     rng: Rng,
     z: float,
     wide: float,
@@ -269,22 +269,22 @@ def _door(
 ) -> None:
     """Add a door in its frame, at times with a pane or a panel, and with a sign."""
     end = z + wide
-    front.add(rectangles(z - 0.08, 0, end + 0.08, top + 0.08), trim)
+    front.add(rects(z - 0.08, 0, end + 0.08, top + 0.08), trim)
     colour = doors if rng.random() < 0.8 else pick(rng, _WOOD)
-    front.add(rectangles(z, 0, end, top), colour)
+    front.add(rects(z, 0, end, top), colour)
     look = rng.integers(3)
     if look == 1:
-        front.add(rectangles(z + 0.2, 1.2, end - 0.2, top - 0.2), (0.25, 0.3, 0.33))
+        front.add(rects(z + 0.2, 1.2, end - 0.2, top - 0.2), (0.25, 0.3, 0.33))
     elif look == 2:
-        front.add(rectangles(z + 0.1, 0.1, end - 0.1, 0.9), scaled(colour, 0.8))
-    front.add(rectangles(end - 0.15, 0.95, end - 0.05, 1.05), (0.8, 0.8, 0.75))
+        front.add(rects(z + 0.1, 0.1, end - 0.1, 0.9), scaled(colour, 0.8))
+    front.add(rects(end - 0.15, 0.95, end - 0.05, 1.05), (0.8, 0.8, 0.75))
     if rng.random() < 0.4:
-        front.add(rectangles(end + 0.15, 1.4, end + 0.4, 1.6), pick(rng, SIGNS))
+        front.add(rects(end + 0.15, 1.4, end + 0.4, 1.6), pick(rng, SIGNS))
 
 
-def _furniture(front: Front, rng: Rng, kind: str, z: float, wide: float, height: float) -> None:
+def _furniture(front: Mesh, rng: Rng, kind: str, z: float, wide: float, height: float) -> None:
     """Add what stands out of the wall: a pillar, a cupboard, a bench, a pipe or a box."""
-    front.mesh.layer = z
+    front.layer = z
     colour = pick(rng, _WOOD + WALLS)
     if kind == "pillar":
         rect, out = (z, 0.0, z + rng.uniform(0.3, 0.7), height), rng.uniform(0.1, 0.5)
@@ -302,7 +302,7 @@ def _furniture(front: Front, rng: Rng, kind: str, z: float, wide: float, height:
     front.boxes(rect, out, colour)
     if kind == "cupboard":
         middle = z + wide / 2
-        gap = rectangles(middle - 0.02, 0.05, middle + 0.02, rect[3] - 0.05, 0.45)
+        gap = bars(middle, 0.02, 0.05, rect[3] - 0.05, 0.45)
         front.add(gap, scaled(colour, 0.6))
 
 
@@ -323,7 +323,7 @@ def _hanging(mesh: Mesh, rng: Rng, box: _Box) -> None:
         mesh.layer = float(z)
         x, wide = rng.uniform(left, right - 0.5), rng.uniform(0.3, 1.2)
         v = height - rng.uniform(0.4, 0.7)
-        sign = rectangles(x, v, min(x + wide, right), v + rng.uniform(0.15, 0.35), z)
+        sign = rects(x, v, min(x + wide, right), v + rng.uniform(0.15, 0.35), z)
         mesh.add(sign, pick(rng, SIGNS), Kind.LAMP if rng.random() < 0.3 else Kind.SOLID)
     for z in rng.uniform(3.0, length, int(rng.integers(0, 5))):
         mesh.layer = float(z)

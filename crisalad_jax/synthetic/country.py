@@ -8,18 +8,18 @@ from crisalad_jax.synthetic.mesh import (
     UP,
     WALLS,
     Body,
-    Front,
     Kind,
     Mesh,
     Place,
     Reach,
     Rng,
+    bars,
     draw_hills,
     flat,
     palette,
     pick,
     polygons,
-    rectangles,
+    rects,
     scaled,
     sheets,
 )
@@ -160,8 +160,8 @@ def _masts(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
         mesh.layer = float(z)
         x = float(way.at(z)) + side * half
         reach = x - side * (half + 0.4)
-        mesh.add(rectangles(x - 0.12, 0, x + 0.12, 6.8, z), steel)
-        mesh.add(rectangles(min(x, reach), 6.2, max(x, reach), 6.3, z), steel)
+        mesh.add(bars(x, 0.12, 0, 6.8, z), steel)
+        mesh.add(rects(min(x, reach), 6.2, max(x, reach), 6.3, z), steel)
     z = np.arange(1.0, _FAR, 12.0)
     for y in (5.4, 6.4):
         wire = sheets(way.at(z), z, way.at(z + 12.0), z + 12, y, y + 0.03)
@@ -204,7 +204,7 @@ def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
             if kind == "fence":
                 rails, wide, colour = np.array((0.45, 0.9)), 0.08, (0.5, 0.45, 0.38)
             mesh.add(sheets(*line, rails, rails + wide), colour, normal=inwards)
-            mesh.add(rectangles(x0 - 0.06, 0, x0 + 0.06, 1.0, z), (0.42, 0.38, 0.33))
+            mesh.add(bars(x0, 0.06, 0, 1.0, z), (0.42, 0.38, 0.33))
 
 
 def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
@@ -248,7 +248,7 @@ def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> list[Body]:
         side, wide = float(rng.choice((-1, 1))), rng.uniform(7, 14)
         x = float(way.at(z)) + side * (half + rng.uniform(3, 30))
         mesh.layer = float(z)
-        front = Front(mesh, x - wide if side < 0 else x, z, 0)
+        front = mesh.front(x - wide if side < 0 else x, z, 0)
         bodies.append(building(rng, front, wide, habit))
     return bodies
 
@@ -259,8 +259,8 @@ def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
         mesh.layer = float(z)
         x = float(way.at(z)) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
         if rng.random() < 0.6:
-            mesh.add(rectangles(x - 0.04, 0, x + 0.04, 2.6, z), (0.45, 0.45, 0.45))
-            sign = rectangles(x - 0.35, 1.7, x + 0.35, 2.0 + rng.uniform(0.2, 0.7), z)
+            mesh.add(bars(x, 0.04, 0, 2.6, z), (0.45, 0.45, 0.45))
+            sign = bars(x, 0.35, 1.7, 2.0 + rng.uniform(0.2, 0.7), z)
             mesh.add(sign, pick(rng, SIGNS))
         else:
             size = rng.uniform(0.4, 1.5)

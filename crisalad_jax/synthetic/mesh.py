@@ -4,6 +4,7 @@ The camera of the default view stands at x = z = 0. A scene is a list of parts, 
 ones to the near.
 """
 
+import copy
 import enum
 from typing import NamedTuple
 
@@ -16,6 +17,8 @@ Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
 Number = int | float | np.ndarray
+Rect = tuple[Number, Number, Number, Number]
+"""The left, low, right and high edges of rectangles."""
 Rng = np.random.Generator
 Body = tuple[float, float, float, float, float]
 """A building's x0, x1, z0, z1 and height in metres, for its shadow."""
@@ -87,7 +90,7 @@ def polygons(*corners: tuple[Number, Number, Number]) -> Float[np.ndarray, "n co
     return table.reshape(count, len(corners), 3)
 
 
-def rectangles(
+def rects(
     x0: Number, y0: Number, x1: Number, y1: Number, z: Number = 0.0, top_z: Number | None = None
 ) -> Float[np.ndarray, "n 4 3"]:
     """Make rectangles between two edges along x, upright unless `top_z` differs from `z`."""
@@ -95,11 +98,18 @@ def rectangles(
     return polygons((x0, y0, z), (x1, y0, z), (x1, y1, top_z), (x0, y1, top_z))
 
 
+def bars(
+    x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0
+) -> Float[np.ndarray, "n 4 3"]:
+    """Make upright rectangles that reach `half` metres to either side of x."""
+    return rects(x - half, y0, x + half, y1, z)
+
+
 def flat(
     x0: Number, z0: Number, x1: Number, z1: Number, y: float = 0.0
 ) -> Float[np.ndarray, "n 4 3"]:
     """Make level rectangles, on the ground unless a height `y` is given."""
-    return rectangles(x0, y, x1, y, z0, z1)
+    return rects(x0, y, x1, y, z0, z1)
 
 
 def sheets(
@@ -136,25 +146,49 @@ class Mesh:
         self.eye = eye
         self.layer = 0.0
         """Painting order of the parts to come: larger is farther away."""
+        self.normal: Vector = TO_CAMERA
+        """Direction that the parts to come face unless told otherwise."""
+        self.sees_start = False
+        """Whether the camera sees the ends towards small u of a front, or those towards large u."""
+        self.end_normal: Vector = UP
+        self._origin, self._axes = np.zeros(3), np.eye(3)
         self._points: list[np.ndarray] = []
         self._polygon_sizes: list[np.ndarray] = []
         self._parts: list[tuple[int, Colour, Vector, int, float]] = []
+
+    def front(self, x: float, z: float, side: float) -> "Mesh":
+        """Return the same mesh in other axes: those of a vertical plane, in the present layer.
+
+        u runs along the plane, v up, d out of it. The plane stands on (x, z), on a side of the
+        street, which is -1 or 1, or across the street where that is 0.
+        """
+        front = copy.copy(self)
+        along = (0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0)
+        front.normal = (-side, 0.0, 0.0) if side else TO_CAMERA
+        front.sees_start = side != 0 or x > 0
+        front.end_normal = scaled(along, -1.0 if front.sees_start else 1.0)
+        front._origin, front._axes = np.array((x, 0.0, z)), np.array((along, UP, front.normal))
+        return front
+
+    def world(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Convert points from the mesh's axes to the world's."""
+        return points @ self._axes + self._origin
 
     def add(
         self,
         polygons: Float[np.ndarray, "polygon corner 3"],
         albedo: Colour,
         kind: Kind = Kind.SOLID,
-        normal: Vector = TO_CAMERA,
+        normal: Vector | None = None,
         layer: float | None = None,
     ) -> None:
-        """Add a part in a layer, the mesh's unless given; without polygons it is left out."""
+        """Add a part; without polygons it is left out."""
         count, corners, _ = polygons.shape
         if count:
-            self._points.append(polygons.reshape(-1, 3))
+            self._points.append(self.world(polygons).reshape(-1, 3))
             self._polygon_sizes.append(np.full(count, corners))
             layer = self.layer if layer is None else layer
-            self._parts.append((count, albedo, normal, int(kind), layer))
+            self._parts.append((count, albedo, normal or self.normal, int(kind), layer))
 
     def ground(
         self, level: int, polygons: np.ndarray, albedo: Colour, kind: Kind = Kind.SOLID
@@ -168,58 +202,23 @@ class Mesh:
         x, outwards = (x1, 1.0) if x0 + x1 < 0 else (x0, -1.0)
         self.add(flat(x0, z0, x1, z1, y1), albedo, Kind.ROOF, UP)
         self.add(sheets(x, z0, x, z1, y0, y1), albedo, normal=(outwards, 0.0, 0.0))
-        self.add(rectangles(x0, y0, x1, y1, z0), albedo)
+        self.add(rects(x0, y0, x1, y1, z0), albedo)
+
+    def boxes(self, rect: Rect, out: float, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+        """Add boxes that protrude from a front: the visible end, the top or underside, the face."""
+        u0, v0, u1, v1 = rect
+        end = u0 if self.sees_start else u1
+        self.add(sheets(end, 0.0, end, out, v0, v1), albedo, normal=self.end_normal)
+        above = float(np.min(v0)) > self.eye
+        v = v0 if above else v1
+        self.add(rects(u0, v, u1, v, 0.0, out), albedo, normal=DOWN if above else UP)
+        self.add(rects(u0, v0, u1, v1, out), albedo, kind)
 
     def scene(self) -> Scene:
         """Make a scene of all parts, of which there has to be at least one."""
         counts, albedo, normal, kind, layer = map(np.array, zip(*self._parts, strict=True))
         points, sizes = np.concatenate(self._points), np.concatenate(self._polygon_sizes)
         return Scene(points, sizes, counts, albedo, normal, kind, layer)
-
-
-class Front:
-    """A vertical plane for parts: u runs along it, v up, d out of it towards the street."""
-
-    def __init__(self, mesh: Mesh, x: float, z: float, side: float) -> None:
-        """Place the plane's foot; `side` of the street is -1 or 1, or 0 for a plane across it."""
-        self.mesh = mesh
-        self.sees_start = side != 0 or x > 0
-        """Whether the camera sees the ends towards small u, or those towards large u."""
-        along = (0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0)
-        self.normal: Vector = (-side, 0.0, 0.0) if side else TO_CAMERA
-        self.end_normal = scaled(along, -1.0 if self.sees_start else 1.0)
-        self._origin = np.array((x, 0.0, z))
-        self._axes = np.array((along, UP, self.normal))
-
-    def world(self, uvd: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Convert the plane's metres to the world's."""
-        return uvd @ self._axes + self._origin
-
-    def add(
-        self,
-        uvd: Float[np.ndarray, "n corner 3"],
-        albedo: Colour,
-        kind: Kind = Kind.SOLID,
-        normal: Vector | None = None,
-    ) -> None:
-        """Add polygons in the plane's own metres; they face out of it unless `normal` differs."""
-        self.mesh.add(self.world(uvd), albedo, kind, normal or self.normal)
-
-    def boxes(
-        self,
-        rects: tuple[Number, Number, Number, Number],
-        out: float,
-        albedo: Colour,
-        kind: Kind = Kind.SOLID,
-    ) -> None:
-        """Add protruding boxes u0, v0, u1, v1: the visible end, the top or underside, the front."""
-        u0, v0, u1, v1 = rects
-        end = u0 if self.sees_start else u1
-        self.add(sheets(end, 0.0, end, out, v0, v1), albedo, normal=self.end_normal)
-        above = float(np.min(v0)) > self.mesh.eye
-        v = v0 if above else v1
-        self.add(rectangles(u0, v, u1, v, 0.0, out), albedo, normal=DOWN if above else UP)
-        self.add(rectangles(u0, v0, u1, v1, out), albedo, kind)
 
 
 class Reach(NamedTuple):

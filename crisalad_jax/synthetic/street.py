@@ -8,19 +8,19 @@ from crisalad_jax.synthetic.mesh import (
     ROOFS,
     WALLS,
     Body,
-    Front,
     Kind,
     Mesh,
     Place,
     Reach,
     Rng,
     Vector,
+    bars,
     draw_hills,
     flat,
     palette,
     pick,
     polygons,
-    rectangles,
+    rects,
     scaled,
 )
 from crisalad_jax.synthetic.things import lamp, monument, tree, wires
@@ -112,25 +112,25 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
         width, height = rng.uniform(14, 34), z * rng.uniform(0.18, 0.5)
         mesh.layer = 3000 + z
         colour = pick(rng, WALLS[6:])
-        mesh.add(rectangles(x, 0, x + width, height, z), colour)
+        mesh.add(rects(x, 0, x + width, height, z), colour)
         if rng.random() < 0.5:
-            setback = rectangles(x + width * 0.25, height, x + width * 0.75, height * 1.12, z)
+            setback = rects(x + width * 0.25, height, x + width * 0.75, height * 1.12, z)
             mesh.add(setback, colour)
         columns, rows = int(rng.integers(3, 7)), int(rng.integers(6, 14))
         u = np.tile(x + (np.arange(columns) + 0.2) * width / columns, rows)
         v = np.repeat((np.arange(rows) + 0.3) * height / rows, columns)
-        panes = rectangles(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows, z)
+        panes = rects(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows, z)
         mesh.add(panes, scaled(GLASS, 1.6), Kind.GLASS)
     if rng.random() < 0.4:
         z = length + rng.uniform(30, 90)
         x = rng.uniform(-0.5, 0.5) * z
         half, height = rng.uniform(2.5, 4), z * rng.uniform(0.28, 0.45)
         mesh.layer = 2000 + z
-        mesh.add(rectangles(x - half, 0, x + half, height, z), pick(rng, WALLS[:6]))
+        mesh.add(bars(x, half, 0, height, z), pick(rng, WALLS[:6]))
         eaves, tip = half + 0.4, height * rng.uniform(1.2, 1.7)
         spire = polygons((x - eaves, height, z), (x + eaves, height, z), (x, tip, z))
         mesh.add(spire, pick(rng, ROOFS), Kind.ROOF, (0.0, 0.6, -0.8))
-        bell = rectangles(x - half * 0.3, height * 0.82, x + half * 0.3, height * 0.93, z)
+        bell = bars(x, half * 0.3, height * 0.82, height * 0.93, z)
         mesh.add(bell, (0.12, 0.12, 0.13))
 
 
@@ -147,7 +147,7 @@ def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
     bodies = []
     for z, x, width in sorted(stands, reverse=True):
         mesh.layer = 1000 + z
-        bodies.append(building(rng, Front(mesh, x, z, 0), width, habit))
+        bodies.append(building(rng, mesh.front(x, z, 0), width, habit))
     return bodies
 
 
@@ -162,7 +162,7 @@ def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habi
             continue
         face = x + side * rng.choice((0.0, 0.0, 0.0, 0.8, 2.5))
         mesh.layer = z + width
-        bodies.append(building(rng, Front(mesh, face, z, side), width, habit))
+        bodies.append(building(rng, mesh.front(face, z, side), width, habit))
         z += width
     return bodies
 
@@ -177,6 +177,6 @@ def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:
     # the next.
     for z in np.arange(-3.0, length, 3.0):
         mesh.layer = float(z)
-        front = Front(mesh, x, float(z), side)
-        front.add(rectangles(0, 0, 3, height), colour)
-        front.add(rectangles(0, height, 3, height + 0.12), colour, Kind.LEDGE)
+        front = mesh.front(x, float(z), side)
+        front.add(rects(0, 0, 3, height), colour)
+        front.add(rects(0, height, 3, height + 0.12), colour, Kind.LEDGE)

@@ -9,18 +9,18 @@ from crisalad_jax.synthetic.mesh import (
     UP,
     WALLS,
     Colour,
-    Front,
     Kind,
     Mesh,
     Rng,
     Scene,
     Vector,
+    bars,
     discs,
     flat,
     palette,
     pick,
     polygons,
-    rectangles,
+    rects,
     scaled,
 )
 
@@ -34,7 +34,7 @@ def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     mesh.layer = z
     height = rng.uniform(4.5, 8.5)
     bark = (0.26, 0.21, 0.17)
-    mesh.add(rectangles(x - 0.16, 0, x + 0.16, height * 0.6, z), bark)
+    mesh.add(bars(x, 0.16, 0, height * 0.6, z), bark)
     if rng.random() < 0.2:
         for low, reach in ((0.2, 1.9), (0.44, 1.4), (0.68, 0.9)):
             y = height * low
@@ -65,10 +65,10 @@ def lamp(mesh: Mesh, x: float, z: float, height: float) -> Vector:
     """Add a street lamp with an arm over the street; return the position of its light."""
     mesh.layer = z
     tip = x + 1.3 if x < 0 else x - 1.3
-    post = rectangles(x - 0.09, 0, x + 0.09, height, z)
-    arm = rectangles(min(x, tip), height - 0.12, max(x, tip), height, z)
+    post = bars(x, 0.09, 0, height, z)
+    arm = rects(min(x, tip), height - 0.12, max(x, tip), height, z)
     mesh.add(np.concatenate((post, arm)), (0.20, 0.22, 0.22))
-    head = rectangles(tip - 0.35, height - 0.32, tip + 0.35, height - 0.08, z)
+    head = bars(tip, 0.35, height - 0.32, height - 0.08, z)
     mesh.add(head, (0.75, 0.74, 0.68), Kind.LAMP)
     return (tip, height - 0.2, z)
 
@@ -81,8 +81,8 @@ def wires(mesh: Mesh, rng: Rng, x: float, length: float) -> None:
     y0, y1 = sag[:-1], sag[1:]
     for z in np.arange(rng.uniform(4.0, 12.0), length, gap):
         mesh.layer = float(z)
-        pole = rectangles(x - 0.13, 0, x + 0.13, height, z)
-        bar = rectangles(x - 0.9, height - 0.8, x + 0.9, height - 0.65, z)
+        pole = bars(x, 0.13, 0, height, z)
+        bar = bars(x, 0.9, height - 0.8, height - 0.65, z)
         mesh.add(np.concatenate((pole, bar)), (0.30, 0.25, 0.21))
         z0, z1 = z + t[:-1] * gap, z + t[1:] * gap
         for u in (x - 0.8, x + 0.8):
@@ -147,20 +147,20 @@ def _vehicle(mesh: Mesh, rng: Rng, x: float, z: float, *, bus: bool, away: bool)
     shadow = flat(x - half - 0.2, z - 0.2, x + half + 0.2, z + length)
     mesh.add(shadow, (0.1, 0.1, 0.1), normal=UP)
     near = np.array((x - half, x + half - 0.3))
-    mesh.add(rectangles(near, 0, near + 0.3, 0.5, z + 0.1), _TYRE)
+    mesh.add(rects(near, 0, near + 0.3, 0.5, z + 0.1), _TYRE)
     mesh.block((x - half, 0.3, z), (x + half, height, z + length), paint)
     side = -1.0 if x < 0 else 1.0
-    flank = Front(mesh, x - side * half, z, side)
+    flank = mesh.front(x - side * half, z, side)
     if bus:
         u = 0.5 + 2.0 * np.arange(5)
-        flank.add(rectangles(u, 1.4, u + 1.7, 2.5), _TINTED, Kind.SHOP)
-        mesh.add(rectangles(x - 1.05, 1.3, x + 1.05, 2.6, z), _TINTED, Kind.SHOP)
+        flank.add(rects(u, 1.4, u + 1.7, 2.5), _TINTED, Kind.SHOP)
+        mesh.add(bars(x, 1.05, 1.3, 2.6, z), _TINTED, Kind.SHOP)
     else:
         mesh.block((x - 0.74, 0.95, z + 0.7), (x + 0.74, 1.5, z + 3.2), paint)
-        mesh.add(rectangles(x - 0.65, 1.0, x + 0.65, 1.42, z + 0.7), _TINTED)
+        mesh.add(bars(x, 0.65, 1.0, 1.42, z + 0.7), _TINTED)
         u = np.array((0.5, 3.1))
-        flank.add(rectangles(u, 0, u + 0.6, 0.6), _TYRE)
-    lights = rectangles(near + 0.02, 0.6, near + 0.28, 0.85, z)
+        flank.add(rects(u, 0, u + 0.6, 0.6), _TYRE)
+    lights = rects(near + 0.02, 0.6, near + 0.28, 0.85, z)
     if away:
         mesh.add(lights, (0.55, 0.08, 0.06), Kind.TAILLIGHT)
     else:
@@ -174,5 +174,5 @@ def _person(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     hips = (hip + 0.08, 0.85 * tall, z), (hip - 0.08, 0.85 * tall, z)
     legs = polygons(*hips, (foot - 0.08, 0.0, z), (foot + 0.08, 0.0, z))
     mesh.add(legs, pick(rng, _PAINT[1:4]))
-    mesh.add(rectangles(x - 0.26, 0.8 * tall, x + 0.26, 1.48 * tall, z), pick(rng, SIGNS, 0.3))
+    mesh.add(bars(x, 0.26, 0.8 * tall, 1.48 * tall, z), pick(rng, SIGNS, 0.3))
     mesh.add(discs(x, 1.63 * tall, 0.13, z), (0.62, 0.47, 0.38))
