@@ -9,15 +9,13 @@ picture is taken); `materials`, `mesh`, `things`, `buildings` and `place` (the c
 
 from crisalad_jax.synthetic.city import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.synthetic.picture import render
-from crisalad_jax.synthetic.view import SCENERIES, SEASONS, TIMES, WEATHERS, Scenery, View
+from crisalad_jax.synthetic.view import SCENERIES, SEASONS, Scenery, View
 from crisalad_jax.synthetic.world import VARIATIONS, Variation, WorldConfig, has_world, write_world
 
 __all__ = [
     "SCENERIES",
     "SEASONS",
-    "TIMES",
     "VARIATIONS",
-    "WEATHERS",
     "Scenery",
     "SyntheticCityConfig",
     "Variation",

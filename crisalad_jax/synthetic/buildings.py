@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from crisalad_jax.synthetic.mesh import (
     GLASS,
@@ -61,11 +60,11 @@ def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> Body:
     if rng.random() < 0.3:
         u = np.linspace(0.35, width - 0.35, int(rng.integers(2, 5)))
         front.add(bars(u, 0.3, ground, height), scaled(wall, 1.16))
+    levels = ground + storey * np.arange(floors)
     if rng.random() < 0.4:
-        v = ground + storey * np.arange(floors)
-        front.add(rects(0, v - 0.15, width, v + 0.12), scaled(wall, 1.18), Kind.LEDGE)
+        front.add(rects(0, levels - 0.15, width, levels + 0.12), scaled(wall, 1.18), Kind.LEDGE)
 
-    _windows(rng, front, width, ground + storey * np.arange(floors), storey, habit.spacing, trim)
+    _windows(rng, front, width, levels, storey, habit, trim)
     use = rng.choice(("shop", "arcade", "door"), p=(0.42, 0.16, 0.42))
     if use == "shop":
         _shops(rng, front, width, ground - 1.1)
@@ -154,13 +153,13 @@ def _windows(
     rng: Rng,
     front: Mesh,
     width: float,
-    levels: Float[np.ndarray, " floor"],
+    levels: np.ndarray,
     storey: float,
-    spacing: float,
+    habit: Habit,
     trim: Colour,
 ) -> None:
     """Add windows above the ground floor, with frames, shutters, sills and balconies."""
-    axis, cell = _axes(width, spacing * rng.uniform(0.8, 1.25))
+    axis, cell = _axes(width, habit.spacing * rng.uniform(0.8, 1.25))
     columns = len(axis)
     halves = np.full(columns, cell * rng.uniform(0.17, 0.33))
     tall = storey * rng.uniform(0.45, 0.72)

@@ -60,8 +60,8 @@ def corridor(rng: Rng) -> Place:
     _ceiling(mesh, rng, box)
     _end(mesh, rng, box)
     for x, side, wall in ((box.left, -1.0, walls[0]), (box.right, 1.0, walls[1])):
-        front = mesh.front(x, 0.0, side)
         mesh.layer = GROUND_LAYER - 10
+        front = mesh.front(x, 0.0, side)
         front.add(rects(_START, 0, length, height), wall)
         _stains(front, rng, wall, box)
         if band:
@@ -73,14 +73,9 @@ def corridor(rng: Rng) -> Place:
         _columns(mesh, rng, box)
     if rng.random() < 0.5:
         _hanging(mesh, rng, box)
-    reach = Reach(
-        height=(0.5, min(1.9, height - 0.4)),
-        lateral=min(0.8, 0.12 * width),
-        forward=0.3,
-        step=float(rng.uniform(1.2, 2.5)),
-    )
-    heading = float(rng.uniform(-12, 12))
-    lanes = (box.left, box.left, box.right, box.right)
+    lateral = min(0.8, 0.12 * width)
+    reach = Reach((0.5, min(1.9, height - 0.4)), lateral, forward=0.3, step=rng.uniform(1.2, 2.5))
+    heading, lanes = rng.uniform(-12, 12), (box.left, box.left, box.right, box.right)
     return Place(mesh.scene(), heading, lanes, reach, indoors=True, traffic=False)
 
 
@@ -259,13 +254,7 @@ def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
 
 
 def _door(
-    front: Mesh,
-    rng: Rng,
-    z: float,
-    wide: float,
-    top: float,
-    doors: Colour,
-    trim: Colour,
+    front: Mesh, rng: Rng, z: float, wide: float, top: float, doors: Colour, trim: Colour
 ) -> None:
     """Add a door in its frame, at times with a pane or a panel, and with a sign."""
     end = z + wide

@@ -72,16 +72,10 @@ def country(rng: Rng) -> Place:
     if rng.random() < 0.6:  # a rougher outline
         hills = hills * (1 + 0.25 * rng.standard_normal(96))
     bearing, heading = float(rng.uniform(0, 360)), float(rng.uniform(-12, 12))
-    return Place(
-        scene=mesh.scene(),
-        heading=heading,
-        lanes=(-half - 1.0, -half, half, half + 1.0),
-        reach=Reach(height=(1.2, 3.2), lateral=1.2, forward=2.5, step=10.0),
-        bearing=bearing,
-        hills=hills,
-        bodies=tuple(bodies),
-        traffic=kind == "road",
-    )
+    lanes = (-half - 1.0, -half, half, half + 1.0)
+    reach = Reach(height=(1.2, 3.2), lateral=1.2, forward=2.5, step=10.0)
+    scene, road = mesh.scene(), kind == "road"
+    return Place(scene, heading, lanes, reach, bearing, hills, bodies, traffic=road)
 
 
 def _fields(mesh: Mesh, rng: Rng) -> None:

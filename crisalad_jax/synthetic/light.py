@@ -49,26 +49,14 @@ _COMPASS: dict[Time, float] = {"noon": 180.0, "dusk": 270.0, "night": 180.0}
 """Degrees clockwise from north of the sun."""
 
 
-class _Air(NamedTuple):
-    """The effect of weather on light."""
-
-    sun: float
-    """Share of the sunlight that comes through."""
-    ambient: float
-    veil: float
-    """Share of grey in the sky's colours, 0 to 1."""
-    grey: float
-    """Brightness of that grey relative to the clear horizon."""
-    visibility: float
-    """Metres over which haze reduces contrast to 1/e."""
-
-
-_AIRS: dict[Weather, _Air] = {
-    "clear": _Air(sun=1.0, ambient=1.0, veil=0.0, grey=1.0, visibility=900.0),
-    "overcast": _Air(sun=0.12, ambient=1.2, veil=0.8, grey=0.95, visibility=500.0),
-    "haze": _Air(sun=0.35, ambient=1.15, veil=0.75, grey=0.95, visibility=75.0),
-    "rain": _Air(sun=0.05, ambient=1.05, veil=0.9, grey=0.8, visibility=190.0),
+_AIRS: dict[Weather, tuple[float, ...]] = {
+    "clear": (1.0, 1.0, 0.0, 1.0, 900.0),
+    "overcast": (0.12, 1.2, 0.8, 0.95, 500.0),
+    "haze": (0.35, 1.15, 0.75, 0.95, 75.0),
+    "rain": (0.05, 1.05, 0.9, 0.8, 190.0),
 }
+"""By weather: shares of the sunlight and the ambient light that come through, share of grey in the
+sky's colours, brightness of that grey relative to the clear horizon, and visibility in metres."""
 _SUN_HEIGHT: dict[Season, float] = {"spring": 0.85, "summer": 1.2, "autumn": 0.85, "winter": 0.5}
 _LEAVES: dict[Season, np.ndarray] = {
     "spring": np.array(palette("44 56 22, 74 60 62")),
@@ -107,17 +95,17 @@ def light_of(view: View, place: Place, rng: Rng) -> Light:
     """
     light = (_INDOORS if place.indoors else _OUTDOORS)[view.time]
     if not place.indoors:
-        air = _AIRS[view.weather]
-        grey = sum(light.horizon) / 3 * air.grey
-        zenith, horizon = (sky + (grey - sky) * air.veil for sky in (light.zenith, light.horizon))
+        sun, ambient, share, brightness, visibility = _AIRS[view.weather]
+        grey = sum(light.horizon) / 3 * brightness
+        zenith, horizon = (sky + (grey - sky) * share for sky in (light.zenith, light.horizon))
         light = light._replace(
-            ambient=light.ambient * air.ambient,
-            sun=light.sun * air.sun,
+            ambient=light.ambient * ambient,
+            sun=light.sun * sun,
             elevation=light.elevation * _SUN_HEIGHT[view.season],
             zenith=zenith,
             horizon=horizon,
             veil=horizon,
-            visibility=air.visibility,
+            visibility=visibility,
         )
     compass = _COMPASS[view.time] + rng.uniform(-50, 50)
     azimuth, elevation = np.deg2rad(compass - place.bearing), np.deg2rad(light.elevation)

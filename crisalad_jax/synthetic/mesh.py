@@ -6,6 +6,7 @@ ones to the near.
 
 import copy
 import enum
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +18,12 @@ Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
 Number = int | float | np.ndarray
+Polygons = Float[np.ndarray, "polygon corner 3"]
 Rect = tuple[Number, Number, Number, Number]
 """The left, low, right and high edges of rectangles."""
 Rng = np.random.Generator
+Lanes = tuple[float, float, float, float]
+"""x of the left fronts, the left kerb, the right kerb and the right fronts of a street."""
 Body = tuple[float, float, float, float, float]
 """A building's x0, x1, z0, z1 and height in metres, for its shadow."""
 
@@ -31,27 +35,14 @@ TO_CAMERA: Vector = (0.0, 0.0, -1.0)
 
 
 class Kind(enum.IntEnum):
-    """Material of a part, which decides how season and light change it."""
+    """Material of a part, which decides how season and light change it.
 
-    SOLID = 0
-    ROOF = 1
-    LEDGE = 2
-    PAVEMENT = 3
-    ROAD = 4
-    GRASS = 5
-    LEAF = 6
-    NEEDLE = 7
-    GLASS = 8
-    SHOP = 9
-    LAMP = 10
-    HEADLIGHT = 11
-    TAILLIGHT = 12
-    SOIL = 13
-    """A field or ballast: of its own colour, under snow in winter."""
-    BUSH = 14
-    """Leaves that are bare twigs in winter."""
-    WINDOW = 15
-    """An opening to the sky, seen from inside."""
+    SOIL is a field or ballast: of its own colour, under snow in winter. BUSH is leaves that are
+    bare twigs in winter. WINDOW is an opening to the sky, seen from inside.
+    """
+
+    SOLID, ROOF, LEDGE, PAVEMENT, ROAD, GRASS, LEAF, NEEDLE = range(8)
+    GLASS, SHOP, LAMP, HEADLIGHT, TAILLIGHT, SOIL, BUSH, WINDOW = range(8, 16)
 
 
 def palette(percents: str) -> tuple[Colour, ...]:
@@ -80,7 +71,7 @@ def pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 
     return scaled(colour, 1 + rng.uniform(-spread, spread))
 
 
-def polygons(*corners: tuple[Number, Number, Number]) -> Float[np.ndarray, "n corner 3"]:
+def polygons(*corners: tuple[Number, Number, Number]) -> Polygons:
     """Make as many polygons as a coordinate's array has numbers; single numbers are repeated."""
     numbers = [number for corner in corners for number in corner]
     count = next((len(n) for n in numbers if isinstance(n, np.ndarray)), 1)
@@ -92,34 +83,30 @@ def polygons(*corners: tuple[Number, Number, Number]) -> Float[np.ndarray, "n co
 
 def rects(
     x0: Number, y0: Number, x1: Number, y1: Number, z: Number = 0.0, top_z: Number | None = None
-) -> Float[np.ndarray, "n 4 3"]:
+) -> Polygons:
     """Make rectangles between two edges along x, upright unless `top_z` differs from `z`."""
     top_z = z if top_z is None else top_z
     return polygons((x0, y0, z), (x1, y0, z), (x1, y1, top_z), (x0, y1, top_z))
 
 
-def bars(
-    x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0
-) -> Float[np.ndarray, "n 4 3"]:
+def bars(x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0) -> Polygons:
     """Make upright rectangles that reach `half` metres to either side of x."""
     return rects(x - half, y0, x + half, y1, z)
 
 
-def flat(
-    x0: Number, z0: Number, x1: Number, z1: Number, y: float = 0.0
-) -> Float[np.ndarray, "n 4 3"]:
+def flat(x0: Number, z0: Number, x1: Number, z1: Number, y: float = 0.0) -> Polygons:
     """Make level rectangles, on the ground unless a height `y` is given."""
     return rects(x0, y, x1, y, z0, z1)
 
 
 def sheets(
     x0: Number, z0: Number, x1: Number, z1: Number, low: Number, high: Number, lean: Number = 0.0
-) -> Float[np.ndarray, "n 4 3"]:
+) -> Polygons:
     """Make upright sheets over lines on the ground; their tops are moved along x by `lean`."""
     return polygons((x0, low, z0), (x1, low, z1), (x1 + lean, high, z1), (x0 + lean, high, z0))
 
 
-def discs(x: Number, y: Number, radius: Number, z: float) -> Float[np.ndarray, "n 10 3"]:
+def discs(x: Number, y: Number, radius: Number, z: float) -> Polygons:
     """Make round polygons that face the camera."""
     angles = np.arange(10) * (2 * np.pi / 10)
     return polygons(*((x + radius * np.cos(a), y + radius * np.sin(a), z) for a in angles))
@@ -176,7 +163,7 @@ class Mesh:
 
     def add(
         self,
-        polygons: Float[np.ndarray, "polygon corner 3"],
+        polygons: Polygons,
         albedo: Colour,
         kind: Kind = Kind.SOLID,
         normal: Vector | None = None,
@@ -191,7 +178,7 @@ class Mesh:
             self._parts.append((count, albedo, normal or self.normal, int(kind), layer))
 
     def ground(
-        self, level: int, polygons: np.ndarray, albedo: Colour, kind: Kind = Kind.SOLID
+        self, level: int, polygons: Polygons, albedo: Colour, kind: Kind = Kind.SOLID
     ) -> None:
         """Add a part of the ground; those of a larger level are painted first."""
         self.add(polygons, albedo, kind, UP, GROUND_LAYER + level)
@@ -240,14 +227,13 @@ class Place(NamedTuple):
     scene: Scene
     heading: float
     """Direction of the default view in degrees clockwise from the street."""
-    lanes: tuple[float, float, float, float]
-    """x of the left fronts, the left kerb, the right kerb and the right fronts."""
+    lanes: Lanes
     reach: Reach
     bearing: float = 0.0
     """Direction of the street in degrees clockwise from north."""
     hills: Float[np.ndarray, " bearing"] = np.zeros(96)
     """Height of the hills over the horizon, as a tangent, at equal steps around the compass."""
-    bodies: tuple[Body, ...] = ()
+    bodies: Sequence[Body] = ()
     lamps: Float[np.ndarray, "lamp 3"] = np.zeros((0, 3))
     indoors: bool = False
     traffic: bool = True

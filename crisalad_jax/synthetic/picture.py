@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from crisalad_jax.synthetic.street import street
 from crisalad_jax.synthetic.things import build_passers
 from crisalad_jax.synthetic.view import (
     NEAR,
+    SCENERIES,
     Camera,
     Scenery,
     View,
@@ -32,11 +33,7 @@ from crisalad_jax.synthetic.view import (
 )
 
 _SUPERSAMPLING = 2
-_BUILDERS: Mapping[Scenery, Callable[[Rng], Place]] = {
-    "street": street,
-    "corridor": corridor,
-    "country": country,
-}
+_BUILDERS = dict(zip(SCENERIES, (street, corridor, country), strict=True))
 
 
 @functools.lru_cache(maxsize=32)
@@ -68,7 +65,7 @@ def render(
     scene, picture = place.scene, _Picture(place, view, image_size)
     draw = picture.rng.random(len(scene.polygon_sizes))
     if view.occluders is not None:
-        passers = build_passers(view.occluders, place.lanes, traffic=place.traffic)
+        passers = build_passers(view.occluders, place.lanes, place.traffic)
         scene = Scene(*map(np.concatenate, zip(scene, passers, strict=True)))
         # A draw of 0 switches the lights of every vehicle on.
         draw = np.concatenate((draw, np.zeros(len(passers.polygon_sizes))))

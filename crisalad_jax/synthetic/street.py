@@ -65,16 +65,9 @@ def street(rng: Rng) -> Place:
 
     hills = draw_hills(rng, 0.2)
     bearing, heading = float(rng.uniform(0, 360)), float(rng.uniform(-20, 20))
-    return Place(
-        scene=mesh.scene(),
-        heading=heading,
-        lanes=(left, *kerbs, right),
-        reach=Reach(height=(1.2, 3.0), lateral=1.2, forward=2.5, step=9.0),
-        bearing=bearing,
-        hills=hills,
-        bodies=tuple(bodies),
-        lamps=np.array(lamps),
-    )
+    lanes = (left, *kerbs, right)
+    reach = Reach(height=(1.2, 3.0), lateral=1.2, forward=2.5, step=9.0)
+    return Place(mesh.scene(), heading, lanes, reach, bearing, hills, bodies, np.array(lamps))
 
 
 def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> None:

@@ -10,6 +10,7 @@ from crisalad_jax.synthetic.mesh import (
     WALLS,
     Colour,
     Kind,
+    Lanes,
     Mesh,
     Rng,
     Scene,
@@ -107,9 +108,7 @@ def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
 
 
 @functools.lru_cache(maxsize=8)
-def build_passers(
-    seed: int, lanes: tuple[float, float, float, float], *, traffic: bool = True
-) -> Scene:
+def build_passers(seed: int, lanes: Lanes, traffic: bool) -> Scene:
     """Build cars along the kerbs, traffic in the lanes, and people on the pavements.
 
     Without traffic there are people alone; one is far away, so that there is somebody.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from crisalad_jax.config.checks import check_types, require
 
@@ -111,9 +111,7 @@ class Camera:
         """Project camera metres in front of the near plane to pixels."""
         return self.centre + self.focal * seen[:, :2] * (1, -1) / seen[:, 2:]
 
-    def outlines(
-        self, seen: Float[np.ndarray, "point 3"], sizes: Int[np.ndarray, " polygon"]
-    ) -> list[np.ndarray | None]:
+    def outlines(self, seen: np.ndarray, sizes: np.ndarray) -> list[np.ndarray | None]:
         """Project polygons, which are runs of points, to quarters of a pixel; None out of sight."""
         ends = np.cumsum(sizes)
         starts = ends - sizes
