@@ -2,9 +2,9 @@
 
 Both are written in two real layouts: GSV-Cities (Ali-bey et al. 2022) to train on, and that of
 VPR-datasets-downloader to evaluate on. The modules in the order of their imports: `view` (how a
-picture is taken); `materials`, `mesh`, `things`, `buildings` and `place` (the contents of a place);
-`street`, `corridor`, `country`, `scenes` and `traffic` (its kinds); `light`, `camera` and `picture`
-(drawing); `city` and `world` (the files).
+picture is taken); `mesh` (materials, polygons and what a place is); `things` and `buildings` (the
+contents of a place); `street`, `corridor` and `country` (its kinds); `light` and `picture`
+(drawing); `layouts`, `city` and `world` (the files).
 """
 
 from crisalad_jax.synthetic.city import SyntheticCityConfig, write_synthetic_city

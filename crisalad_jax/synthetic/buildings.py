@@ -51,8 +51,7 @@ def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> Body:
     height = ground + storey * floors + rng.uniform(0.2, 1.0)
 
     end = 0.0 if front.sees_start else width
-    side = sheets(end, 0, end, -DEPTH, 0, height)
-    front.add(side, scaled(wall, 0.85), normal=front.end_normal)
+    front.add(sheets(end, 0, end, -DEPTH, 0, height), scaled(wall, 0.85), normal=front.end_normal)
     _roof(rng, front, width, height, wall)
     front.add(rects(0, 0, width, height), wall)
     base = scaled(wall, 0.72) if rng.random() < 0.5 else pick(rng, WALLS)
@@ -125,16 +124,13 @@ def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> N
             inset = width / 2 * np.arange(steps) / steps
             front.add(rects(inset, v, width - inset, v + rise / steps), wall)
         u = width / 2
-        eye = bars(u, 0.5, height + 0.2, height + rise * 0.45)
-        front.add(eye, GLASS, Kind.GLASS)
+        front.add(bars(u, 0.5, height + 0.2, height + rise * 0.45), GLASS, Kind.GLASS)
     elif shape == "mansard":
         top = height + rng.uniform(2.4, 3.4)
         front.add(rects(0, height, width, top, 0, -1), tiles, Kind.ROOF, uphill)
         u, _ = _axes(width, rng.uniform(2.6, 4.5))
-        dormers = bars(u, 0.75, height + 0.4, top - 0.3, -0.1)
-        front.add(dormers, scaled(wall, 1.1))
-        panes = bars(u, 0.45, height + 0.6, top - 0.6, -0.1)
-        front.add(panes, GLASS, Kind.GLASS)
+        front.add(bars(u, 0.75, height + 0.4, top - 0.3, -0.1), scaled(wall, 1.1))
+        front.add(bars(u, 0.45, height + 0.6, top - 0.6, -0.1), GLASS, Kind.GLASS)
     else:
         parapet = rects(0, height, width, height + rng.uniform(0.3, 0.9))
         front.add(parapet, scaled(wall, 0.9), Kind.LEDGE)
@@ -150,20 +146,14 @@ def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> N
 
 
 def _windows(
-    rng: Rng,
-    front: Mesh,
-    width: float,
-    levels: np.ndarray,
-    storey: float,
-    habit: Habit,
-    trim: Colour,
+    rng: Rng, front: Mesh, wide: float, levels: np.ndarray, rise: float, habit: Habit, trim: Colour
 ) -> None:
     """Add windows above the ground floor, with frames, shutters, sills and balconies."""
-    axis, cell = _axes(width, habit.spacing * rng.uniform(0.8, 1.25))
+    axis, cell = _axes(wide, habit.spacing * rng.uniform(0.8, 1.25))
     columns = len(axis)
     halves = np.full(columns, cell * rng.uniform(0.17, 0.33))
-    tall = storey * rng.uniform(0.45, 0.72)
-    low = levels + (storey - tall) * rng.uniform(0.4, 0.7)
+    tall = rise * rng.uniform(0.45, 0.72)
+    low = levels + (rise - tall) * rng.uniform(0.4, 0.7)
     high = low + tall
     style = rng.choice(("grid", "bands", "shafts"), p=(0.76, 0.14, 0.10))
     # The rhythm of the columns identifies the building in every season and light.
@@ -179,7 +169,7 @@ def _windows(
         halves[columns // 2] = cell * 0.42
     axis, halves = axis[present], halves[present]
     if style == "bands":
-        axis, halves = np.array([width / 2]), np.array([width * rng.uniform(0.4, 0.48)])
+        axis, halves = np.array([wide / 2]), np.array([wide * rng.uniform(0.4, 0.48)])
     elif style == "shafts":
         low, high = low[:1], high[-1:]
     elif len(levels) > 2 and rng.random() < 0.35:
@@ -225,8 +215,7 @@ def _shops(rng: Rng, front: Mesh, width: float, lintel: float) -> None:
     front.add(rects(start + 0.4, 0.5, end, lintel), scaled(GLASS, 1.2), Kind.SHOP)
     front.add(rects(end + 0.35, 0, end + 1.3, lintel), scaled(GLASS, 1.2), Kind.SHOP)
     for u0, u1 in zip(start, end, strict=True):
-        board = rects(u0 + 0.3, lintel + 0.1, u0 + span - 0.3, lintel + 0.8)
-        front.add(board, pick(rng, SIGNS))
+        front.add(rects(u0 + 0.3, lintel + 0.1, u0 + span - 0.3, lintel + 0.8), pick(rng, SIGNS))
         if rng.random() < 0.4:
             high, low, out = lintel + 0.2, lintel - 0.5, rng.uniform(1.0, 1.6)
             front.add(rects(u0, high, u1, low, 0, out), pick(rng, SIGNS), Kind.LEDGE)

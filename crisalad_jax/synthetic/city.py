@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from crisalad_jax.synthetic.layouts import (
     MONTHS,
     UTM_ORIGIN,
     Files,
+    Progress,
     TrainImage,
     gsv_city,
-    identity_of,
     jpeg,
     panoid,
     utm_path,
@@ -38,8 +38,6 @@ from crisalad_jax.synthetic.view import (
 
 _CITY_NAMES = ("Alderby", "Brackwater")
 """Names of the training cities, which are invented."""
-_RENDERER = 1
-"""Version of the city: increase it if pictures change, and cities on disk no longer match."""
 _SPACING = 80.0
 """Metres between neighbouring places: more than three times the 25 m that make a positive."""
 _HOURS: tuple[Time, ...] = ("noon", "dusk", "night", "noon")
@@ -73,10 +71,7 @@ class SyntheticCityConfig:
 
 
 def write_synthetic_city(
-    root: str | os.PathLike[str],
-    config: SyntheticCityConfig,
-    *,
-    progress: Callable[[int], object] | None = None,
+    root: str | os.PathLike[str], config: SyntheticCityConfig, *, progress: Progress = None
 ) -> None:
     """Render the city into `root`, whole or not at all.
 
@@ -93,7 +88,7 @@ def write_synthetic_city(
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
     """
-    write_set(root, "city.json", identity_of(_RENDERER, config), _files(config), progress)
+    write_set(root, "city.json", config, _files(config), progress)
 
 
 def _files(config: SyntheticCityConfig) -> Files:
@@ -126,11 +121,8 @@ def _train_images(config: SyntheticCityConfig, city: int) -> Iterator[TrainImage
     for place_id, index in enumerate(indices, start=1):
         spot = _Spot(place_seed(config, 0, index), index, config.train_places)
         seasons, hours = spot.rng.permutation(4), spot.rng.permutation(4)
-        drawn = [
-            _draw_view(spot.rng, SEASONS[season], _HOURS[hour])
-            for season, hour in zip(seasons, hours, strict=True)
-        ]
-        for view in drawn:
+        order = list(zip(seasons, hours, strict=True))
+        for view in [_draw_view(spot.rng, SEASONS[s], _HOURS[h]) for s, h in order]:
             east, north, northdeg = spot.pose(view)
             lat = f"{latitude + north / METRES_PER_DEGREE:.7f}"
             lon = f"{longitude + east / per_degree:.7f}"

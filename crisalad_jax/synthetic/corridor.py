@@ -8,6 +8,7 @@ from crisalad_jax.synthetic.mesh import (
     DOWN,
     GROUND_LAYER,
     SIGNS,
+    UP,
     WALLS,
     Colour,
     Kind,
@@ -44,6 +45,7 @@ class _Box(NamedTuple):
 def corridor(rng: Rng) -> Place:
     """Build a corridor; one in four is a wide hall with columns."""
     mesh = Mesh(_EYE)
+    mesh.layer = GROUND_LAYER + 1  # walls and ceiling, before all that stands in the corridor
     hall = rng.random() < 0.25
     width = rng.uniform(5.0, 16.0) if hall else rng.uniform(1.5, 4.2)
     height = rng.uniform(3.0, 8.0) if hall else rng.uniform(2.2, 3.4)
@@ -60,7 +62,6 @@ def corridor(rng: Rng) -> Place:
     _ceiling(mesh, rng, box)
     _end(mesh, rng, box)
     for x, side, wall in ((box.left, -1.0, walls[0]), (box.right, 1.0, walls[1])):
-        mesh.layer = GROUND_LAYER - 10
         front = mesh.front(x, 0.0, side)
         front.add(rects(_START, 0, length, height), wall)
         _stains(front, rng, wall, box)
@@ -83,36 +84,35 @@ def _floor(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add the floor, with tiles, a carpet, planks or spots."""
     left, right, _, length = box
     colour = pick(rng, _FLOORS)
-    mesh.ground(0, flat(left, _START, right, length), colour)
+    mesh.add(flat(left, _START, right, length), colour, normal=UP, layer=GROUND_LAYER + 2)
     kind = rng.choice(("plain", "tiles", "carpet", "boards", "checks"), p=(0.2, 0.3, 0.2, 0.1, 0.2))
     if kind == "tiles":
         size, line = rng.uniform(0.3, 1.2), rng.uniform(0.01, 0.03)
         shade = scaled(colour, rng.choice((0.75, 1.25)))
         z, x = np.arange(_START, length, size), np.arange(left, right, size)
-        mesh.ground(-1, flat(left, z - line, right, z + line), shade)
-        mesh.ground(-1, flat(x - line, _START, x + line, length), shade)
+        mesh.ground(flat(left, z - line, right, z + line), shade)
+        mesh.ground(flat(x - line, _START, x + line, length), shade)
     elif kind == "carpet":
         inset = rng.uniform(0.1, 0.3) * (right - left)
-        carpet = flat(left + inset, _START, right - inset, length)
-        mesh.ground(-1, carpet, pick(rng, SIGNS, 0.3))
+        mesh.ground(flat(left + inset, _START, right - inset, length), pick(rng, SIGNS, 0.3))
         if rng.random() < 0.5:
             edge = np.array((left + inset, right - inset - 0.08))
-            mesh.ground(-1, flat(edge, _START, edge + 0.08, length), pick(rng, SIGNS, 0.3))
+            mesh.ground(flat(edge, _START, edge + 0.08, length), pick(rng, SIGNS, 0.3))
     elif kind == "boards":
         x = np.arange(left, right, rng.uniform(0.15, 0.4))[::2]
-        mesh.ground(-1, flat(x, _START, x + 0.1, length), scaled(colour, 0.88))
+        mesh.ground(flat(x, _START, x + 0.1, length), scaled(colour, 0.88))
     elif kind == "checks":
         size = rng.uniform(0.3, 1.0)
         x, z = np.meshgrid(np.arange(left, right, size), np.arange(_START, length, size))
         odd = (np.indices(x.shape).sum(0) % 2).astype(bool)
         x, z = x[odd], z[odd]
         checks = flat(x, z, np.minimum(x + size, right), z + size)
-        mesh.ground(-1, checks, scaled(colour, rng.uniform(0.5, 0.9)))
+        mesh.ground(checks, scaled(colour, rng.uniform(0.5, 0.9)))
     count = int(rng.integers(0, 14))
     x, z = rng.uniform(left, right - 0.3, count), rng.uniform(0, length, count)
     size = rng.uniform(0.1, 0.6, count)
     spots = flat(x, z, np.minimum(x + size, right), z + size * rng.uniform(0.5, 2.0))
-    mesh.ground(-1, spots, scaled(colour, rng.uniform(0.6, 1.3)))
+    mesh.ground(spots, scaled(colour, rng.uniform(0.6, 1.3)))
 
 
 def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
@@ -120,8 +120,7 @@ def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
     left, right, height, length = box
     colour = pick(rng, _CEILINGS)
     ceiling = flat(left, _START, right, length, height)
-    mesh.add(ceiling, colour, normal=DOWN, layer=GROUND_LAYER)
-    mesh.layer = GROUND_LAYER - 1
+    mesh.add(ceiling, colour, normal=DOWN, layer=GROUND_LAYER + 2)
     if rng.random() < 0.45:
         size = rng.uniform(0.5, 1.3)
         z, x = np.arange(_START, length, size), np.arange(left, right, size)
@@ -146,12 +145,10 @@ def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
     if rng.random() < 0.25:
         depth = rng.uniform(0.15, 0.6)
         for at in np.arange(length - rng.uniform(0.5, 2), 0, -rng.uniform(2.0, 5.0)):
-            mesh.layer = float(at)
-            mesh.add(rects(left, height - depth, right, height, at), scaled(colour, 0.8))
+            mesh.add(rects(left, height - depth, right, height, at), scaled(colour, 0.8), layer=at)
             under = flat(left, at, right, at + 0.3, height - depth)
-            mesh.add(under, scaled(colour, 0.9), normal=DOWN)
+            mesh.add(under, scaled(colour, 0.9), normal=DOWN, layer=at)
     if rng.random() < 0.3:
-        mesh.layer = GROUND_LAYER - 5
         for _ in range(int(rng.integers(1, 4))):
             x, r = rng.uniform(left + 0.1, right - 0.2), rng.uniform(0.04, 0.15)
             pipe = flat(x - r, _START, x + r, length, height - 0.25)
@@ -162,16 +159,14 @@ def _end(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add what closes the corridor: a wall, a door, a window, or a way on."""
     left, right, height, length = box
     wall = pick(rng, WALLS)
-    mesh.add(rects(left, 0, right, height, length), wall, layer=GROUND_LAYER - 8)
-    mesh.layer = GROUND_LAYER - 9
+    mesh.add(rects(left, 0, right, height, length), wall)
     middle, half = rng.uniform(0.3, 0.7) * (right - left) + left, rng.uniform(0.2, 0.45)
     half *= min(right - left, 3.0)
     kind = rng.choice(("wall", "door", "window", "way"), p=(0.2, 0.35, 0.2, 0.25))
     low, high = max(left, middle - half), min(right, middle + half)
     if kind == "door":
         door, top = pick(rng, _WOOD), min(2.1, height - 0.1)
-        frame = rects(low - 0.08, 0, high + 0.08, top + 0.08, length)
-        mesh.add(frame, scaled(door, 0.7))
+        mesh.add(rects(low - 0.08, 0, high + 0.08, top + 0.08, length), scaled(door, 0.7))
         mesh.add(rects(low, 0, high, top, length), door)
         if rng.random() < 0.5:
             pane = rects(low + 0.15, 1.1, high - 0.15, top - 0.15, length)
@@ -220,7 +215,7 @@ def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
     z = _START + rng.uniform(0.0, 2.0)
     while z < box.length - 1.2:
         kind = rng.choice(kinds, p=weights)
-        front.layer = GROUND_LAYER - 20 - z * 1e-3
+        front.layer = GROUND_LAYER - 1 - z * 1e-3  # after both walls
         wide = rng.uniform(0.75, 1.1)
         if kind == "door":
             _door(front, rng, z, wide, top, doors, trim)
@@ -291,8 +286,7 @@ def _furniture(front: Mesh, rng: Rng, kind: str, z: float, wide: float, height: 
     front.boxes(rect, out, colour)
     if kind == "cupboard":
         middle = z + wide / 2
-        gap = bars(middle, 0.02, 0.05, rect[3] - 0.05, 0.45)
-        front.add(gap, scaled(colour, 0.6))
+        front.add(bars(middle, 0.02, 0.05, rect[3] - 0.05, 0.45), scaled(colour, 0.6))
 
 
 def _columns(mesh: Mesh, rng: Rng, box: _Box) -> None:
@@ -320,8 +314,7 @@ def _hanging(mesh: Mesh, rng: Rng, box: _Box) -> None:
         x = left + edge if rng.random() < 0.5 else right - edge
         colour = pick(rng, _WOOD + SIGNS)
         if rng.random() < 0.4:
-            plant = discs(x, 0.8, rng.uniform(0.2, 0.4), z)
-            mesh.add(plant, (0.18, 0.34, 0.16), Kind.NEEDLE)
+            mesh.add(discs(x, 0.8, rng.uniform(0.2, 0.4), z), (0.18, 0.34, 0.16), Kind.NEEDLE)
         else:
             half, tall = rng.uniform(0.1, 0.35), rng.uniform(0.3, 1.1)
             mesh.block((x - half, 0, z), (x + half, tall, z + 2 * half), colour)

@@ -4,6 +4,7 @@ import numpy as np
 
 from crisalad_jax.synthetic.buildings import Habit, building
 from crisalad_jax.synthetic.mesh import (
+    GROUND_LAYER,
     SIGNS,
     UP,
     WALLS,
@@ -82,7 +83,7 @@ def _fields(mesh: Mesh, rng: Rng) -> None:
     """Add a meadow, fields and tufts."""
     # In bands, because a part has one depth, whose haze it gets.
     for near, far in ((300, 2500), (120, 300), (50, 120), (15, 50), (-20, 15)):
-        mesh.ground(9, flat(-900, near, 900, far), (0.44, 0.46, 0.40), Kind.GRASS)
+        mesh.ground(flat(-900, near, 900, far), (0.44, 0.46, 0.40), Kind.GRASS)
     for side in (-1.0, 1.0):
         z = rng.uniform(-10, 10)
         while z < 400 and rng.random() < 0.8:
@@ -92,13 +93,13 @@ def _fields(mesh: Mesh, rng: Rng) -> None:
             slant = rng.normal(0, 0.2) * deep
             z1 = z + deep
             field = polygons((x0, 0, z), (x1, 0, z), (x1 + slant, 0, z1), (x0, 0, z1))
-            mesh.ground(8, field, pick(rng, _FIELDS, 0.2), Kind.SOIL)
+            mesh.ground(field, pick(rng, _FIELDS, 0.2), Kind.SOIL)
             z = z1
     z = rng.uniform(1, 60, 60)
     x, size = rng.uniform(-25, 25, 60), rng.uniform(0.2, 1.6, 60)
     tufts = flat(x, z, x + size, z + size)
     for half in (tufts[::2], tufts[1::2]):
-        mesh.ground(7, half, pick(rng, _FIELDS), Kind.SOIL)
+        mesh.ground(half, pick(rng, _FIELDS), Kind.SOIL)
 
 
 def _lay(mesh: Mesh, rng: Rng, way: _Way, kind: str) -> float:
@@ -110,23 +111,23 @@ def _lay(mesh: Mesh, rng: Rng, way: _Way, kind: str) -> float:
     if kind == "meadow":
         return 1.5
     half = rng.uniform(0.7, 1.8)
-    mesh.ground(6, way.strip(-half, half), pick(rng, _FIELDS), Kind.SOIL)
+    mesh.ground(way.strip(-half, half), pick(rng, _FIELDS), Kind.SOIL)
     if rng.random() < 0.5:
-        mesh.ground(5, way.strip(-0.3 * half, 0.3 * half), pick(rng, _FIELDS), Kind.GRASS)
+        mesh.ground(way.strip(-0.3 * half, 0.3 * half), pick(rng, _FIELDS), Kind.GRASS)
     return half
 
 
 def _road(mesh: Mesh, rng: Rng, way: _Way) -> float:
     half = rng.uniform(2.2, 5.0)
     asphalt, white = pick(rng, _ASPHALT), (0.80, 0.80, 0.76)
-    mesh.ground(6, way.strip(-half - 0.6, half + 0.6), pick(rng, _STONES), Kind.SOIL)
-    mesh.ground(5, way.strip(-half, half), asphalt, Kind.ROAD)
+    mesh.ground(way.strip(-half - 0.6, half + 0.6), pick(rng, _STONES), Kind.SOIL)
+    mesh.ground(way.strip(-half, half), asphalt, Kind.ROAD)
     if rng.random() < 0.6:
         for at in (-half + 0.2, half - 0.3):
-            mesh.ground(4, way.strip(at, at + 0.12), white, Kind.ROAD)
+            mesh.ground(way.strip(at, at + 0.12), white, Kind.ROAD)
     if rng.random() < 0.7:
         z = np.arange(rng.uniform(0, 6), 90, rng.uniform(4, 9))
-        mesh.ground(4, way.band(z, z + 2.5, -0.07, 0.07), white, Kind.ROAD)
+        mesh.ground(way.band(z, z + 2.5, -0.07, 0.07), white, Kind.ROAD)
     return half
 
 
@@ -134,13 +135,14 @@ def _railway(mesh: Mesh, rng: Rng, way: _Way) -> float:
     """Add one track or two, at times with masts and wires."""
     tracks = (0.0,) if rng.random() < 0.6 else (-2.2, 2.2)
     half = abs(tracks[-1]) + 2.0
-    mesh.ground(6, way.strip(-half, half), pick(rng, _STONES), Kind.SOIL)
+    mesh.ground(way.strip(-half, half), pick(rng, _STONES), Kind.SOIL)
     z = np.arange(0.5, 45, 0.65)
     for track in tracks:
         x = way.at(z) + track
-        mesh.ground(5, flat(x - 1.25, z, x + 1.25, z + 0.26), (0.34, 0.30, 0.27), Kind.SOIL)
+        mesh.ground(flat(x - 1.25, z, x + 1.25, z + 0.26), (0.34, 0.30, 0.27), Kind.SOIL)
         for rail in (-0.75, 0.68):
-            mesh.ground(4, way.strip(track + rail, track + rail + 0.08), (0.5, 0.46, 0.44))
+            strip = way.strip(track + rail, track + rail + 0.08)  # over the sleepers of both tracks
+            mesh.add(strip, (0.5, 0.46, 0.44), normal=UP, layer=GROUND_LAYER)
     if rng.random() < 0.6:
         _masts(mesh, rng, way, half)
     return half
@@ -254,8 +256,7 @@ def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
         x = float(way.at(z)) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
         if rng.random() < 0.6:
             mesh.add(bars(x, 0.04, 0, 2.6, z), (0.45, 0.45, 0.45))
-            sign = bars(x, 0.35, 1.7, 2.0 + rng.uniform(0.2, 0.7), z)
-            mesh.add(sign, pick(rng, SIGNS))
+            mesh.add(bars(x, 0.35, 1.7, 2.0 + rng.uniform(0.2, 0.7), z), pick(rng, SIGNS))
         else:
             size = rng.uniform(0.4, 1.5)
             mesh.block((x - size, 0, z), (x + size, size, z + size), pick(rng, _STONES))

@@ -8,7 +8,7 @@ import dataclasses
 import json
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -22,7 +22,10 @@ from crisalad_jax.utils.files import read_json, told_of, write_json
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 Files = Iterator[tuple[str, bytes]]
+Progress = Callable[[int], object] | None
 
+RENDERER = 1
+"""Version of the renderer: increase it if pictures change, and sets on disk no longer match."""
 METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
 UTM_ORIGIN = (500_000.0, 5_000_000.0)
@@ -30,18 +33,18 @@ UTM_ORIGIN = (500_000.0, 5_000_000.0)
 MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 
 
-def holds(root: str | os.PathLike[str], file: str, identity: Mapping[str, Any]) -> bool:
+def holds(root: str | os.PathLike[str], file: str, config: Any) -> bool:
     """Return whether a folder holds this set already; False where it can be written there.
 
     Args:
         root: the folder.
         file: name of the file that says what the folder holds.
-        identity: the contents of that file.
+        config: the set's configuration, a dataclass.
 
     Raises:
         InputError: `root` is a file, or holds anything else.
     """
-    root = pathlib.Path(root)
+    root, identity = pathlib.Path(root), _identity(config)
     if root.is_dir() and any(root.iterdir()):
         found = "a folder with other content"
         with contextlib.suppress(InputError):
@@ -58,26 +61,27 @@ def holds(root: str | os.PathLike[str], file: str, identity: Mapping[str, Any]) 
     raise InputError(f"{root}: found {found}, expected a new or empty folder")
 
 
+def _identity(config: Any) -> dict[str, Any]:
+    """Return what tells a set from others, as JSON has it."""
+    return json.loads(json.dumps({"renderer": RENDERER, **dataclasses.asdict(config)}))
+
+
 def write_set(
-    root: str | os.PathLike[str],
-    file: str,
-    identity: Mapping[str, Any],
-    files: Files,
-    progress: Callable[[int], object] | None,
+    root: str | os.PathLike[str], file: str, config: Any, files: Files, progress: Progress
 ) -> None:
     """Write a set into `root`, whole or not at all, unless it is there.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this set.
         file: name of the file that says what the folder holds.
-        identity: the contents of that file.
+        config: the set's configuration, a dataclass.
         files: the set.
         progress: called with 1 after every picture.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
     """
-    if holds(root, file, identity):
+    if holds(root, file, config):
         return
     root = pathlib.Path(root)
     temporary = temporary_beside(root)
@@ -90,13 +94,8 @@ def write_set(
             if progress is not None and path.suffix == ".jpg":
                 progress(1)
         with told_of(root):
-            write_json(temporary / file, identity)
+            write_json(temporary / file, _identity(config))
             os.replace(temporary, root)
-
-
-def identity_of(renderer: int, config: Any) -> dict[str, Any]:
-    """Return what tells a set from others: the renderer's version and the configuration."""
-    return json.loads(json.dumps({"renderer": renderer, **dataclasses.asdict(config)}))
 
 
 class TrainImage(NamedTuple):

@@ -132,7 +132,7 @@ class Mesh:
         """Start without parts; cameras are some `eye` metres above the ground."""
         self.eye = eye
         self.layer = 0.0
-        """Painting order of the parts to come: larger is farther away."""
+        """Painting order of the parts to come: larger is farther away, and painted first."""
         self.normal: Vector = TO_CAMERA
         """Direction that the parts to come face unless told otherwise."""
         self.sees_start = False
@@ -177,11 +177,9 @@ class Mesh:
             layer = self.layer if layer is None else layer
             self._parts.append((count, albedo, normal or self.normal, int(kind), layer))
 
-    def ground(
-        self, level: int, polygons: Polygons, albedo: Colour, kind: Kind = Kind.SOLID
-    ) -> None:
-        """Add a part of the ground; those of a larger level are painted first."""
-        self.add(polygons, albedo, kind, UP, GROUND_LAYER + level)
+    def ground(self, polygons: Polygons, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+        """Add a part of the ground, over those before it."""
+        self.add(polygons, albedo, kind, UP, GROUND_LAYER + 1)
 
     def block(self, low: Vector, high: Vector, albedo: Colour) -> None:
         """Add an upright box: its top, its side towards the middle of the street, its front."""

@@ -74,27 +74,26 @@ def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> 
     """Add pavements, the street, the crossing at its far end, and their lines."""
     paving, asphalt = pick(rng, _PAVING), pick(rng, _ASPHALT)
     left, right = kerbs
-    mesh.ground(9, flat(-900, -20, 900, 2500), (0.44, 0.46, 0.40), Kind.GRASS)
-    mesh.ground(8, flat(-200, -20, 200, length + 25), paving, Kind.PAVEMENT)
+    mesh.ground(flat(-900, -20, 900, 2500), (0.44, 0.46, 0.40), Kind.GRASS)
+    mesh.ground(flat(-200, -20, 200, length + 25), paving, Kind.PAVEMENT)
     street, crossing = flat(left, -20, right, length + 1), flat(-120, length + 1, 120, length + 8)
-    mesh.ground(7, np.concatenate((street, crossing)), asphalt, Kind.ROAD)
+    mesh.ground(np.concatenate((street, crossing)), asphalt, Kind.ROAD)
     edge = np.array(kerbs)
-    kerb = flat(edge - 0.12, -5, edge + 0.12, length + 1)
-    mesh.ground(6, kerb, scaled(paving, 1.25), Kind.PAVEMENT)
+    mesh.ground(flat(edge - 0.12, -5, edge + 0.12, length + 1), scaled(paving, 1.25), Kind.PAVEMENT)
     white, middle = (0.78, 0.78, 0.74), (left + right) / 2
     if rng.random() < 0.7:
         dash = rng.uniform(1.5, 3.5)
         z = np.arange(1, length, dash * 2)
-        mesh.ground(6, flat(middle - 0.08, z, middle + 0.08, z + dash), white, Kind.ROAD)
+        mesh.ground(flat(middle - 0.08, z, middle + 0.08, z + dash), white, Kind.ROAD)
     if rng.random() < 0.45:
         z, x = rng.uniform(6.0, length - 6), np.arange(left + 0.4, right - 0.6, 1.0)
-        mesh.ground(6, flat(x, z, x + 0.5, z + 3), white, Kind.ROAD)
+        mesh.ground(flat(x, z, x + 0.5, z + 3), white, Kind.ROAD)
     if rng.random() < 0.35:
         x = np.array((left + 2.2, right - 2.2))
-        mesh.ground(6, flat(x - 0.06, -5, x + 0.06, length), white, Kind.ROAD)
+        mesh.ground(flat(x - 0.06, -5, x + 0.06, length), white, Kind.ROAD)
     if rng.random() < 0.2:
         x = middle + np.array((-2.2, -0.8, 0.8, 2.2))
-        mesh.ground(6, flat(x - 0.07, -5, x + 0.07, length), (0.20, 0.20, 0.21))
+        mesh.ground(flat(x - 0.07, -5, x + 0.07, length), (0.20, 0.20, 0.21))
 
 
 def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
@@ -107,8 +106,7 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
         colour = pick(rng, WALLS[6:])
         mesh.add(rects(x, 0, x + width, height, z), colour)
         if rng.random() < 0.5:
-            setback = rects(x + width * 0.25, height, x + width * 0.75, height * 1.12, z)
-            mesh.add(setback, colour)
+            mesh.add(rects(x + width * 0.25, height, x + width * 0.75, height * 1.12, z), colour)
         columns, rows = int(rng.integers(3, 7)), int(rng.integers(6, 14))
         u = np.tile(x + (np.arange(columns) + 0.2) * width / columns, rows)
         v = np.repeat((np.arange(rows) + 0.3) * height / rows, columns)
@@ -123,8 +121,7 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
         eaves, tip = half + 0.4, height * rng.uniform(1.2, 1.7)
         spire = polygons((x - eaves, height, z), (x + eaves, height, z), (x, tip, z))
         mesh.add(spire, pick(rng, ROOFS), Kind.ROOF, (0.0, 0.6, -0.8))
-        bell = bars(x, half * 0.3, height * 0.82, height * 0.93, z)
-        mesh.add(bell, (0.12, 0.12, 0.13))
+        mesh.add(bars(x, half * 0.3, height * 0.82, height * 0.93, z), (0.12, 0.12, 0.13))
 
 
 def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
@@ -162,7 +159,7 @@ def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habi
 
 def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:
     """Add lawn and trees behind a wall, on a side without houses."""
-    mesh.ground(5, flat(x, -5, x + side * 90, length), (0.40, 0.48, 0.30), Kind.GRASS)
+    mesh.ground(flat(x, -5, x + side * 90, length), (0.40, 0.48, 0.30), Kind.GRASS)
     for z in np.arange(rng.uniform(10, 16), length, rng.uniform(5.0, 9.0)):
         tree(mesh, rng, x + side * rng.uniform(2.0, 16.0), float(z))
     colour, height = pick(rng, WALLS), rng.uniform(0.7, 1.6)

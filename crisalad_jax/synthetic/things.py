@@ -69,8 +69,7 @@ def lamp(mesh: Mesh, x: float, z: float, height: float) -> Vector:
     post = bars(x, 0.09, 0, height, z)
     arm = rects(min(x, tip), height - 0.12, max(x, tip), height, z)
     mesh.add(np.concatenate((post, arm)), (0.20, 0.22, 0.22))
-    head = bars(tip, 0.35, height - 0.32, height - 0.08, z)
-    mesh.add(head, (0.75, 0.74, 0.68), Kind.LAMP)
+    mesh.add(bars(tip, 0.35, height - 0.32, height - 0.08, z), (0.75, 0.74, 0.68), Kind.LAMP)
     return (tip, height - 0.2, z)
 
 
@@ -100,8 +99,7 @@ def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     stone = scaled(stone, 0.9)
     if rng.random() < 0.5:
         mesh.block((x - half, 0.9, z + 1), (x + half, height, z + 1 + 2 * half), stone)
-        ball = discs(x, height + 0.7, 0.8, z + 1)
-        mesh.add(ball, (0.35, 0.40, 0.36), normal=(0.0, 0.5, -0.85))
+        mesh.add(discs(x, height + 0.7, 0.8, z + 1), (0.35, 0.40, 0.36), normal=(0.0, 0.5, -0.85))
     else:
         tip = (x + 0.15, height, z), (x - 0.15, height, z)
         mesh.add(polygons((x - half, 0.9, z), (x + half, 0.9, z), *tip), stone)
@@ -143,8 +141,7 @@ def _vehicle(mesh: Mesh, rng: Rng, x: float, z: float, *, bus: bool, away: bool)
     paint = pick(rng, SIGNS if bus else _PAINT)
     half, length, height = (1.25, 10.5, 3.0) if bus else (0.9, 4.3, 0.95)
     mesh.layer = z + 0.01
-    shadow = flat(x - half - 0.2, z - 0.2, x + half + 0.2, z + length)
-    mesh.add(shadow, (0.1, 0.1, 0.1), normal=UP)
+    mesh.add(flat(x - half - 0.2, z - 0.2, x + half + 0.2, z + length), (0.1, 0.1, 0.1), normal=UP)
     near = np.array((x - half, x + half - 0.3))
     mesh.add(rects(near, 0, near + 0.3, 0.5, z + 0.1), _TYRE)
     mesh.block((x - half, 0.3, z), (x + half, height, z + length), paint)
@@ -171,7 +168,6 @@ def _person(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     tall, stride = rng.uniform(0.9, 1.08), rng.uniform(0.05, 0.3)
     hip, foot = np.array((-0.1, 0.1)) + x, np.array((-stride, stride)) + x
     hips = (hip + 0.08, 0.85 * tall, z), (hip - 0.08, 0.85 * tall, z)
-    legs = polygons(*hips, (foot - 0.08, 0.0, z), (foot + 0.08, 0.0, z))
-    mesh.add(legs, pick(rng, _PAINT[1:4]))
+    mesh.add(polygons(*hips, (foot - 0.08, 0.0, z), (foot + 0.08, 0.0, z)), pick(rng, _PAINT[1:4]))
     mesh.add(bars(x, 0.26, 0.8 * tall, 1.48 * tall, z), pick(rng, SIGNS, 0.3))
     mesh.add(discs(x, 1.63 * tall, 0.13, z), (0.62, 0.47, 0.38))

@@ -3,8 +3,8 @@
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, get_args
+from collections.abc import Iterator, Sequence
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -13,10 +13,10 @@ from crisalad_jax.synthetic.layouts import (
     METRES_PER_DEGREE,
     UTM_ORIGIN,
     Files,
+    Progress,
     TrainImage,
     gsv_city,
     holds,
-    identity_of,
     jpeg,
     panoid,
     utm_path,
@@ -50,8 +50,6 @@ _FIELDS: dict[Variation, tuple[str, ...]] = {
     "exposure": ("exposure", "noise"),
 }
 """Fields of `View` that are one variation."""
-_RENDERER = 1
-"""Version of the world: increase it if pictures change."""
 _FILE = "world.json"
 _SCENES_PER_CITY = 12
 _SPACING = 100.0
@@ -82,6 +80,9 @@ class WorldConfig:
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
+        # The order of variations makes no other world.
+        varied = tuple(name for name in VARIATIONS if name in self.varied)
+        object.__setattr__(self, "varied", varied)
         for name in ("scenes", "stations", "images_per_place", "test_scenes"):
             check_range(f"WorldConfig.{name}", getattr(self, name), 1)
         check_range("WorldConfig.repaint", self.repaint, 0, 3)
@@ -96,10 +97,7 @@ class WorldConfig:
 
 
 def write_world(
-    root: str | os.PathLike[str],
-    config: WorldConfig,
-    *,
-    progress: Callable[[int], object] | None = None,
+    root: str | os.PathLike[str], config: WorldConfig, *, progress: Progress = None
 ) -> None:
     """Render a world into `root`, whole or not at all.
 
@@ -114,7 +112,7 @@ def write_world(
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
     """
-    write_set(root, _FILE, _identity(config), _files(config), progress)
+    write_set(root, _FILE, config, _files(config), progress)
 
 
 def has_world(root: str | os.PathLike[str], config: WorldConfig) -> bool:
@@ -127,13 +125,7 @@ def has_world(root: str | os.PathLike[str], config: WorldConfig) -> bool:
     Raises:
         InputError: `root` is a file, or holds something else.
     """
-    return holds(root, _FILE, _identity(config))
-
-
-def _identity(config: WorldConfig) -> dict[str, Any]:
-    """Return what world.json has of a world; the order of its variations makes no other."""
-    varied = tuple(name for name in VARIATIONS if name in config.varied)
-    return identity_of(_RENDERER, dataclasses.replace(config, varied=varied))
+    return holds(root, _FILE, config)
 
 
 def _files(config: WorldConfig) -> Files:
