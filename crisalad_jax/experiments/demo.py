@@ -24,8 +24,8 @@ from crisalad_jax.experiments.report import (
     recall_markdown,
     training_curves,
 )
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.nn.model import Model, init_crisalad
+from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -87,10 +87,8 @@ def _demo(config: DemoConfig, out: pathlib.Path, quiet: bool, started: float) ->
     city = SyntheticCityConfig(
         train_places=config.train_places, test_places=config.test_places, seed=config.seed
     )
-    images = city.train_places * city.images_per_place
-    images += city.test_places * (city.database_per_place + city.queries_per_place)
-    with progress_bar("rendering the city", images, "images", quiet=quiet) as bar:
-        write_synthetic_city(out / "city", city, progress=lambda done, total: bar.advance(1))
+    with progress_bar("rendering the city", city.images, "images", quiet=quiet) as bar:
+        write_synthetic_city(out / "city", city, progress=bar.advance)
     benchmark = open_benchmark(out / "city" / "test")
     places = read_places(out / "city" / "train")
 

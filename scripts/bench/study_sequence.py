@@ -21,9 +21,9 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import recalls
-from crisalad_jax.experiments.synthetic import View, render
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.sequence import BayesFilter
+from crisalad_jax.synthetic import View, render
 
 FILTERS = {
     "filter, no adapt": BayesFilter(adapt=False),

@@ -29,10 +29,9 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.experiments.synthetic import SCENERIES, WorldConfig, write_world
-from crisalad_jax.experiments.synthetic.world import VARIATIONS
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
+from crisalad_jax.synthetic import SCENERIES, VARIATIONS, WorldConfig, write_world
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit

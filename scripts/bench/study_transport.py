@@ -20,9 +20,9 @@ from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.demo import DemoConfig, demo_recipe
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.nn.model import Model
 from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit

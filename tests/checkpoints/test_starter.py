@@ -14,9 +14,9 @@ from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.experiments.synthetic import WorldConfig, write_world
 from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.retrieval.describe import prepare_image
+from crisalad_jax.synthetic import WorldConfig, write_world
 from crisalad_jax.utils.notes import Note
 
 GOLDEN = pathlib.Path(__file__).parents[2] / "parity" / "goldens" / "starter.npz"
