@@ -129,7 +129,7 @@ import crisalad_jax as cj
 @cj.register_recipe("salad")
 def mine(model, preset):
     return cj.TrainConfig(model=model)
-""", "register_recipe 'salad': found the name taken by crisalad_jax.training.recipes.salad, exp"),
+""", "register_recipe 'salad': found the name taken by crisalad_jax.training.recipes.dinov2, exp"),
 }  # fmt: skip
 
 

@@ -403,7 +403,7 @@ VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("train", "--images-per-place", ("0", "-1", HUGE)),
     ("train", "--min-images", ("0", "-1", HUGE)),
     ("train", "--patience", ("-1", "x")),
-    ("train", "--keep-best", ("-1",)),
+    ("train", "--save-top-k", ("-1",)),
     ("train", "--num-workers", ("-1", "x")),
     ("train", "--optimiser.learning-rate", ("-1", "nan", "inf", "x")),
     ("train", "--model.aggregator", ("x",)),

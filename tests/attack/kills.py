@@ -233,12 +233,12 @@ def log_of(run: pathlib.Path) -> list[Any]:
 
 TRAINING = Marks(
     {
-        "opening the run": "crisalad_jax.training.run:Run.__init__",
+        "opening the run": "crisalad_jax.training.run_files:RunFiles.load",
         "loading a state": "crisalad_jax.checkpoints.train_state:StateStore.load",
-        "steps": "crisalad_jax.training.loop:_train_round",
+        "steps": "crisalad_jax.training.loop:_Loop._take_round",
         "saving": "crisalad_jax.training.run_files:RunFiles.save",
-        "validating": "crisalad_jax.training.run:Run._validate",
-        "keeping the best": "crisalad_jax.training.run_files:RunFiles.keep_if_best",
+        "validating": "crisalad_jax.training.validation:Validator.validate",
+        "keeping the best": "crisalad_jax.training.run_files:RunFiles.save_if_best",
         "closing": "crisalad_jax.training.run_files:RunFiles.close",
     }
 )
@@ -263,7 +263,7 @@ def recipe_of_chains(folder: pathlib.Path) -> pathlib.Path:
         cross_image=CrossImageConfig(heads=2, feedforward=16),
     )
     path = folder / "recipe.json"
-    config = dataclasses.replace(RECIPE, model=model, epochs=EPOCHS, patience=None, keep_best=2)
+    config = dataclasses.replace(RECIPE, model=model, epochs=EPOCHS, patience=None, save_top_k=2)
     write_json(path, to_plain(config))
     return path
 
@@ -278,12 +278,12 @@ def train_arguments(world: World, recipe: pathlib.Path, out: pathlib.Path) -> li
 
 def attack_training(bench: Bench, kills: int, chains: int, programs: int) -> list[Row]:
     """Kill runs of training, some as programs of their own while they start."""
-    import crisalad_jax.training.run
+    import crisalad_jax.training.run_files
 
     folder = bench.folder / "training"
     folder.mkdir()
     recipe = recipe_of_chains(folder)
-    often = (crisalad_jax.training.run, "SAVE_SECONDS", -1.0)
+    often = (crisalad_jax.training.run_files, "SAVE_SECONDS", -1.0)
 
     def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
         TRAINING.clear()

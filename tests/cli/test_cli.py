@@ -164,19 +164,8 @@ def test_no_command_prints_the_usage(capfd):
         ("train --data d --out o --micro-batch 5", "micro_batch: found 5, expected a divisor of"),
         ("train --data d --out o --loss.kind fast-ap", "expected 'none': it ranks all images"),
         ("evaluate --data d --preset b16", "preset: found 'b16'"),
-        (
-            "train --data d --out o --recipe tiny",
-            r"recipe: found 'tiny', which is a preset \(--preset tiny\), expected one of anyloc",
-        ),
-        (
-            "train --data d --out o --preset boq",
-            r"preset: found 'boq', which is a recipe \(--recipe boq\), expected a size of the "
-            "model: b14, g14",
-        ),
-        (
-            "info --preset crisalad+gem",
-            r"preset: found 'crisalad\+gem', which is a recipe \(--recipe crisalad\+gem\)",
-        ),
+        ("train --data d --out o --recipe tiny", "recipe: found 'tiny', expected one of anyloc"),
+        ("info --preset boq", "preset: found 'boq', expected one of b14, g14"),
         ("info --colour red", "--colour"),
         ("train --data d --out o --epoch 3", "--epochs"),  # perhaps you meant
         ("train --data d", "--out"),

@@ -300,7 +300,7 @@ def test_a_run_prints_json(capfd, tmp_path, shared, run):
     found, words = printed(capfd, *given, "--json", "-")
     assert f"{STEPS} steps, best R@5" in words
     assert (found["steps"], found["epochs"], found["stopped_early"]) == (STEPS, 3, False)
-    best = json.loads((run / "config.json").read_text())["select_by"]
+    best = json.loads((run / "config.json").read_text())["monitor"]
     assert found["best"]["name"] == best
     assert f"best R@5 {100 * found['best']['recall']:.1f}" in words
 

@@ -70,7 +70,7 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path) -> None:
     start = ("vocabulary", "--images", shared / "town", "--out")
     for more, words in (
         ((tmp_path / "w.npy",), "w.npy: found the suffix '.npy', expected .safetensors"),
-        ((out, "--weights", weights), f"{weights}: found aggregator salad, expected one w"),
+        ((out, "--weights", weights), "aggregator: found salad, which has no vocabulary"),
         ((out, "--weights", weights, "--backbone", weights), "--backbone: found beside --weights"),
         ((out, "--weights", weights, "--preset", "b14"), "--preset: found beside --weights"),
         ((out, "--weights", weights, "--layer", 1), "--layer: found beside --weights"),
@@ -81,7 +81,7 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path) -> None:
         ),
         (
             (out, "--preset", "tiny", "--aggregator", "gem"),
-            "--aggregator: found gem, which has no vocabulary, expected one that starts from",
+            "aggregator: found gem, which has no vocabulary, expected one that starts from",
         ),
         (
             (out, "--preset", "tiny", "--backbone", weights),

@@ -69,7 +69,7 @@ def a_step(params: Crisalad, config: ModelConfig, out: pathlib.Path, shared: pat
         PARAMS, "head", step_config(RECIPE, **options), key=jax.random.key(0)
     )
     state = state._replace(trainable=params)
-    step = make_train_step(trained(config), **options)
+    step = make_train_step(step_config(trained(config), **options))
     step(state, jax.tree.map(lambda _: None, frozen), IMAGES, LABELS, jax.random.key(0))
 
 
@@ -321,10 +321,10 @@ def test_every_door_refuses_images_of_another_kind(door: str, kind: str) -> None
 
 @pytest.mark.usefixtures("_unchecked")
 def test_a_step_refuses_pixels_as_floats() -> None:
-    options = {"steps": 2}
-    state, frozen = init_train_state(PARAMS, "head", step_config(RECIPE, **options))
+    static = step_config(RECIPE, steps=2)
+    state, frozen = init_train_state(PARAMS, "head", static)
     with pytest.raises(InputError, match=r"^images: found float64 from 0 to 1, which"):
-        make_train_step(RECIPE, **options)(state, frozen, IMAGES / 255, LABELS, jax.random.key(0))
+        make_train_step(static)(state, frozen, IMAGES / 255, LABELS, jax.random.key(0))
 
 
 @pytest.mark.parametrize(

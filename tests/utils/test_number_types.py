@@ -127,11 +127,11 @@ def test_a_training_step_is_the_same() -> None:
     optimiser = optax.chain(
         make_optimiser(RECIPE.optimiser, steps=8), optax.GradientTransformation(init, update)
     )
-    options = {"steps": 8, "optimiser": optimiser}
+    static = step_config(RECIPE, steps=8, optimiser=optimiser)
 
     def train() -> Any:
-        step = make_train_step(RECIPE, **options)
-        state, frozen = init_train_state(PARAMS, "all", step_config(RECIPE, **options))
+        step = make_train_step(static)
+        state, frozen = init_train_state(PARAMS, "all", static)
         for _ in range(3):
             labels = jnp.asarray(LABELS)  # int64 in the 64-bit mode
             state, metrics = step(state, frozen, IMAGES, labels, jax.random.key(4))

@@ -37,7 +37,7 @@ from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
-from crisalad_jax.training.batches import groups_of, steps_per_epoch
+from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
 from crisalad_jax.training.trainable import count_trainable
@@ -342,7 +342,7 @@ def _own_training_set(
             config.train, min_images=training.min_images_of_place, on_bad_image=on_bad_image
         )
     try:
-        steps = steps_per_epoch(training, groups_of(training, places))
+        steps = PlaceBatches(training, places).steps_per_epoch
     except InputError as error:
         raise InputError(f"{draft.name}: {error}") from error
     return places, steps

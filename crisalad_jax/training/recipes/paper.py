@@ -1,7 +1,6 @@
-"""CriSALAD, as the paper trains it (section 4.2), and rows of its Table 2."""
+"""CriSALAD, as the paper trains it (section 4.2), rows of its Table 2, and `scratch`."""
 
 import dataclasses
-from typing import Any
 
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import TrainConfig
@@ -14,30 +13,23 @@ def crisalad(model: ModelConfig, preset: str) -> TrainConfig:
     return TrainConfig(model=model)
 
 
-def _varied(model: ModelConfig, **changes: Any) -> TrainConfig:
-    optimiser = dataclasses.replace(TrainConfig.optimiser, **changes)
-    return TrainConfig(model=model, optimiser=optimiser)
-
-
 @register_recipe("crisalad-1e-4")
 def crisalad_1e_4(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of Table 2's row with a higher learning rate."""
-    return _varied(model, learning_rate=1e-4)
+    return TrainConfig(
+        model=model, optimiser=dataclasses.replace(TrainConfig.optimiser, learning_rate=1e-4)
+    )
 
 
 @register_recipe("crisalad-step")
 def crisalad_step(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe of Table 2's row with the step schedule."""
-    return _varied(model, schedule="step")
+    return TrainConfig(
+        model=model, optimiser=dataclasses.replace(TrainConfig.optimiser, schedule="step")
+    )
 
 
 @register_recipe("scratch")
 def scratch(model: ModelConfig, preset: str) -> TrainConfig:
     """Make the recipe for training all of a model from random weights: ours, for `tiny`."""
     return from_scratch(TrainConfig(model=model))
-
-
-def without_encoder(model: ModelConfig, **changes: Any) -> ModelConfig:
-    """Remove a model's cross-image encoder: its descriptors depend on no other image."""
-    cross_image = dataclasses.replace(model.cross_image, layers=0)
-    return dataclasses.replace(model, cross_image=cross_image, **changes)
