@@ -18,7 +18,7 @@ from crisalad_jax.config.source import changed_sources
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
@@ -150,7 +150,7 @@ class RunFiles:
             paths.append(self._best_path(self.record.step))
         with told_of(self.out):
             for path in paths:
-                save_weights(path, params, self._config.model)
+                save_weights(path, Model(params, self._config.model))
 
     def save_is_due(self) -> bool:
         """Return whether the last saved state is old, by the primary process's clock."""
@@ -163,7 +163,7 @@ class RunFiles:
         """
         if distributed.is_primary() and self._saved != self.record:
             with told_of(self.out):
-                save_weights(self.out / "last.safetensors", params(), self._config.model)
+                save_weights(self.out / "last.safetensors", Model(params(), self._config.model))
                 self._states.save(self.record.step, state, dataclasses.asdict(self.record))
                 self._drop_old_best()
             self._saved = copy.deepcopy(self.record)

@@ -1,8 +1,9 @@
 """The model of a run as it is: its recalls, its transport on a few queries, its descriptors."""
 
+import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,12 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.model import Crisalad, extract_tokens
-from crisalad_jax.retrieval.alone import describe_alone
-from crisalad_jax.retrieval.photographs import photograph_batches
+from crisalad_jax.nn.model import Crisalad, Model, extract_tokens
+from crisalad_jax.retrieval.describe import described
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.step import named_scalars
 
@@ -55,7 +58,7 @@ class Validator:
         if benchmark is not None:
             benchmark.ground_truth()
         self._config, self._benchmark = config, benchmark
-        self._reading: Any = {"on_bad_image": on_bad_image, "cache": cache}
+        self._reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
 
     @property
     def name(self) -> str:
@@ -78,12 +81,10 @@ class Validator:
         """Evaluate the model, each image by itself, and watch its transport."""
         assert self._benchmark is not None
         (result,) = evaluate(
-            params,
-            self._config.validation_model,
+            Model(params, self._config.validation_model),
             self._benchmark,
             groupings=("single",),
-            quiet=True,
-            **self._reading,
+            reading=self._reading,
         )
         recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
         words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
@@ -98,8 +99,8 @@ class Validator:
         """Describe image files, each by itself; NaN for those that cannot be read."""
         model = self._config.model
         rows = np.full((len(paths), model.descriptor_dim), np.nan, np.float32)
-        stream = describe_alone(params, model, paths, batch_size=DESCRIBED_AT_ONCE, **self._reading)
-        for part in stream:
+        reading = dataclasses.replace(self._reading, batch_size=DESCRIBED_AT_ONCE)
+        for part in described(describer_of(Model(params, model)), paths, reading):
             rows[part.indices] = part.descriptors
         return rows
 
@@ -107,9 +108,9 @@ class Validator:
         """Compute statistics of the transport on the first queries, without dropout."""
         model = self._config.validation_model
         paths = benchmark.queries[:WATCHED_QUERIES]
-        batches = photograph_batches(
-            model, paths, batch_size=len(paths), cache=self._reading["cache"]
-        )
+        how = Preparation(model.image_size, model.preprocessing, model.side_multiple)
+        reading = Reading(batch_size=len(paths), cache=self._reading.cache)
+        batches = reading.batches(paths, how, model.check_image_size)
         batch = next(iter(batches))  # of the size of the first, where sizes differ
         transport = extract_tokens(params, batch.images[batch.valid], model).transport
         if transport is None:
