@@ -5,7 +5,6 @@ import pathlib
 
 import pytest
 
-from crisalad_jax.nn.model import Model
 from tests.cli.test_cli import fails, files_in, succeeds
 from tests.cli.test_index import index, query
 from tests.conftest import BATCH
@@ -15,7 +14,7 @@ from tests.conftest import BATCH
 def folder(shared, tmp_path, capfd) -> pathlib.Path:
     """A map of the town's database."""
     database = shared / "town" / "images" / "test" / "database"
-    succeeds(capfd, *index(Model(shared, database), tmp_path / "map"))
+    succeeds(capfd, *index(shared, database, tmp_path / "map"))
     return tmp_path / "map"
 
 
@@ -41,7 +40,7 @@ def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd):
         capfd, "info", "--map", folder
     )
     answers = tmp_path / "answers.jsonl"
-    said = succeeds(capfd, *query(folder, "--json", answers, model=Model(queries, folder.config)))
+    said = succeeds(capfd, *query(folder, queries, "--json", answers))
     lines = [json.loads(line) for line in answers.read_text().splitlines()]
     # The same queries were calibrated on: as many are answered as then.
     unknown = 5 - value["answered"]
@@ -53,9 +52,7 @@ def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd):
     table = succeeds(capfd, *query(folder, queries))
     assert table.count("unknown") == unknown + 1  # their rows and the title
     # What a flag says stands before what the map remembers.
-    table = succeeds(
-        capfd, *query(folder, "--min-similarity", -1, model=Model(queries, folder.config))
-    )
+    table = succeeds(capfd, *query(folder, queries, "--min-similarity", -1))
     assert "unknown" not in table
 
 
@@ -76,9 +73,7 @@ def test_a_damaged_calibration_is_left_out_where_a_similarity_is_given(folder, s
     (folder / "calibration.json").write_text("{")
     fails(capfd, *query(folder, queries), words=("calibration.json", "the file may be removed"))
     for least in (-1, 0.5):
-        said = succeeds(
-            capfd, *query(folder, "--min-similarity", least, model=Model(queries, folder.config))
-        )
+        said = succeeds(capfd, *query(folder, queries, "--min-similarity", least))
         assert ("unknown, below similarity 0.5" in said) == (least == 0.5)
         assert "rests on" not in said
     watched = ("query", "--map", folder, "--watch", folder / "none", "--min-similarity", -1)
@@ -92,33 +87,13 @@ def test_frames_of_a_camera_are_followed(folder, shared, tmp_path, capfd):
     queries = shared / "town" / "images" / "test" / "queries"
     answers = tmp_path / "answers.jsonl"
     followed = ("--sequence", "bayes", "--sequence-reach", 1)
-    succeeds(
-        capfd,
-        *query(folder, *followed, "--k", 7, "--json", answers, model=Model(queries, folder.config)),
-    )
+    succeeds(capfd, *query(folder, queries, *followed, "--k", 7, "--json", answers))
     for line in map(json.loads, answers.read_text().splitlines()):
         # Over all images of the map, each rounded to six digits.
         total = sum(answer["probability"] for answer in line["neighbours"])
         assert total == pytest.approx(1, abs=7 * 5e-7)
-    assert "probability" in succeeds(
-        capfd, *query(folder, "--sequence", "bayes", model=Model(queries, folder.config))
-    )
+    assert "probability" in succeeds(capfd, *query(folder, queries, "--sequence", "bayes"))
     words = ("--sequence-reach: found without --sequence bayes",)
-    fails(
-        capfd,
-        *query(folder, "--sequence-reach", 1, model=Model(queries, folder.config)),
-        words=words,
-    )
+    fails(capfd, *query(folder, queries, "--sequence-reach", 1), words=words)
     words = ("BayesFilter.reach: found 0.0, expected at least 1",)
-    fails(
-        capfd,
-        *query(
-            folder,
-            "--sequence",
-            "bayes",
-            "--sequence-reach",
-            0,
-            model=Model(queries, folder.config),
-        ),
-        words=words,
-    )
+    fails(capfd, *query(folder, queries, "--sequence", "bayes", "--sequence-reach", 0), words=words)

@@ -416,10 +416,10 @@ def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_pat
         )
 
     one, two = tmp_path / "among.txt", tmp_path / "pairs.txt"
-    said = succeeds(capfd, *extract(Model(database, "db.h5"), "--pairs", one, "--k", 2))
+    said = succeeds(capfd, *extract(database, "db.h5", "--pairs", one, "--k", 2))
     assert f"{one}: 14 pairs" in said
     shared_flags = ("--pairs", two, "--k", 3, "--database", tmp_path / "db.h5")
-    assert f"{two}: 15 pairs" in succeeds(capfd, *extract(Model(queries, "q.h5"), *shared_flags))
+    assert f"{two}: 15 pairs" in succeeds(capfd, *extract(queries, "q.h5", *shared_flags))
 
     sides = [by_name(*read_descriptors(tmp_path / name)) for name in ("db.h5", "q.h5")]
     assert set(sides[1]) == {f"queries/{path.name}" for path in list_images(queries)}
@@ -434,15 +434,15 @@ def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_pat
         (("--pairs", two, "--database", tmp_path / "no.h5"), "no.h5: found no such file, expected"),
         (("--root", queries), f"--root: found {queries}, expected a folder that holds {database}"),
     ):
-        fails(capfd, *extract(Model(database, "x.h5"), *more), words=(words,))
+        fails(capfd, *extract(database, "x.h5", *more), words=(words,))
     short = tmp_path / "short.h5"
     write_descriptors(short, np.eye(3, dtype=np.float32), ["a", "b", "c"])
-    wrong = extract(Model(database, "x.h5"), "--pairs", two, "--database", short)
+    wrong = extract(database, "x.h5", "--pairs", two, "--database", short)
     fails(capfd, *wrong, words=("short.h5: found descriptors of 3 numbers, expected 48",))
     spaced = tmp_path / "images"
     spaced.mkdir()
     (spaced / "a b.jpg").write_bytes(list_images(database)[0].read_bytes())
-    wrong = extract(Model(spaced, "x.h5"), "--root", spaced, "--pairs", tmp_path / "none.txt")
+    wrong = extract(spaced, "x.h5", "--root", spaced, "--pairs", tmp_path / "none.txt")
     fails(capfd, *wrong, words=("none.txt: found the image name 'a b.jpg'", "without spaces"))
     assert not list(tmp_path.glob("x.*"))
     assert not (tmp_path / "none.txt").exists()

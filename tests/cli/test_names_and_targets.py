@@ -6,7 +6,6 @@ import shutil
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
 from tests.cli.test_cli import extract, fails, files_in, succeeds
 
@@ -14,7 +13,7 @@ from tests.cli.test_cli import extract, fails, files_in, succeeds
 @pytest.mark.parametrize("folder", ["x[/b]", "fo[red]x", "a:smile:b"])
 def test_brackets_and_colons_in_names_are_printed_as_they_are(capfd, tmp_path, shared, folder):
     out = tmp_path / folder / "d.npy"
-    said = succeeds(capfd, *extract(Model(shared, shared / "town"), out))
+    said = succeeds(capfd, *extract(shared, shared / "town", out))
     assert f"{folder}/d.npy: 12 descriptors" in said
 
 
@@ -32,13 +31,13 @@ def test_a_name_that_is_no_line_of_text_is_refused_before_the_work(
     photograph = next((town / "images" / "test" / "queries").iterdir())
     shutil.copy(photograph, os.path.join(os.fsencode(photograph.parent), name))
     (tmp_path / "out").mkdir()
-    fails(capfd, *extract(Model(shared, town), tmp_path / "out" / "d.npy"), words=(words,))
+    fails(capfd, *extract(shared, town, tmp_path / "out" / "d.npy"), words=(words,))
     assert files_in(tmp_path / "out") == set()
 
 
 @pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.npy.json"])
 def test_pairs_do_not_overwrite_what_extract_writes(capfd, tmp_path, shared, name):
-    start = extract(Model(shared, shared / "town"), tmp_path / "d.npy", "--pairs", tmp_path / name)
+    start = extract(shared, shared / "town", tmp_path / "d.npy", "--pairs", tmp_path / name)
     fails(capfd, *start, words=(f"--pairs: found {tmp_path / name}, which --out writes",))
     assert files_in(tmp_path) == set()
 
@@ -50,7 +49,7 @@ def test_pairs_of_descriptors_that_are_no_unit_vectors_are_refused_before_the_wo
     components = tmp_path / "pca.safetensors"
     save_pca(components, fit_pca(rows, 5, PcaConfig(renormalise=False)))
     more = "--pca", components, "--pairs", tmp_path / "pairs.txt"
-    start = extract(Model(shared, shared / "town"), tmp_path / "d.npy", *more)
+    start = extract(shared, shared / "town", tmp_path / "d.npy", *more)
     fails(capfd, *start, words=(f"--pairs: found {components}, which leaves lengths",))
     assert files_in(tmp_path) == {"pca.safetensors"}
 

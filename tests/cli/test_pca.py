@@ -8,7 +8,6 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, load_pca, save_pca
 from crisalad_jax.utils.files import write_json
 from tests.cli.test_cli import extract, fails, succeeds
@@ -44,11 +43,11 @@ def test_what_is_fitted_is_written(capfd, tmp_path, kind):
 
 def test_extract_writes_shorter_descriptors(capfd, tmp_path, shared):
     town, components = shared / "town", tmp_path / "pca.safetensors"
-    succeeds(capfd, *extract(Model(shared, town), tmp_path / "d.npy"))
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
     whole = np.load(tmp_path / "d.npy")
     fitted = fit_pca(whole, 5)
     save_pca(components, fitted)
-    out = succeeds(capfd, *extract(Model(shared, town), tmp_path / "s.npy", "--pca", components))
+    out = succeeds(capfd, *extract(shared, town, tmp_path / "s.npy", "--pca", components))
     assert "12 descriptors of 5 numbers" in out
     np.testing.assert_array_equal(np.load(tmp_path / "s.npy"), fitted.apply(whole))
     config = json.loads((tmp_path / "s.npy.json").read_text())
@@ -57,7 +56,7 @@ def test_extract_writes_shorter_descriptors(capfd, tmp_path, shared):
 
 def test_evaluate_ranks_shorter_descriptors(capfd, tmp_path, shared, benchmark):
     town, weights = shared / "town", shared / "weights.safetensors"
-    succeeds(capfd, *extract(Model(shared, town), tmp_path / "d.npy"))
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
     whole, names = np.load(tmp_path / "d.npy"), (tmp_path / "d.names.txt").read_text().split()
     fitted, components = fit_pca(whole, 3), tmp_path / "pca.safetensors"
     save_pca(components, fitted)
@@ -96,7 +95,7 @@ def test_evaluate_ranks_shorter_descriptors(capfd, tmp_path, shared, benchmark):
 @pytest.mark.parametrize("whiten", [False, True])
 def test_components_become_the_last_layer_of_a_model(capfd, tmp_path, shared, whiten):
     town, model = shared / "town", tmp_path / "model.safetensors"
-    succeeds(capfd, *extract(Model(shared, town), tmp_path / "d.npy"))
+    succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
     whole = np.load(tmp_path / "d.npy")
     fit = ("pca", "--descriptors", tmp_path / "d.npy", "--weights", shared / "weights.safetensors")
     more = ("--whiten",) if whiten else ()
@@ -124,9 +123,7 @@ def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
         (weights, (f"{weights}: found metadata", "as `crisalad pca` writes it")),
         (tmp_path / "long.safetensors", (f"{weights}: found descriptors of length 48", "50")),
     ):
-        start = extract(
-            Model(shared, shared / "no-folder"), tmp_path / "d.npy", "--pca", components
-        )
+        start = extract(shared, shared / "no-folder", tmp_path / "d.npy", "--pca", components)
         fails(capfd, *start, words=words)
 
     np.save(tmp_path / "d.npy", DESCRIPTORS)

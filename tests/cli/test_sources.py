@@ -44,28 +44,28 @@ def test_positions_are_of_the_flag_the_table_names_or_exif(shared, images, tmp_p
         name: (pytest.approx(sign * 52.2296, abs=1e-6), pytest.approx(21.0125, abs=1e-6))
         for name, sign in (("a.jpg", 1), ("b.jpg", -1))  # 1e-6: ratios of integers of 32 bits
     }
-    said = succeeds(capfd, *index(Model(shared, images), tmp_path / "exif"))
+    said = succeeds(capfd, *index(shared, images, tmp_path / "exif"))
     assert "2 images added, 2 with positions" in said
     assert positions(tmp_path / "exif") == exif
 
     work = tmp_path / "work"
     shutil.copytree(images, work)
     (work / "poses.csv").write_text("name;x;y\na.jpg;1,5;2\nb.jpg;;\n")
-    said = succeeds(capfd, *index(Model(shared, work / "poses.csv"), tmp_path / "table"))
+    said = succeeds(capfd, *index(shared, work / "poses.csv", tmp_path / "table"))
     assert "2 images added, 1 with positions" in said
     assert positions(tmp_path / "table") == {"a.jpg": (1.5, 2.0), "b.jpg": None}
 
     (work / "more.csv").write_text("name,lat,lon\nb.jpg,3,4\n")
     flags = ("--positions", work / "more.csv")
-    succeeds(capfd, *index(Model(shared, work / "poses.csv"), tmp_path / "flag", *flags))
+    succeeds(capfd, *index(shared, work / "poses.csv", tmp_path / "flag", *flags))
     assert positions(tmp_path / "flag") == {"a.jpg": None, "b.jpg": (3.0, 4.0)}
 
     # A table without positions leaves them to EXIF; a map of metres leaves EXIF out, with a note.
     (work / "names.csv").write_text("name\nb.jpg\n")
-    succeeds(capfd, *index(Model(shared, work / "names.csv"), tmp_path / "names"))
+    succeeds(capfd, *index(shared, work / "names.csv", tmp_path / "names"))
     assert positions(tmp_path / "names") == {"b.jpg": exif["b.jpg"]}
     shutil.copy(work / "a.jpg", work / "new.jpg")
-    given = map(str, index(Model(shared, work / "new.jpg"), tmp_path / "table"))
+    given = map(str, index(shared, work / "new.jpg", tmp_path / "table"))
     assert main(list(given)) == 0
     error = capfd.readouterr().err
     assert "left out the EXIF positions of 1 images, expected x, y as in the map" in error
@@ -78,31 +78,23 @@ def test_a_rate_without_a_video_is_refused(shared, images, folder, tmp_path, cap
     common = ("--weights", shared / "weights.safetensors", "--images", images, "--quiet")
     before = sorted(tmp_path.iterdir())
     fails(capfd, "extract", *common, *out, "--fps", 2, words=words)
-    fails(capfd, *index(Model(shared, images), tmp_path / "map", "--fps", 2), words=words)
-    fails(capfd, *query(folder, "--fps", 2, model=Model(images, folder.config)), words=words)
+    fails(capfd, *index(shared, images, tmp_path / "map", "--fps", 2), words=words)
+    fails(capfd, *query(folder, images, "--fps", 2), words=words)
     target = ("--out", tmp_path / "v.safetensors")
     fails(capfd, "vocabulary", "--images", images, *target, "--fps", 2, words=words)
     assert sorted(tmp_path.iterdir()) == before
     # One video among several sources is enough.
     video = write_video(tmp_path / "walk.avi", 21)
     assert "walk.avi#t=0.500" in succeeds(
-        capfd, *query(folder, video, "--fps", 2, "--json", "-", model=Model(images, folder.config))
+        capfd, *query(folder, images, video, "--fps", 2, "--json", "-")
     )
 
 
 def test_one_image_is_one(shared, images, tmp_path, capfd):
-    said = succeeds(capfd, *index(Model(shared, images / "a.jpg"), tmp_path / "map"))
+    said = succeeds(capfd, *index(shared, images / "a.jpg", tmp_path / "map"))
     assert "map: 1 image added, 1 with positions; 1 descriptor of" in said
     answers = tmp_path / "answers.jsonl"
-    said = succeeds(
-        capfd,
-        *query(
-            tmp_path / "map",
-            "--json",
-            answers,
-            model=Model(images / "a.jpg", tmp_path / "map".config),
-        ),
-    )
+    said = succeeds(capfd, *query(tmp_path / "map", images / "a.jpg", "--json", answers))
     assert said == f"{answers}: 1 query in a map of 1 image"
 
 
@@ -139,7 +131,7 @@ def test_a_video_is_extracted_and_described_as_its_frames(shared, tmp_path, capf
 def folder(shared, tmp_path_factory) -> pathlib.Path:
     out = tmp_path_factory.mktemp("live") / "map"
     database = shared / "town" / "images" / "test" / "database"
-    assert main([str(part) for part in index(Model(shared, database), out)]) == 0
+    assert main([str(part) for part in index(shared, database, out)]) == 0
     return out
 
 
@@ -148,18 +140,7 @@ def test_a_pattern_and_a_window_of_queries(shared, folder, tmp_path, capfd):
 
     def answers(*flags: object) -> list[dict]:
         out = tmp_path / "answers.jsonl"
-        succeeds(
-            capfd,
-            *query(
-                folder,
-                "--k",
-                1,
-                "--json",
-                out,
-                *flags,
-                model=Model(queries / "*.jpg", folder.config),
-            ),
-        )
+        succeeds(capfd, *query(folder, queries / "*.jpg", "--k", 1, "--json", out, *flags))
         return [json.loads(line) for line in out.read_text().splitlines()]
 
     lines, together = answers(), answers("--window", 3)
@@ -172,10 +153,7 @@ def test_a_pattern_and_a_window_of_queries(shared, folder, tmp_path, capfd):
     # As a shell writes out a pattern: one file after the other.
     out = tmp_path / "answers.jsonl"
     files = list_images(queries)
-    succeeds(
-        capfd,
-        *query(folder, "--k", 1, "--json", out, "--window", 3, model=Model(*files, folder.config)),
-    )
+    succeeds(capfd, *query(folder, *files, "--k", 1, "--json", out, "--window", 3))
     assert [json.loads(line) for line in out.read_text().splitlines()] == together
 
 
@@ -188,7 +166,7 @@ def test_the_default_rate_of_a_video_is_said(shared, folder, tmp_path, capfd):
     out = ("--out", tmp_path / "d.npy")
     verbs = (
         ("extract", *weights, "--images", video, *out, "--quiet"),
-        index(Model(shared, video), tmp_path / "map"),
+        index(shared, video, tmp_path / "map"),
         query(folder, video),
         (
             *("vocabulary", "--images", video, "--weights", tmp_path / "start.safetensors"),
@@ -203,14 +181,14 @@ def test_the_default_rate_of_a_video_is_said(shared, folder, tmp_path, capfd):
     (tmp_path / "list.txt").write_text("walk.avi\nslow.avi\n")
     assert main(list(map(str, query(folder, tmp_path / "list.txt")))) == 0
     assert "list.txt: 6 of 24 frames, 1 per second: --fps\n" in capfd.readouterr().err
-    succeeds(capfd, *query(folder, "--fps", 1, model=Model(video, folder.config)))
+    succeeds(capfd, *query(folder, video, "--fps", 1))
     succeeds(capfd, *query(folder, tmp_path / "slow.avi"))
     succeeds(capfd, *query(folder, f"{video}#t=0.5"))
 
 
 def test_a_camera_of_a_video(folder, tmp_path, capfd):
     video = write_video(tmp_path / "walk.avi", 5)
-    given = query(folder, video, "--k", 1, "--window", 3, model=Model("--camera", folder.config))
+    given = query(folder, "--camera", video, "--k", 1, "--window", 3)
     assert main([str(part) for part in given]) == 0
     out, error = capfd.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
@@ -232,7 +210,7 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, num
     image = list_images(shared / "town" / "images" / "test" / "database")[2]
     (tmp_path / "in").mkdir()
     shutil.copy(image, tmp_path / "in" / "old.jpg")
-    given = query(folder, tmp_path / "in", "--k", 1, model=Model("--watch", folder.config))
+    given = query(folder, "--watch", tmp_path / "in", "--k", 1)
     with (tmp_path / "errors").open("w") as errors:
         child = subprocess.Popen(
             [sys.executable, "-m", "crisalad_jax", *map(str, given)],
