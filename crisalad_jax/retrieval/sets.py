@@ -11,7 +11,7 @@ import numpy as np
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.retrieval.chunks import check_rows, pieces
+from crisalad_jax.retrieval.chunks import blocks, check_rows
 from crisalad_jax.retrieval.describe import HeldTokens, described, group, read_tokens
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
@@ -294,7 +294,8 @@ def _joined(shared: SharedSet, work: Work) -> DescribedSet:
         progress_bar("joining", len(names), "rows", quiet=True) as bar,
     ):
         for _, descriptors in sets:
-            for part in pieces(descriptors, "share", max(1, _COPIED_BYTES // (4 * length))):
+            size = max(1, _COPIED_BYTES // (4 * length))
+            for _, part in blocks(descriptors, "share", size, unit=False):
                 file.write(np.arange(start, start + len(part)), part)
                 start += len(part)
                 bar.advance(len(part))

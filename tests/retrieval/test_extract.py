@@ -11,7 +11,6 @@ import pytest
 import crisalad_jax.retrieval.sets
 from crisalad_jax.data.images import list_images
 from crisalad_jax.retrieval import partial
-from crisalad_jax.retrieval.chunks import is_mapped
 from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import check_extraction, extract
@@ -197,7 +196,7 @@ def test_memory_does_not_grow_with_the_images(params, town, expected, tmp_path, 
     monkeypatch.setattr(partial, "_joined", lambda parts: held.append(len(parts)) or real(parts))
     found = run(params, town, tmp_path / "d.npy")
     assert held == [1] * (len(expected) // BATCH)
-    assert is_mapped(found.descriptors)
+    assert isinstance(found.descriptors, np.memmap)
     np.testing.assert_array_equal(found.descriptors, expected)
 
 

@@ -9,6 +9,7 @@ import ml_dtypes
 import numpy as np
 import pytest
 
+from crisalad_jax.retrieval import neighbours
 from crisalad_jax.retrieval import search as retrieval
 from crisalad_jax.retrieval.chunks import as_sides
 from crisalad_jax.utils.errors import InputError
@@ -80,7 +81,7 @@ def test_search_orders_as_the_l2_distance_does():
 def test_search_walks_queries_in_chunks(monkeypatch):
     database, queries = _random_unit(4, 40, 16), _random_unit(5, 23, 16)
     whole = retrieval.search(database, queries, 5)
-    monkeypatch.setattr(retrieval, "_QUERY_CHUNK", 10)
+    monkeypatch.setattr(neighbours, "QUERY_CHUNK", 10)
     parts = retrieval.search(database, queries, 5)
     np.testing.assert_array_equal(parts.indices, whole.indices)
     _assert_ranked(parts, database, queries, 5)

@@ -359,7 +359,6 @@ class Map:
             self._segments,
             self._store,
             lambda: self.descriptors,
-            self.head.descriptor_length,
             quiet=quiet,
         )
         return None if self._approximate is None else self._approximate.recall

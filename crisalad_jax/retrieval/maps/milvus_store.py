@@ -6,12 +6,11 @@ import logging
 import os
 import pathlib
 import urllib.parse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from crisalad_jax.retrieval.maps.ties import lower_first
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float32
@@ -189,7 +188,7 @@ class MilvusStore:
             ]
             return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
 
-        return lower_first(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
+        return break_ties(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
 
     def _ask(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         with self._one_line():
@@ -220,6 +219,43 @@ class MilvusStore:
             from milvus_lite.server_manager import server_manager_instance
 
             server_manager_instance.release_server(self._address)
+
+
+def break_ties(
+    ask: Callable[[Float32[np.ndarray, "q d"], int], Neighbours],
+    queries: Float32[np.ndarray, "q d"],
+    k: int,
+    count: int,
+) -> Neighbours:
+    """Search so that equal similarities are ordered by number, also at the k-th place.
+
+    One more than k is asked for. Where the last is as similar as the k-th, there may be more equal
+    ones. Such queries ask again for twice as many, until the last is less similar.
+
+    Args:
+        ask: takes queries and k; returns the k most similar of each, equal ones in any order.
+        queries: unit descriptors.
+        k: neighbours per query, at most `count`.
+        count: how many descriptors there are.
+    """
+    asked = min(k + 1, count)
+    found = _in_order(ask(queries, asked))
+    indices, similarities = (part[:, :k].copy() for part in found)
+    rows = np.arange(len(queries))
+    while asked < count:
+        is_open = found.similarities[:, k - 1] == found.similarities[:, -1]
+        rows = rows[is_open]
+        if not len(rows):
+            break
+        asked = min(2 * asked, count)
+        found = _in_order(ask(queries[rows], asked))
+        indices[rows], similarities[rows] = (part[:, :k] for part in found)
+    return Neighbours(indices, similarities)
+
+
+def _in_order(neighbours: Neighbours) -> Neighbours:
+    order = np.lexsort((neighbours.indices, -neighbours.similarities))
+    return Neighbours(*(np.take_along_axis(array, order, axis=1) for array in neighbours))
 
 
 def _make_folder(folder: pathlib.Path) -> None:
