@@ -19,7 +19,6 @@ from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
-from crisalad_jax.retrieval.euclidean import to_unit_vectors
 from crisalad_jax.retrieval.grouping import (
     DEFAULT_GROUPINGS,
     Grouping,
@@ -32,7 +31,7 @@ from crisalad_jax.retrieval.model import Model, check_groupings, check_params
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
-from crisalad_jax.retrieval.search import search
+from crisalad_jax.retrieval.search import search, to_unit_vectors
 from crisalad_jax.utils.errors import InputError
 
 KS = (1, 5, 10, 20)

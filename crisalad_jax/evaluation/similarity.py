@@ -24,9 +24,8 @@ def similarity_map(
     rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
     picture = np.full((rows[-1] + 1, columns[-1] + 1), -np.inf, np.float32)
     for block in blocks(database, "database", _DATABASE_CHUNK):
-        wide = block.rows.astype(np.float32, copy=False)
         for part in blocks(queries, "queries", _QUERY_CHUNK):
-            products = part.rows.astype(np.float32, copy=False) @ wide.T
+            products = part.rows @ block.rows.T
             row, tops = _cells(rows, part)
             column, lefts = _cells(columns, block)
             products = np.maximum.reduceat(products, tops, axis=0)

@@ -1,20 +1,19 @@
 """Descriptors in any number, in memory or on disk, some rows at a time."""
 
 import mmap
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import ml_dtypes
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.shapes import Float, Int
+from crisalad_jax.utils.shapes import Float, Float32, Int
 
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 UNIT_TOLERANCE = 1e-2
 WIDE = np.dtype(np.float32)
-_NARROW = (WIDE, np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
-"""Types that blocks keep, since float32 holds all their values; others become float32."""
+_NARROW = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
 _CHECKED = 4096
 """Number of rows that are checked at a time."""
 _NEIGHBOURS = 2**21
@@ -64,6 +63,7 @@ class Block(NamedTuple):
     start: int
     """Number of rows in the blocks before it."""
     rows: Float[np.ndarray, "size d"]
+    """In float32, unless asked for otherwise."""
 
 
 def blocks(
@@ -73,11 +73,12 @@ def blocks(
     *,
     unit: bool = True,
     places: Int[np.ndarray, " m"] | None = None,
+    narrow: bool = False,
 ) -> Generator[Block, None, None]:
     """Yield an array's rows in order, `size` at a time, checked, and without a copy if possible.
 
-    Pages of a memory map are released once the next block is asked for twice, so that it may be
-    read one block ahead.
+    Pages of a memory map are released after the block behind theirs is taken, so that a stream may
+    be read one block ahead.
 
     Args:
         array: descriptors in memory or on disk.
@@ -85,6 +86,7 @@ def blocks(
         size: number of rows in a block; the last may have fewer.
         unit: whether rows have to be of unit length, or only finite.
         places: the rows to yield, in ascending order; None for all.
+        narrow: whether to leave float16 and bfloat16 as they are; other types become float32.
 
     Raises:
         InputError: a row is not finite, or not of unit length where that is asked for.
@@ -94,31 +96,49 @@ def blocks(
     for start in range(0, len(numbers), size):
         some = numbers[start : start + size]
         span = array[some[0] : some[-1] + 1]
-        rows = _at_most_wide(span if places is None else span[some - some[0]])
-        check_rows(rows, name, some, unit=unit)
-        yield Block(start, rows)
+        rows = span if places is None else span[some - some[0]]
+        wide = _widened(rows)
+        check_rows(wide, name, some, unit=unit)
+        yield Block(start, rows if narrow and rows.dtype in _NARROW else wide)
         _let_go(before)
         before = span
     _let_go(before)
 
 
+def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
+    """Join consecutive blocks to blocks of about `size` rows, at most twice as many.
+
+    Args:
+        stream: blocks of at most `size` rows.
+        size: number of rows.
+    """
+    parts: list[Float[np.ndarray, "rows d"]] = []
+    start = count = 0
+    for block in stream:
+        parts.append(block.rows)
+        count += len(block.rows)
+        if count >= size:
+            yield Block(start, np.concatenate(parts) if len(parts) > 1 else parts[0])
+            parts, start, count = [], start + count, 0
+    if parts:
+        yield Block(start, np.concatenate(parts))
+
+
 def gathered(
     array: Float[np.ndarray, "n d"], places: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m d"]:
-    """Read the rows at some places in ascending order, and release their pages."""
+    """Read the rows at some places in ascending order as float32, and release their pages."""
     parts = []
     for start in range(0, len(places), _SCATTERED):
         some = places[start : start + _SCATTERED]
-        parts.append(_at_most_wide(array[some]))
+        parts.append(_widened(array[some]))
         _let_go(array[some[0] : some[-1] + 1])
     return np.concatenate(parts)
 
 
-def _at_most_wide(rows: np.ndarray) -> np.ndarray:
-    if rows.dtype in _NARROW:
-        return rows
+def _widened(rows: np.ndarray) -> Float32[np.ndarray, "rows d"]:
     with np.errstate(over="ignore"):  # what overflows is reported
-        return rows.astype(WIDE)
+        return rows.astype(WIDE, copy=False)
 
 
 def sample(total: int, count: int, seed: int) -> Int[np.ndarray, " count"]:
@@ -140,8 +160,8 @@ def check_rows(
     Raises:
         InputError: a row is not; the message names the first.
     """
+    wide = _widened(rows)
     with np.errstate(over="ignore", invalid="ignore"):
-        wide = rows.astype(WIDE, copy=False)
         norms = np.sqrt(np.einsum("nd,nd->n", wide, wide))
     # "Not within" rather than "beyond", so that NaN and infinity count as wrong.
     right = np.abs(norms - 1) <= UNIT_TOLERANCE if unit else np.isfinite(norms)

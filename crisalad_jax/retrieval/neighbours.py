@@ -9,7 +9,7 @@ import numpy as np
 
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.read_ahead import one_ahead, read_ahead
-from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE, WIDE, Block
+from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE, Block
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 
@@ -21,6 +21,8 @@ _PIECE = 2**17
 """Size of a piece that is multiplied in float64, in numbers: 1 MiB, which fits a core's cache."""
 _READ = 2**22
 """Size of the candidates that are read from a database at a time, in numbers: 16 MiB."""
+_PARTITIONED = 1024
+"""Number of rows whose products set the first limit to candidates."""
 _LEAST = -2.0
 """Less than any product of unit vectors."""
 
@@ -118,13 +120,12 @@ def multiply(
     shape = size, min(QUERY_CHUNK, len(queries))
     memory = itertools.cycle([np.empty(shape, np.float32) for _ in range(2)])
     for block in one_ahead(stream):
-        rows = block.rows.astype(WIDE, copy=False)
-        indices = block.start + np.arange(len(rows))[:, None]
+        indices = block.start + np.arange(len(block.rows))[:, None]
         for first in range(0, len(queries), QUERY_CHUNK):
             some = queries[first : first + QUERY_CHUNK]
             # The queries are the right factor: the product then takes a tenth less time.
-            out = next(memory)[: len(rows), : len(some)]
-            yield Products(first, np.matmul(rows, some.T, out=out), indices)
+            out = next(memory)[: len(block.rows), : len(some)]
+            yield Products(first, np.matmul(block.rows, some.T, out=out), indices)
 
 
 def nearest(
@@ -201,8 +202,9 @@ def _largest(
     for first, values, indices in one_ahead(products):
         part = least[first : first + values.shape[1]]
         if len(values) >= count and part.min() == _LEAST:
-            block = np.partition(values, -count, axis=0)[-count]
-            np.maximum(part, np.nextafter(block, np.float32(_LEAST)), out=part)
+            # Of some rows, since partitioning takes longer than multiplying.
+            some = np.partition(values[: max(count, _PARTITIONED)], -count, axis=0)[-count]
+            np.maximum(part, np.nextafter(some, np.float32(_LEAST)), out=part)
         row, query = np.nonzero(values > part)
         index = np.broadcast_to(indices, values.shape)[row, query]
         value = values[row, query] if score is None else score(query + first, index)

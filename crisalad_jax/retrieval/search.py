@@ -20,6 +20,7 @@ from crisalad_jax.retrieval.chunks import (
     Block,
     as_sides,
     blocks,
+    check_all_rows,
     check_rows,
     gathered,
 )
@@ -44,12 +45,12 @@ def search(
     The database may be a memory map, larger than memory. It is read once, `chunk` rows at a time,
     one chunk ahead; the best rows are read once more. Beyond the inputs, memory holds three chunks
     and their similarities to 1,024 queries, whatever the size of the database. Pages of a memory
-    map are released after use. (Many copies of one image may add the pairs of a whole chunk.)
+    map are released after use. Where some queries have many near copies in the database, it is read
+    a second time.
 
-    Products in float32 select candidates: all rows that may be among the best, whatever the
-    rounding. Numpy multiplies on a CPU, the devices elsewhere. A candidate's final similarity is
-    summed in float64 and rounded to float32: the same bits whatever the chunk and the devices.
-    Equal similarities are ordered by database index, lower first.
+    Products in float32 select candidates. Numpy multiplies on a CPU, the devices elsewhere. A
+    candidate's final similarity is summed in float64 and rounded to float32: the same bits whatever
+    the chunk and the devices. Equal similarities are ordered by database index, lower first.
 
     Args:
         database: unit descriptors of the n database images, in float32, float16 or bfloat16 (which
@@ -57,7 +58,7 @@ def search(
             float32.
         queries: unit descriptors of the q queries, alike.
         k: neighbours per query; a database of fewer images gives all of them, min(k, n).
-        chunk: database rows compared at a time, rounded so that chunks and devices share alike.
+        chunk: database rows compared at a time, rounded up so that devices share alike.
         label: of the progress bar.
         quiet: no progress bar.
 
@@ -83,6 +84,52 @@ def search(
     return _search(database, queries, k, chunk, on_host=on_host, label=label, quiet=quiet)
 
 
+def to_unit_vectors(
+    database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d"]
+) -> tuple[Float32[np.ndarray, "n d+3"], Float32[np.ndarray, "q d+3"]]:
+    r"""Embed descriptors so that their cosines rank as the Euclidean distances do.
+
+    With both sides divided by the largest length, x of the database and y of the queries become
+
+    $$\left(\sqrt{\tfrac23}\,x,\ \tfrac{|x|^2}{\sqrt3},\ a,\ 0\right) \quad\text{and}\quad
+    \left(\sqrt{\tfrac23}\,y,\ -\tfrac{1}{\sqrt3},\ 0,\ b\right),$$
+
+    where a and b fill the lengths up to 1. The cosine is then (|y|^2 - |x - y|^2) / 3.
+
+    Args:
+        database: descriptors of the n database images, of any lengths.
+        queries: descriptors of the q queries, of any lengths.
+
+    Returns:
+        Unit vectors of both sides, three numbers longer.
+
+    Raises:
+        InputError: a side is not a matrix, or is empty; the sides' widths differ; a number is not
+            finite.
+
+    Example:
+        >>> import numpy as np
+        >>> database = np.array([[9.0, 9.0], [1.0, 2.0]])
+        >>> search(*to_unit_vectors(database, np.array([[2.0, 2.0]])), 1).indices.tolist()
+        [[1]]
+    """
+    sides = as_sides(database, queries)
+    for name, side in zip(("database", "queries"), sides, strict=True):
+        check_all_rows(side, name, unit=False)
+    lengths = [np.linalg.norm(side.astype(np.float64), axis=1) for side in sides]
+    largest = max(1e-30, *(found.max() for found in lengths))
+    squares = [np.square(found / largest) for found in lengths]
+    last = np.sqrt(1 / 3) * squares[0], np.full_like(squares[1], -np.sqrt(1 / 3))
+    embedded = []
+    for number, (side, square, third) in enumerate(zip(sides, squares, last, strict=True)):
+        unit = np.zeros((len(side), side.shape[1] + 3), np.float32)
+        unit[:, :-3] = np.sqrt(2 / 3) / largest * side
+        unit[:, -3] = third
+        unit[:, -2 + number] = np.sqrt(np.maximum(0, 1 - 2 / 3 * square - third**2))
+        embedded.append(unit)
+    return embedded[0], embedded[1]
+
+
 def _search(
     database: Float[np.ndarray, "n d"],
     queries: Float32[np.ndarray, "q d"],
@@ -102,7 +149,7 @@ def _search(
     with progress_bar(label, count, "rows", quiet=quiet) as bar:
 
         def shown() -> Generator[Block, None, None]:
-            for block in stream():
+            for block in blocks(database, "database", size, narrow=not on_host):
                 yield block
                 bar.advance(len(block.rows))
 

@@ -2,11 +2,11 @@
 
 import math
 import pathlib
-from collections.abc import Generator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from crisalad_jax.retrieval.chunks import Block, blocks, gathered
+from crisalad_jax.retrieval.chunks import Block, blocks, gathered, joined
 from crisalad_jax.retrieval.neighbours import (
     QUERY_CHUNK,
     Neighbours,
@@ -17,7 +17,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, durable_path, npy_header, write_npy
 from crisalad_jax.utils.shapes import Float, Float32, Int64
 
-_BLOCK = 2**24
+_BLOCK = 2**23
 """Largest size of a block of descriptors, and of its products with some queries, in numbers."""
 _MAPPED = 8192
 """Number of files that stay mapped, at most; Linux allows a process 65,530 mappings."""
@@ -82,10 +82,9 @@ class FileStore:
         firsts = np.array([first for first in self._counts if first < count])
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
-        def stream() -> Generator[Block, None, None]:
+        def files() -> Iterator[Block]:
             for first in firsts:
-                for start, rows in blocks(self._open(first), str(self._path(first)), size):
-                    yield Block(first + start, rows)
+                yield from blocks(self._open(first), str(self._path(first)), size)
 
         def read_rows(numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
             segments = np.searchsorted(firsts, numbers, side="right") - 1
@@ -97,7 +96,7 @@ class FileStore:
             ]
             return np.concatenate(parts)
 
-        return nearest(stream, queries, k, read_rows, size)
+        return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)
 
     def similarities(
         self, queries: Float32[np.ndarray, "q d"], numbers: Int64[np.ndarray, "q k"]

@@ -1,7 +1,6 @@
 """Descriptors in Milvus: a server, or milvus-lite in this process, by the same code."""
 
 import contextlib
-import importlib.util
 import logging
 import os
 import pathlib
@@ -13,6 +12,7 @@ import numpy as np
 
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.shapes import Float, Float32
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"
@@ -51,19 +51,18 @@ class MilvusStore:
 
     def __init__(self, address: str, collection: str, length: int, *, new: bool) -> None:
         """Connect to `address`, and make the collection if it is `new`."""
-        needed = ("pymilvus",) if check_address(address) else ("pymilvus", "milvus_lite")
-        if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
-            raise InputError(
-                f"store: found no {' nor '.join(missing)}, expected them installed: "
-                'pip install "crisalad-jax[milvus]"'
-            )
-        import pymilvus
+        self._is_file = not check_address(address)
+        try:
+            import pymilvus
 
+            if self._is_file:
+                import milvus_lite as _milvus_lite  # noqa: F401
+        except ModuleNotFoundError as error:
+            raise InputError(missing_extra(error, "store milvus")) from error
         self._address, self._collection = address, collection
         self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
-        self._is_file = "milvus_lite" in needed
         if self._is_file and new:
-            _make_folder(pathlib.Path(address).parent)
+            pathlib.Path(address).parent.mkdir(parents=True, exist_ok=True)
         if self._is_file and not new and not pathlib.Path(address).exists():
             raise InputError(f"{address}: found nothing, expected the descriptors of this map")
         with self._one_line():
@@ -201,11 +200,6 @@ class MilvusStore:
                 output_fields=["id"],
                 search_params={"metric_type": "IP"},
             )
-        if any(len(hits) != k for hits in answers):
-            raise InputError(
-                f"{self._address}: found {min(map(len, answers))} descriptors in "
-                f"{self._collection}, expected at least {k}"
-            )
         return Neighbours(
             np.array([[hit["id"] for hit in hits] for hits in answers], np.int64),
             np.array([[hit["distance"] for hit in hits] for hits in answers], np.float32),
@@ -256,10 +250,3 @@ def break_ties(
 def _in_order(neighbours: Neighbours) -> Neighbours:
     order = np.lexsort((neighbours.indices, -neighbours.similarities))
     return Neighbours(*(np.take_along_axis(array, order, axis=1) for array in neighbours))
-
-
-def _make_folder(folder: pathlib.Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot make this folder: {error.strerror}") from error

@@ -3,6 +3,7 @@
 import fcntl
 import os
 import pathlib
+import sys
 
 import numpy as np
 import pymilvus
@@ -307,11 +308,10 @@ def test_a_server_gets_the_token_of_the_environment(tmp_path, monkeypatch):
 
 
 def test_milvus_is_asked_for_when_it_is_not_installed(tmp_path, monkeypatch):
-    find = milvus.importlib.util.find_spec
-    monkeypatch.setattr(
-        milvus.importlib.util, "find_spec", lambda name: None if "milvus" in name else find(name)
-    )
-    with pytest.raises(InputError, match=r'found no pymilvus nor milvus_lite.*pip install "crisa'):
+    monkeypatch.setitem(sys.modules, "milvus_lite", None)
+    with pytest.raises(
+        InputError, match=r"found no module milvus_lite, .*pip install 'crisalad-jax"
+    ):
         opened(tmp_path, "milvus:rows.db")
 
 
