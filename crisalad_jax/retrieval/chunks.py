@@ -96,7 +96,7 @@ def blocks(
     for start in range(0, len(numbers), size):
         some = numbers[start : start + size]
         span = array[some[0] : some[-1] + 1]
-        rows = span if places is None else span[some - some[0]]
+        rows = span if places is None else array[some]
         wide = _widened(rows)
         check_rows(wide, name, some, unit=unit)
         yield Block(start, rows if narrow and rows.dtype in _NARROW else wide)

@@ -172,7 +172,7 @@ def nearest(
             similarities[unsure, -1] - margin,
             k,
             lambda query, index: similarities_of(some, query, index, read_rows),
-            margin,
+            float(margin),
         )
         indices[unsure], similarities[unsure] = (column.reshape(-1, k) for column in best[1:])
     return Neighbours(indices, similarities)

@@ -214,8 +214,9 @@ def fit_pca(
         components /= np.linalg.norm(components, axis=1, keepdims=True)
     # Fixes the sign of each component, which otherwise depends on the solver.
     largest = np.take_along_axis(components, np.abs(components).argmax(axis=1)[:, None], axis=1)
-    arrays = (mean, components * np.sign(largest), variances, whole)
-    return Pca(*(np.asarray(array, np.float32) for array in arrays), config or PcaConfig())
+    found = (mean, components * np.sign(largest), variances, whole)
+    mean, components, variances, whole = (np.asarray(array, np.float32) for array in found)
+    return Pca(mean, components, variances, whole, config or PcaConfig())
 
 
 def _rows_at_a_time(length: int) -> int:
@@ -309,6 +310,5 @@ def _fits(arrays: dict[str, np.ndarray]) -> bool:
     return (
         {name: array.shape for name, array in arrays.items()} == shapes
         and all(array.dtype == WIDE and np.isfinite(array).all() for array in arrays.values())
-        and arrays["variances"].min(initial=1) > 0
-        and arrays["total"] > 0
+        and min(arrays["variances"].min(initial=1), arrays["total"].min()) > 0
     )
