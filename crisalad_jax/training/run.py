@@ -20,13 +20,15 @@ from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage
 from crisalad_jax.data.places import Places
+from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.data.read_ahead import one_ahead
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.model import Crisalad, cast_params, extract_tokens, init_crisalad
+from crisalad_jax.nn.model import Crisalad, Model, cast_params, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
-from crisalad_jax.retrieval.alone import describe_alone
-from crisalad_jax.retrieval.photographs import photograph_batches
+from crisalad_jax.retrieval.describe import described
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.training.batches import (
     Rounds,
     batches_of,
@@ -344,18 +346,16 @@ class Run:
             number=step // self._rounds.steps,
         )
 
+        describer = describer_of(Model(params, config.model))
+        reading = Reading(
+            batch_size=DESCRIBED_AT_ONCE, on_bad_image=on_bad_image, cache=self._cache
+        )
+
         def describe(images: np.ndarray) -> np.ndarray:
             nonlocal unreadable
             rows = np.full((len(images), config.model.descriptor_dim), np.nan, np.float32)
-            stream = describe_alone(
-                params,
-                config.model,
-                [queries.path(image) for image in images],
-                batch_size=DESCRIBED_AT_ONCE,
-                on_bad_image=on_bad_image,
-                cache=self._cache,
-            )
-            for part in stream:
+            paths = [queries.path(image) for image in images]
+            for part in described(describer, paths, reading):
                 rows[part.indices] = part.descriptors
                 unreadable += len(part.unreadable)
             return rows
@@ -557,13 +557,10 @@ class Run:
         record, benchmark = self.record, self._validation
         with signals.at_once():
             (result,) = evaluate(
-                params,
-                self.config.validation_model,
+                Model(params, self.config.validation_model),
                 benchmark,
                 groupings=("single",),
-                cache=self._cache,
-                on_bad_image=on_bad_image,
-                quiet=True,
+                reading=Reading(on_bad_image=on_bad_image, cache=self._cache, quiet=True),
             )
             watched = self._watch_transport(params, result.skipped.rest_of(benchmark))
         epoch = self.step // self.steps_per_epoch
@@ -589,7 +586,9 @@ class Run:
         """Compute statistics of the transport on the first queries, without dropout."""
         model = self.config.validation_model
         paths = benchmark.queries[:WATCHED_QUERIES]
-        batches = photograph_batches(model, paths, batch_size=len(paths), cache=self._cache)
+        how = Preparation(model.image_size, model.preprocessing, model.side_multiple)
+        reading = Reading(batch_size=len(paths), cache=self._cache)
+        batches = reading.batches(paths, how, model.check_image_size)
         batch = next(iter(batches))  # of the size of the first, where sizes differ
         transport = extract_tokens(params, batch.images[batch.valid], model).transport
         return (

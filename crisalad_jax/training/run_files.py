@@ -16,7 +16,7 @@ from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
@@ -121,7 +121,7 @@ class RunFiles:
         paths += [self._best_path(step)] if self._config.keep_best > 1 and step in steps else []
         with self._writing():
             for path in paths:
-                save_weights(path, params, self._config.model)
+                save_weights(path, Model(params, self._config.model))
 
     def save(
         self, step: int, record: RunRecord, state: RunState, params: Callable[[], Crisalad]
@@ -131,7 +131,7 @@ class RunFiles:
         if self._saved == (step, record):
             return
         with self._writing():
-            save_weights(self._out / "last.safetensors", params(), self._config.model)
+            save_weights(self._out / "last.safetensors", Model(params(), self._config.model))
             self._states.save(step, state, dataclasses.asdict(record))
             self._drop_old_best(record)
         self._saved = step, record

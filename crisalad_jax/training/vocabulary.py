@@ -21,14 +21,14 @@ from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_seed
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad, unit_features
+from crisalad_jax.nn.model import Crisalad, Model, cast_params, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
-from crisalad_jax.retrieval.grouping import useful_batch_size
-from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
@@ -240,7 +240,7 @@ def build_vocabulary(
         on_bad_image=on_bad_image,
         quiet=quiet,
     )
-    save_weights(out, params, config)
+    save_weights(out, Model(params, config))
     words = config.aggregator.count_centroids(config.backbone.dim)
     return Vocabulary(params, words, min(max_images, len(paths)))
 
@@ -307,9 +307,10 @@ def _read_features(
     on_bad_image: OnBadImage,
     quiet: bool,
 ) -> Float32[np.ndarray, "feature dim"]:
-    batch_size = useful_batch_size(batch_size, len(paths))
-    batches = photograph_batches(config, paths, batch_size=batch_size, on_bad_image=on_bad_image)
-    devices = devices_for(batch_size)
+    reading = Reading(batch_size=batch_size, on_bad_image=on_bad_image).fitted(len(paths))
+    how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
+    batches = reading.batches(paths, how, config.check_image_size)
+    devices = devices_for(reading.batch_size)
     params = devices.replicate(cast_params(params, config))
     generator = np.random.default_rng(seed)
     parts: list[np.ndarray] = []

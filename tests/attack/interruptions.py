@@ -87,8 +87,8 @@ class Verb:
     ) -> Done:
         """Run it in a fork, with smaller settings where the command has none."""
         import crisalad_jax.experiments.demo
+        import crisalad_jax.retrieval.extract
         import crisalad_jax.retrieval.maps.build
-        import crisalad_jax.retrieval.partial
         import crisalad_jax.training.run
 
         of_demo = crisalad_jax.experiments.demo.DemoConfig
@@ -97,7 +97,7 @@ class Verb:
             *settings,
             (crisalad_jax.experiments.demo, "DemoConfig", small),
             (crisalad_jax.retrieval.maps.build, "SEGMENT", 4),
-            (crisalad_jax.retrieval.partial, "SEGMENT", 4),
+            (crisalad_jax.retrieval.extract, "SEGMENT", 4),
         ]
         out.mkdir(parents=True, exist_ok=True)
         CALLS.clear()

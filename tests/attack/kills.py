@@ -380,7 +380,7 @@ INDEXING = Marks(
         "opening the map": "crisalad_jax.retrieval.maps.build:open_for_appending",
         "appending": "crisalad_jax.retrieval.maps.map:Map.append",
         "a descriptors' file": "crisalad_jax.retrieval.maps.file_store:FileStore.add",
-        "a record": "crisalad_jax.retrieval.maps.map:write_record",
+        "a record": "crisalad_jax.retrieval.segments:write_record",
     }
 )
 IMAGES, TOGETHER = 24, 2
@@ -410,8 +410,8 @@ def map_files(folder: pathlib.Path) -> dict[str, bytes]:
 def attack_maps(bench: Bench, kills: int) -> list[Row]:
     """Kill `index`, read maps after each kill, and search a map while it grows."""
     import crisalad_jax.retrieval.maps.build
-    from crisalad_jax.retrieval.maps.head import has_images
     from crisalad_jax.retrieval.maps.map import Map
+    from crisalad_jax.retrieval.maps.metadata import has_images
 
     folder = bench.folder / "maps"
     images = folder / "images"
@@ -552,7 +552,7 @@ def attack_readers(
 
 EXTRACTING = Marks(
     {
-        "part of the tokens": "crisalad_jax.retrieval.partial:write_sealed",
+        "part of the tokens": "crisalad_jax.retrieval.segments:write_record",
         "writing descriptors": "crisalad_jax.retrieval.extract:write_descriptors",
     }
 )
@@ -560,13 +560,13 @@ EXTRACTING = Marks(
 
 def attack_extract(bench: Bench, suffix: str, kills: int) -> list[Row]:
     """Kill `extract`, half of the chains over an older set, and read the set after each kill."""
-    import crisalad_jax.retrieval.partial
+    import crisalad_jax.retrieval.extract
     from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
 
     folder = bench.folder / suffix[1:]
     images = folder / "images"
     write_images(images, 0, IMAGES)
-    small = (crisalad_jax.retrieval.partial, "SEGMENT", TOGETHER)
+    small = (crisalad_jax.retrieval.extract, "SEGMENT", TOGETHER)
 
     def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
         EXTRACTING.clear()

@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from tests.attack.kills import Bench, carry_out, part_of, recipe_of_chains
 from tests.attack.world import VERBS, Row, files_in, forked, make_products
 
@@ -122,13 +124,19 @@ def attack_queries(bench: Bench, scale: float) -> list[Row]:
             sizes = {}
             image = next(path for path in bench.world.images.rglob("*.jpg"))
             with Map.open(bench.world.path("map")) as places:
-                params = places.load_params()
+                params = places.load_model()
                 rows = np.concatenate(list(places.descriptors))
                 for number in range(1, last + 1):
                     if kind == "searches":
                         places.search(rows[:1], 3)
                     else:
-                        query(places, params, [image], k=3, quiet=True)
+                        query(
+                            places,
+                            [image],
+                            model=Model(params, places.config),
+                            k=3,
+                            reading=Reading(quiet=True),
+                        )
                     if number % max(last // 10, 1) == 0:
                         gc.collect()
                         sizes[number] = resident()

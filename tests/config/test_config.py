@@ -18,7 +18,6 @@ from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.experiments.demo import DemoConfig
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.circle import CircleConfig
 from crisalad_jax.losses.contrastive import ContrastiveConfig
@@ -44,6 +43,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.retrieval.pca import PcaConfig
 from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.synthetic import SyntheticCityConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
 from crisalad_jax.utils.errors import InputError

@@ -15,6 +15,7 @@ from crisalad_jax.checkpoints.export import ExportConfig, export_model, write_ex
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.config import ModelConfig, with_aggregator
@@ -22,6 +23,7 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.misfits import misfits
 from crisalad_jax.nn.model import (
     Crisalad,
+    Model,
     attend_across_images,
     cast_params,
     check_params,
@@ -102,22 +104,26 @@ DOORS: dict[str, Callable[..., Any]] = {
         quiet=True,
     ),
     "extract": lambda params, config, out, shared: extract(
-        params, config, shared / "town", out / "d.npy", quiet=True
+        Model(params, config), shared / "town", out / "d.npy", reading=Reading(quiet=True)
     ),
     "index": lambda params, config, out, shared: index(
-        params, config, shared / "town", out / "map", weights=out / "none", quiet=True
+        Model(params, config),
+        shared / "town",
+        out / "map",
+        weights=out / "none",
+        reading=Reading(quiet=True),
     ),
     "evaluate": lambda params, config, out, shared: evaluate(
-        params, config, open_benchmark(shared / "town"), quiet=True
+        Model(params, config), open_benchmark(shared / "town"), reading=Reading(quiet=True)
     ),
     "export_model": lambda params, config, out, shared: export_model(
         params, config, ExportConfig(platforms=("cpu",))
     ),
     "write_export": lambda params, config, out, shared: write_export(
-        out / "export", params, config, ExportConfig(platforms=("cpu",))
+        out / "export", Model(params, config), ExportConfig(platforms=("cpu",))
     ),
     "save_weights": lambda params, config, out, shared: save_weights(
-        out / "w.safetensors", params, config
+        out / "w.safetensors", Model(params, config)
     ),
 }
 MISFITS: dict[str, tuple[Any, ModelConfig, str]] = {
@@ -254,9 +260,9 @@ def test_no_file_of_weights_holds_what_cannot_be_loaded(value: float, tmp_path) 
     with pytest.raises(
         InputError, match=r"^params: .*: backbone\.cls_token holds NaN or infinity$"
     ):
-        save_weights(path, broken, MODEL)
+        save_weights(path, Model(broken, MODEL))
     assert not path.exists()
-    save_weights(path, PARAMS, MODEL)
+    save_weights(path, Model(PARAMS, MODEL))
     assert load_weights(path, expected=MODEL)[1] == MODEL
 
 

@@ -18,10 +18,11 @@ from crisalad_jax.config.io import read_config
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import GroupingResult, evaluate
 from crisalad_jax.nn.config import with_aggregator
-from crisalad_jax.nn.model import Crisalad, extract_tokens
+from crisalad_jax.nn.model import Crisalad, Model, extract_tokens
 from crisalad_jax.nn.tokens import Tokens, TransportStatistics
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.training import run as run_module
@@ -118,7 +119,9 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     validations = [line for line in lines if "R@5" in line]
     assert [(line["step"], line["epoch"]) for line in validations] == [(2, 1), (4, 2), (6, 3)]
     params, config = load_weights(run / "last.safetensors")
-    (result,) = evaluate(params, config, benchmark, groupings=("single",), quiet=True)
+    (result,) = evaluate(
+        Model(params, config), benchmark, groupings=("single",), reading=Reading(quiet=True)
+    )
     size = config.image_size
     queries = np.stack([resize_image(read_image(q), size) for q in benchmark.queries])
     transport = extract_tokens(params, queries, config).transport
@@ -239,9 +242,9 @@ def scripted(monkeypatch: pytest.MonkeyPatch, recalls_at_5: list[float]) -> list
     """Validations that find these recalls; returned: the parameters that each was asked about."""
     seen = []
 
-    def fake(params, config, benchmark, *, groupings, cache, on_bad_image, quiet):
+    def fake(model, benchmark, *, groupings, reading):
         assert groupings == ("single",)
-        seen.append(jax.device_get(params))
+        seen.append(jax.device_get(model.params))
         recall = recalls_at_5[len(seen) - 1]
         neighbours = Neighbours(np.zeros((1, 1), np.int64), np.zeros((1, 1), np.float32))
         return [GroupingResult("single", {1: 1 - recall, 5: recall, 10: 1.0}, neighbours)]
@@ -301,7 +304,7 @@ def test_a_validation_has_its_own_size(shared, places, tmp_path, monkeypatch):
 
     def recorded(params, model, *rest, **options):
         seen.append(model)
-        return evaluate(params, model, *rest, **options)
+        return evaluate(Model(params, model), *rest, **options)
 
     monkeypatch.setattr(run_module, "evaluate", recorded)
     config = dataclasses.replace(ENDLESS, epochs=1, validation_size=(56, 84))
@@ -310,7 +313,9 @@ def test_a_validation_has_its_own_size(shared, places, tmp_path, monkeypatch):
     assert model == config.model
     larger = dataclasses.replace(model, image_size=(56, 84))
     assert seen == [larger]
-    (expected,) = evaluate(params, larger, town, groupings=("single",), quiet=True)
+    (expected,) = evaluate(
+        Model(params, larger), town, groupings=("single",), reading=Reading(quiet=True)
+    )
     assert result.best_recall == expected.recalls[5]
     line = metrics_of(tmp_path)[-1]
     assert {f"R@{k}": recall for k, recall in expected.recalls.items()}.items() <= line.items()

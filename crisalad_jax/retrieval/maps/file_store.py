@@ -110,14 +110,15 @@ class FileStore:
         wide = np.ascontiguousarray(queries, np.float32)
         return similarities_of(wide, query, numbers.ravel(), self.rows).reshape(numbers.shape)
 
-    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
+    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
         """Read the descriptors of these numbers; their files stay mapped into memory.
 
         Raises:
             InputError: a file is damaged or gone.
         """
         firsts = np.array(list(self._counts))
-        rows = np.empty((len(numbers), self._length), np.float32)
+        wide = np.promote_types(self._dtype, np.float32)
+        rows = np.empty((len(numbers), self._length), wide)
         segments = np.searchsorted(firsts, numbers, side="right") - 1
         for segment in _distinct(segments):
             places, first = np.flatnonzero(segments == segment), int(firsts[segment])

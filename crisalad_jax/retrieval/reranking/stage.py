@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, cast_params
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.retrieval.reranking import matching, patch_netvlad
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
@@ -166,10 +166,7 @@ class Reranker:
         reranking: Reranking,
         database: Sequence[pathlib.Path],
         queries: Sequence[pathlib.Path],
-        *,
-        batch_size: int = 16,
-        cache: ImageCache | None = None,
-        quiet: bool = False,
+        reading: Reading = Reading(),
     ) -> None:
         """Prepare the second stage; enter it as a context before use.
 
@@ -181,8 +178,8 @@ class Reranker:
         reranking.check(reranking.config, len(database))
         self._top, self._config, self._label = reranking.top, reranking.config, reranking.name
         self._method = _METHODS[reranking.name]
-        self._batch_size, self._cache, self._quiet = batch_size, cache, quiet
-        self._devices = devices_for(batch_size)
+        self._reading, self._quiet = reading, reading.quiet
+        self._devices = devices_for(reading.batch_size)
         self._params = self._devices.replicate(cast_params(reranking.params, reranking.config))
         self._scores: dict[tuple[int, int], float | list[float]] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
@@ -249,17 +246,14 @@ class Reranker:
             )
         if not len(missing):
             return
-        batches = photograph_batches(
-            self._config,
-            [side.paths[i] for i in missing],
-            batch_size=self._batch_size,
-            cache=self._cache,
-        )
+        config, paths = self._config, [side.paths[i] for i in missing]
+        how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
+        batches = self._reading.batches(paths, how, config.check_image_size)
         label = f"{self._label}, {name}"
         with progress_bar(label, len(missing), "images", quiet=self._quiet) as bar:
             for batch in batches:
                 sharded = self._devices.shard_batch(batch.images)
-                found = np.asarray(self._method.describe(self._params, sharded, self._config))
+                found = np.asarray(self._method.describe(self._params, sharded, config))
                 rows = missing[batch.indices[batch.valid]]
                 side.features[rows], side.known[rows] = found[batch.valid], True
                 bar.advance(len(rows))

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import (
@@ -61,7 +63,7 @@ def rerank(
     database: Sequence[pathlib.Path],
     queries: Sequence[pathlib.Path],
 ) -> Neighbours:
-    with Reranker(given, database, queries, batch_size=BATCH, quiet=True) as second:
+    with Reranker(given, database, queries, Reading(batch_size=BATCH, quiet=True)) as second:
         return second(neighbours)
 
 
@@ -166,8 +168,7 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
         reranking("transvpr", 2),
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
+        Reading(batch_size=BATCH, quiet=True),
     ) as reranker:
         folder = reranker._folder.name
         found = reranker(two)
@@ -181,9 +182,11 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
 
 def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
     own = random_params(PLAIN)
-    plain = evaluate(own, PLAIN, benchmark, batch_size=BATCH, quiet=True)
+    plain = evaluate(Model(own, PLAIN), benchmark, reading=Reading(batch_size=BATCH, quiet=True))
     with_own = reranking("transvpr", 3)
-    both = evaluate(own, PLAIN, benchmark, batch_size=BATCH, rerank=with_own, quiet=True)
+    both = evaluate(
+        Model(own, PLAIN), benchmark, rerank=with_own, reading=Reading(batch_size=BATCH, quiet=True)
+    )
     assert [(r.grouping, r.rerank) for r in both] == [("any", None), ("any", "transvpr:3")]
     assert both[0].recalls == plain[0].recalls
     np.testing.assert_array_equal(both[0].neighbours.indices, plain[0].neighbours.indices)
@@ -203,7 +206,12 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
 def test_the_first_stages_model_serves_where_it_can(name: str, benchmark) -> None:
     own, config = model_of(name)
     results = [
-        evaluate(own, config, benchmark, batch_size=BATCH, rerank=given, quiet=True)[1]
+        evaluate(
+            Model(own, config),
+            benchmark,
+            rerank=given,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )[1]
         for given in (Reranking(name, 7), Reranking(name, 7, own, config))
     ]
     assert results[0].rerank == f"{name}:7"
@@ -253,7 +261,12 @@ def test_what_does_not_fit_is_found_before_any_work(
     monkeypatch.setattr("crisalad_jax.retrieval.describe.read_tokens", None)
     rerank = parse_reranking(given)
     with pytest.raises(InputError, match=words):
-        evaluate(random_params(config), config, benchmark, rerank=rerank, quiet=True)
+        evaluate(
+            Model(random_params(config), config),
+            benchmark,
+            rerank=rerank,
+            reading=Reading(quiet=True),
+        )
 
 
 def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark) -> None:

@@ -27,7 +27,7 @@ _Spot = tuple[str, tuple[float, ...]]
 
 
 @brief
-class Followed(NamedTuple):
+class TrackResult(NamedTuple):
     """Images of a map at each of some frames, the most probable first."""
 
     numbers: Int64[np.ndarray, "frame k"]
@@ -38,7 +38,7 @@ class Followed(NamedTuple):
     """Similarity of the image of the whole map that is most similar to the frame."""
 
 
-class Follower:
+class SequenceTracker:
     """A camera that is followed through a map, a few frames at a time."""
 
     def __init__(self, places: Map, bayes: BayesFilter) -> None:
@@ -56,7 +56,7 @@ class Follower:
         descriptors: Float32[np.ndarray, "frame d"],
         k: int,
         frames: Sequence[pathlib.Path],
-    ) -> "Followed":
+    ) -> "TrackResult":
         """Take the next frames into account, and rank the map's images at each of them.
 
         Motion is in metres where the map has a position of every image, and the names of the first
@@ -81,7 +81,7 @@ class Follower:
             for row, frame in zip(self._similarities(descriptors), frames, strict=True)
         ]
         numbers, similarities, probabilities, best = map(np.stack, zip(*rows, strict=True))
-        return Followed(numbers, similarities, probabilities, best)
+        return TrackResult(numbers, similarities, probabilities, best)
 
     def _choose_unit(self, frames: Sequence[pathlib.Path]) -> None:
         moments = [_when(image.name) for image in self._map.images]

@@ -2,25 +2,34 @@
 
 import numpy as np
 
-from crisalad_jax.experiments.synthetic.buildings import DEPTH, Habit, building
-from crisalad_jax.experiments.synthetic.materials import GLASS, ROOFS, WALLS, Kind, pick, scaled
-from crisalad_jax.experiments.synthetic.mesh import (
-    GROUND_LAYER,
-    TO_CAMERA,
-    UP,
-    Front,
+from crisalad_jax.synthetic.buildings import Habit, building
+from crisalad_jax.synthetic.mesh import (
+    GLASS,
+    ROOFS,
+    WALLS,
+    Body,
+    Kind,
     Mesh,
+    Place,
+    Reach,
+    Rng,
     Vector,
+    bars,
+    draw_hills,
     flat,
+    palette,
+    pick,
     polygons,
-    rectangles,
-    street_front,
+    rects,
+    scaled,
 )
-from crisalad_jax.experiments.synthetic.place import Body, Place, Reach
-from crisalad_jax.experiments.synthetic.things import lamp, monument, tree, wires
+from crisalad_jax.synthetic.things import lamp, monument, tree, wires
+
+_PAVING = palette("56 54 51, 62 58 52, 50 50 50")
+_ASPHALT = palette("30 30 31, 36 35 34, 42 38 35")
 
 
-def street(rng: np.random.Generator) -> Place:
+def street(rng: Rng) -> Place:
     """Build a street of a city."""
     mesh = Mesh()
     walls = tuple(WALLS[i] for i in rng.choice(len(WALLS), 5, replace=False))
@@ -34,11 +43,11 @@ def street(rng: np.random.Generator) -> Place:
     _skyline(mesh, rng, length)
     bodies = _far_row(mesh, rng, length, habit)
     park = rng.choice(3, p=(0.7, 0.15, 0.15))
-    for number, x in ((1, left), (2, right)):
+    for number, x, side in ((1, left, -1.0), (2, right, 1.0)):
         if park == number:
-            _park(mesh, rng, x, length)
+            _park(mesh, rng, x, side, length)
         else:
-            bodies += _row(mesh, rng, x, length, habit)
+            bodies += _row(mesh, rng, x, side, length, habit)
     lamps: list[Vector] = []
     for x in (kerbs[0] - 0.6, kerbs[1] + 0.6):
         if rng.random() < 0.55:
@@ -54,51 +63,40 @@ def street(rng: np.random.Generator) -> Place:
     if rng.random() < 0.25:
         monument(mesh, rng, sum(kerbs) / 2, rng.uniform(0.45, 0.9) * length)
 
-    ridge = rng.uniform(0.0, 1.0, 24) ** 2 * rng.uniform(0.02, 0.2)
-    hills = np.interp(np.arange(96), np.arange(24) * 4.0, ridge, period=96)
+    hills = draw_hills(rng, 0.2)
     bearing, heading = float(rng.uniform(0, 360)), float(rng.uniform(-20, 20))
     lanes = (left, *kerbs, right)
     reach = Reach(height=(1.2, 3.0), lateral=1.2, forward=2.5, step=9.0)
-    return Place(
-        mesh.scene(), np.array(lamps), tuple(bodies), bearing, heading, lanes, hills, reach
-    )
+    return Place(mesh.scene(), heading, lanes, reach, bearing, hills, bodies, np.array(lamps))
 
 
-def _ground(
-    mesh: Mesh, rng: np.random.Generator, kerbs: tuple[float, float], length: float
-) -> None:
+def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> None:
     """Add pavements, the street, the crossing at its far end, and their lines."""
-    paving = pick(rng, ((0.56, 0.54, 0.51), (0.62, 0.58, 0.52), (0.50, 0.50, 0.50)))
-    asphalt = pick(rng, ((0.30, 0.30, 0.31), (0.36, 0.35, 0.34), (0.42, 0.38, 0.35)))
+    paving, asphalt = pick(rng, _PAVING), pick(rng, _ASPHALT)
     left, right = kerbs
-    mesh.layer = GROUND_LAYER + 9
-    mesh.add(flat(-900, -20, 900, 2500), (0.44, 0.46, 0.40), UP, Kind.GRASS)
-    mesh.layer = GROUND_LAYER + 8
-    mesh.add(flat(-200, -20, 200, length + 25), paving, UP, Kind.PAVEMENT)
-    mesh.layer = GROUND_LAYER + 7
+    mesh.ground(flat(-900, -20, 900, 2500), (0.44, 0.46, 0.40), Kind.GRASS)
+    mesh.ground(flat(-200, -20, 200, length + 25), paving, Kind.PAVEMENT)
     street, crossing = flat(left, -20, right, length + 1), flat(-120, length + 1, 120, length + 8)
-    mesh.add(np.concatenate((street, crossing)), asphalt, UP, Kind.ROAD)
-    mesh.layer = GROUND_LAYER + 6
+    mesh.ground(np.concatenate((street, crossing)), asphalt, Kind.ROAD)
     edge = np.array(kerbs)
-    kerb = flat(edge - 0.12, -5, edge + 0.12, length + 1)
-    mesh.add(kerb, scaled(paving, 1.25), UP, Kind.PAVEMENT)
+    mesh.ground(flat(edge - 0.12, -5, edge + 0.12, length + 1), scaled(paving, 1.25), Kind.PAVEMENT)
     white, middle = (0.78, 0.78, 0.74), (left + right) / 2
     if rng.random() < 0.7:
         dash = rng.uniform(1.5, 3.5)
         z = np.arange(1, length, dash * 2)
-        mesh.add(flat(middle - 0.08, z, middle + 0.08, z + dash), white, UP, Kind.ROAD)
+        mesh.ground(flat(middle - 0.08, z, middle + 0.08, z + dash), white, Kind.ROAD)
     if rng.random() < 0.45:
         z, x = rng.uniform(6.0, length - 6), np.arange(left + 0.4, right - 0.6, 1.0)
-        mesh.add(flat(x, z, x + 0.5, z + 3), white, UP, Kind.ROAD)
+        mesh.ground(flat(x, z, x + 0.5, z + 3), white, Kind.ROAD)
     if rng.random() < 0.35:
         x = np.array((left + 2.2, right - 2.2))
-        mesh.add(flat(x - 0.06, -5, x + 0.06, length), white, UP, Kind.ROAD)
+        mesh.ground(flat(x - 0.06, -5, x + 0.06, length), white, Kind.ROAD)
     if rng.random() < 0.2:
         x = middle + np.array((-2.2, -0.8, 0.8, 2.2))
-        mesh.add(flat(x - 0.07, -5, x + 0.07, length), (0.20, 0.20, 0.21), UP)
+        mesh.ground(flat(x - 0.07, -5, x + 0.07, length), (0.20, 0.20, 0.21))
 
 
-def _skyline(mesh: Mesh, rng: np.random.Generator, length: float) -> None:
+def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
     """Add distant towers, and at times a steeple: landmarks that barely move."""
     for _ in range(int(rng.integers(0, 6))):
         z = length + rng.uniform(90, 320)
@@ -106,29 +104,27 @@ def _skyline(mesh: Mesh, rng: np.random.Generator, length: float) -> None:
         width, height = rng.uniform(14, 34), z * rng.uniform(0.18, 0.5)
         mesh.layer = 3000 + z
         colour = pick(rng, WALLS[6:])
-        mesh.add(rectangles(x, 0, x + width, height, z), colour, TO_CAMERA)
+        mesh.add(rects(x, 0, x + width, height, z), colour)
         if rng.random() < 0.5:
-            setback = rectangles(x + width * 0.25, height, x + width * 0.75, height * 1.12, z)
-            mesh.add(setback, colour, TO_CAMERA)
+            mesh.add(rects(x + width * 0.25, height, x + width * 0.75, height * 1.12, z), colour)
         columns, rows = int(rng.integers(3, 7)), int(rng.integers(6, 14))
         u = np.tile(x + (np.arange(columns) + 0.2) * width / columns, rows)
         v = np.repeat((np.arange(rows) + 0.3) * height / rows, columns)
-        panes = rectangles(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows, z)
-        mesh.add(panes, scaled(GLASS, 1.6), TO_CAMERA, Kind.GLASS)
+        panes = rects(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows, z)
+        mesh.add(panes, scaled(GLASS, 1.6), Kind.GLASS)
     if rng.random() < 0.4:
         z = length + rng.uniform(30, 90)
         x = rng.uniform(-0.5, 0.5) * z
         half, height = rng.uniform(2.5, 4), z * rng.uniform(0.28, 0.45)
         mesh.layer = 2000 + z
-        mesh.add(rectangles(x - half, 0, x + half, height, z), pick(rng, WALLS[:6]), TO_CAMERA)
+        mesh.add(bars(x, half, 0, height, z), pick(rng, WALLS[:6]))
         eaves, tip = half + 0.4, height * rng.uniform(1.2, 1.7)
         spire = polygons((x - eaves, height, z), (x + eaves, height, z), (x, tip, z))
-        mesh.add(spire, pick(rng, ROOFS), (0.0, 0.6, -0.8), Kind.ROOF)
-        bell = rectangles(x - half * 0.3, height * 0.82, x + half * 0.3, height * 0.93, z)
-        mesh.add(bell, (0.12, 0.12, 0.13), TO_CAMERA)
+        mesh.add(spire, pick(rng, ROOFS), Kind.ROOF, (0.0, 0.6, -0.8))
+        mesh.add(bars(x, half * 0.3, height * 0.82, height * 0.93, z), (0.12, 0.12, 0.13))
 
 
-def _far_row(mesh: Mesh, rng: np.random.Generator, length: float, habit: Habit) -> list[Body]:
+def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
     """Add the row that closes the street, at varying distances and at times with a gap."""
     reach = 14 + length * 0.7
     stands: list[tuple[float, float, float]] = []
@@ -141,15 +137,12 @@ def _far_row(mesh: Mesh, rng: np.random.Generator, length: float, habit: Habit) 
     bodies = []
     for z, x, width in sorted(stands, reverse=True):
         mesh.layer = 1000 + z
-        front = Front(mesh, (x, 0.0, z), (1.0, 0.0, 0.0), TO_CAMERA, sees_start=x > 0)
-        height = building(rng, front, width, habit)
-        bodies.append(Body(x, x + width, z, z + DEPTH, height))
+        bodies.append(building(rng, mesh.front(x, z, 0), width, habit))
     return bodies
 
 
-def _row(mesh: Mesh, rng: np.random.Generator, x: float, length: float, habit: Habit) -> list[Body]:
+def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habit) -> list[Body]:
     """Add one side of the street, from the camera to the crossing, with gaps and setbacks."""
-    side = -1.0 if x < 0 else 1.0
     bodies = []
     z = rng.uniform(-9.0, -2.0)
     while z < length - 5:
@@ -159,18 +152,14 @@ def _row(mesh: Mesh, rng: np.random.Generator, x: float, length: float, habit: H
             continue
         face = x + side * rng.choice((0.0, 0.0, 0.0, 0.8, 2.5))
         mesh.layer = z + width
-        height = building(rng, street_front(mesh, face, z), width, habit)
-        x0, x1 = sorted((face, face + side * DEPTH))
-        bodies.append(Body(x0, x1, z, z + width, height))
+        bodies.append(building(rng, mesh.front(face, z, side), width, habit))
         z += width
     return bodies
 
 
-def _park(mesh: Mesh, rng: np.random.Generator, x: float, length: float) -> None:
+def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:
     """Add lawn and trees behind a wall, on a side without houses."""
-    side = -1.0 if x < 0 else 1.0
-    mesh.layer = GROUND_LAYER + 5
-    mesh.add(flat(x, -5, x + side * 90, length), (0.40, 0.48, 0.30), UP, Kind.GRASS)
+    mesh.ground(flat(x, -5, x + side * 90, length), (0.40, 0.48, 0.30), Kind.GRASS)
     for z in np.arange(rng.uniform(10, 16), length, rng.uniform(5.0, 9.0)):
         tree(mesh, rng, x + side * rng.uniform(2.0, 16.0), float(z))
     colour, height = pick(rng, WALLS), rng.uniform(0.7, 1.6)
@@ -178,6 +167,6 @@ def _park(mesh: Mesh, rng: np.random.Generator, x: float, length: float) -> None
     # the next.
     for z in np.arange(-3.0, length, 3.0):
         mesh.layer = float(z)
-        front = street_front(mesh, x, float(z))
-        front.add(rectangles(0, 0, 3, height), colour)
-        front.add(rectangles(0, height, 3, height + 0.12), colour, Kind.LEDGE)
+        front = mesh.front(x, float(z), side)
+        front.add(rects(0, 0, 3, height), colour)
+        front.add(rects(0, height, 3, height + 0.12), colour, Kind.LEDGE)

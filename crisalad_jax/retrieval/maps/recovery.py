@@ -6,7 +6,7 @@ import numpy as np
 
 from crisalad_jax.retrieval.maps.approximate import indexed_images
 from crisalad_jax.retrieval.maps.calibration import CALIBRATION
-from crisalad_jax.retrieval.maps.head import SEGMENTS, has_images
+from crisalad_jax.retrieval.maps.metadata import SEGMENTS, has_images
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 

@@ -9,11 +9,11 @@ import pytest
 
 from crisalad_jax.data.moments import moment_of
 from crisalad_jax.data.positions import Positions, utm_positions
-from crisalad_jax.retrieval.maps.follow import Follower
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.tracking import SequenceTracker
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.notes import Note
-from tests.killed_appends import description
+from tests.killed_appends import metadata
 from tests.retrieval.test_sequence import walk
 
 NOISE = 0.9
@@ -21,7 +21,7 @@ NOISE = 0.9
 
 
 def made(folder: pathlib.Path, names, rows, positions: Positions | None = None) -> Map:
-    described = dataclasses.replace(description("files"), descriptor_length=rows.shape[1])
+    described = dataclasses.replace(metadata("files"), descriptor_length=rows.shape[1])
     with open_for_appending(folder, described) as target:
         rows = rows.astype(np.float32)
         target.append(names, [1] * len(names), rows, root="/images", positions=positions)
@@ -52,7 +52,7 @@ def recalls(folder, of_map: float, of_frames: float, name, name_frames=None) -> 
     when, queries = walk(of_frames, 3, NOISE)
     places = made(folder, name(there), database)
     frames = [pathlib.Path("in", each) for each in (name_frames or name)(when)]
-    follower = Follower(places, BayesFilter())
+    follower = SequenceTracker(places, BayesFilter())
     # In portions, as `query` asks.
     portions = [follower.answer(queries[:7].astype(np.float32), 1, frames[:7])]
     portions.append(follower.answer(queries[7:].astype(np.float32), 1, frames[7:]))
@@ -81,7 +81,7 @@ def test_a_map_of_positions_is_followed_in_metres(tmp_path):
     degrees = [(40 + 1.5 * time / 111_035, 9.0) for time in there]
     of = dict(zip(names, degrees, strict=True))
     places = made(tmp_path, names, database, Positions(("lat", "lon"), of))
-    follower = Follower(places, BayesFilter())
+    follower = SequenceTracker(places, BayesFilter())
     frames = [pathlib.Path(each) for each in in_metres(when)]
     with warnings.catch_warnings():
         warnings.simplefilter("error", Note)
@@ -108,7 +108,7 @@ def test_two_videos_have_two_clocks(tmp_path):
     """The camera may be anywhere when another video begins, and a map's videos are far apart."""
     names = [*in_video([0, 1, 2]), *(f"b/{each}" for each in in_video([0, 1, 2]))]
     places = made(tmp_path, names, np.eye(6))
-    follower = Follower(places, BayesFilter(adapt=False))
+    follower = SequenceTracker(places, BayesFilter(adapt=False))
     frames = [pathlib.Path(each) for each in ("x.mp4#t=0.0", "x.mp4#t=0.5", "y.mp4#t=0.5")]
     follower.answer(np.eye(6, dtype=np.float32)[:2], 1, frames[:2])
     gaps = np.diff(follower.state.along)
@@ -122,7 +122,7 @@ def test_two_videos_have_two_clocks(tmp_path):
 def test_metres_come_before_seconds_and_are_of_one_zone(tmp_path):
     names = [f"@500000.0@{4_000_000 + 3 * s}.0@32@N@140363657{s}@.jpg" for s in range(3)]
     places = made(tmp_path, names, np.eye(3), utm_positions(names))
-    follower = Follower(places, BayesFilter())
+    follower = SequenceTracker(places, BayesFilter())
     follower.answer(np.eye(3, dtype=np.float32)[:1], 1, [pathlib.Path(names[0])])
     assert follower.state.along.tolist() == [0, 3, 6]
     assert follower._moved(pathlib.Path(names[1])) == 3
