@@ -100,8 +100,8 @@ def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
         record = training_of(finished / "crisalad" / f"seed-{seed}")
         seconds.append(record["steps"] * record["step_seconds"])
     ratio = max(seconds) / min(seconds)
-    assert row["training"] == pytest.approx([1, 1 / ratio, ratio])
-    assert row["training_seconds"] == pytest.approx(
+    assert list(row["training"].values()) == pytest.approx([1, 1 / ratio, ratio])
+    assert list(row["training_seconds"].values()) == pytest.approx(
         [statistics.mean(seconds), min(seconds), max(seconds)]
     )
 
@@ -310,7 +310,8 @@ def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
     summary = run(config, finished)
     assert seen == [(0, "parsed by-name:5"), (1, "parsed by-name:5")]
     first, second = summary.rows
-    assert first.recalls == second.recalls
+    for k, recall in second.recalls["town"].items():
+        assert recall._replace(difference=None) == first.recalls["town"][k]
     assert (first.speed, second.speed, second.training) == (1, 1, first.training)
     assert second.recalls["town"][1].difference.interval == (0, 0)
 
