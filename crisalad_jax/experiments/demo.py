@@ -14,6 +14,7 @@ from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.report import (
     RecallRow,
@@ -24,8 +25,8 @@ from crisalad_jax.experiments.report import (
     training_curves,
 )
 from crisalad_jax.experiments.report.tables import write_text
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import Model, init_crisalad
+from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -87,24 +88,28 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
     city = SyntheticCityConfig(
         train_places=config.train_places, test_places=config.test_places, seed=config.seed
     )
-    images = city.train_places * city.images_per_place
-    images += city.test_places * (city.database_per_place + city.queries_per_place)
-    with progress_bar("rendering the city", images, "images", quiet=quiet) as bar:
-        write_synthetic_city(out / "city", city, progress=lambda done, total: bar.advance(1))
+    with progress_bar("rendering the city", city.images, "images", quiet=quiet) as bar:
+        write_synthetic_city(out / "city", city, progress=bar.advance)
     benchmark = open_benchmark(out / "city" / "test")
     measure = functools.partial(
-        evaluate, benchmark=benchmark, groupings=GROUPINGS, seed=config.seed, seeds=1, quiet=quiet
+        evaluate,
+        benchmark=benchmark,
+        groupings=GROUPINGS,
+        seed=config.seed,
+        seeds=1,
+        reading=Reading(quiet=quiet),
     )
 
     settings = demo_recipe(config)
-    untrained = measure(init_crisalad(jax.random.key(config.seed), settings.model), settings.model)
+    params = init_crisalad(jax.random.key(config.seed), settings.model)
+    untrained = measure(Model(params, settings.model))
     training_started = time.monotonic()
     fit(settings, read_places(out / "city" / "train"), out / "run", quiet=quiet)
     training_seconds = time.monotonic() - training_started
     results = {
-        "HOG, no learning": measure(*load("hog")),
+        "HOG, no learning": measure(load("hog")),
         "untrained": untrained,
-        "trained": measure(*load_weights(out / "run" / "last.safetensors")),
+        "trained": measure(load_weights(out / "run" / "last.safetensors")),
     }
 
     rows = [

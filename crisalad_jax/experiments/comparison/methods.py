@@ -276,7 +276,7 @@ _LARGEST = 2**40
 """Largest whole number, as of the command line's flags."""
 _FIXED = (
     *("seed", "preset", "mining.kind", "patience", "validate-every", "validation-size"),
-    *("select-by", "keep-best"),
+    *("monitor", "save-top-k"),
 )
 """Flags of `train` that are the same for all rows: a comparison has its own seeds and preset,
 trains on places, and validates nothing."""

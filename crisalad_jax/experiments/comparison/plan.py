@@ -13,7 +13,7 @@ import numpy as np
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.config.checks import check_types
+from crisalad_jax.config.checks import check_count, check_types
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.parts import parts_of
@@ -33,9 +33,9 @@ from crisalad_jax.experiments.comparison.methods import (
 )
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
+from crisalad_jax.retrieval.grouping import parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
-from crisalad_jax.training.batches import groups_of, steps_per_epoch
+from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
 from crisalad_jax.training.run_files import checksum_of_places
@@ -94,7 +94,8 @@ class ComparisonConfig:
         own = [row.name for row in map(parse_row, self.rows)]
         names = (*self.names, *(name for name in own if name not in self.names))
         object.__setattr__(self, "names", names)
-        check_grouping((), self.batch_size, 0, self.seeds)
+        check_count("batch size", self.batch_size)
+        check_count("seeds", self.seeds)
         parse_groupings(self.grouping.split(","))
         if own and self.kind != "ablate":
             raise InputError("--row: found rows with methods, expected them in an ablation alone")
@@ -442,7 +443,7 @@ def _own_places(loss: LossConfig) -> LossConfig:
 def _with_short_warmup(variant: Variant, training: TrainConfig, places: Places) -> TrainConfig:
     """Shorten the warm-up of a short run, and say so."""
     try:
-        per_epoch = steps_per_epoch(training, groups_of(training, places))
+        per_epoch = PlaceBatches(training, places).steps_per_epoch
     except InputError as error:
         raise InputError(f"{variant.name}: {error}") from error
     steps = per_epoch * training.epochs

@@ -25,6 +25,7 @@ from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.comparison.costs import (
     AdapterCost,
@@ -45,8 +46,8 @@ from crisalad_jax.experiments.comparison.results import (
 )
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
 from crisalad_jax.experiments.report.gallery import first_right_ranks
-from crisalad_jax.nn.model import Crisalad, init_crisalad
-from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
+from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -256,15 +257,13 @@ def _ranks(
     variant, benchmark = evaluation.variant, evaluation.benchmark
     rerank = None if variant.rerank is None else parse_reranking(variant.rerank)
     results = evaluate(
-        params,
-        variant.model,
+        Model(params, variant.model),
         benchmark,
         groupings=config.grouping.split(","),
-        batch_size=config.batch_size,
         seed=seed,
         seeds=1,
         rerank=rerank,
-        quiet=True,
+        reading=Reading(batch_size=config.batch_size, quiet=True),
     )
     return {
         each.grouping: first_right_ranks(each.neighbours, benchmark.ground_truth()).tolist()
@@ -330,7 +329,7 @@ def _start(prepared: Prepared, run: Run, quiet: bool) -> Crisalad:
             on_bad_image=prepared.on_bad_image,
             quiet=quiet,
         )
-        save_weights(path, params, model)
+        save_weights(path, Model(params, model))
     return params
 
 

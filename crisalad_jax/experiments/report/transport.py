@@ -21,7 +21,7 @@ from crisalad_jax.experiments.report.gallery import thumbnail
 from crisalad_jax.experiments.report.style import GREY, INK, Picture
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, check_params, transport_masses
-from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.retrieval.describe import prepare_image
 
 CLUSTER_COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 """Okabe and Ito's colours, which the colour-blind can tell apart, on a grey photograph."""
