@@ -27,8 +27,8 @@ from crisalad_jax.evaluation.calibrate import calibrate as calibrate
 from crisalad_jax.evaluation.evaluate import evaluate as evaluate
 from crisalad_jax.evaluation.operating_point import operating_point as operating_point
 from crisalad_jax.experiments.comparison import compare as compare
-from crisalad_jax.experiments.report.show import show_retrievals as show_retrievals
-from crisalad_jax.experiments.report.show import show_transport as show_transport
+from crisalad_jax.experiments.report import show_retrievals as show_retrievals
+from crisalad_jax.experiments.report import show_transport as show_transport
 from crisalad_jax.experiments.train import train as train
 from crisalad_jax.losses import Loss as Loss
 from crisalad_jax.losses import LossBatch as LossBatch

@@ -107,7 +107,7 @@ def maps(folder: pathlib.Path, descriptors: np.ndarray) -> None:
     assert_type(benchmark, cj.Benchmark)
     results = cj.evaluate(cj.Model(params, config), benchmark)
     assert_type(results, list[GroupingResult])
-    rows = ("gem: model.aggregator=gem", ("slow", {"optimiser.learning_rate": 1e-4}))
+    rows = ("gem: model.aggregator=gem", "slow: optimiser.learning-rate=1e-4")
     compared = ComparisonConfig("ablate", ("crisalad",), test=("SET",), train="DIR", rows=rows)
     assert_type(compare(compared, "OUT", jobs=2), Summary)
 

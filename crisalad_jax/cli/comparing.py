@@ -19,8 +19,8 @@ class ComparisonFlags:
     test: tuple[pathlib.Path, ...]
     """Evaluation sets, each in any layout that `evaluate` reads."""
     out: pathlib.Path
-    """Folder of the comparison; the same command goes on with what is in it. Beside the runs it
-    holds table.md, table.csv, results.json, and the page index.html."""
+    """Folder of the comparison; the same command resumes what is in it. It also gets table.md,
+    table.csv, results.json, and the page index.html."""
     train: pathlib.Path | None = None
     """Training set: a folder with one folder a place, a table name,place[,lat,lon[,heading]]
     (places.csv in the folder, or the file), or Dataframes/ and Images/ of GSV-Cities."""
@@ -40,7 +40,7 @@ class ComparisonFlags:
     bicubic or area; antialias or no-antialias; bytes or floats; round;
     high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     batch_size: int = 16
-    """Images described together, which a grouping lets look at each other."""
+    """Images described together, which a grouping lets attend to each other."""
     grouping: str = "single"
     """Comma-separated, as `evaluate` takes them, for methods with a cross-image encoder."""
     reference: str | None = None
@@ -48,7 +48,7 @@ class ComparisonFlags:
     the first where that is not compared."""
     jobs: int = 1
     """Runs at once, each in a process of its own: on a GPU of its own where there are as many, else
-    beside the others. Other hosts that run the same command on a shared folder take runs too."""
+    sharing one. Other hosts that run the same command on a shared folder take runs too."""
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
@@ -67,13 +67,11 @@ class ComparisonFlags:
 def settings_of(flags: ComparisonFlags) -> dict[str, Any]:
     """Return the settings of a `ComparisonConfig` that both commands' flags set."""
 
-    def text(path: pathlib.Path | None) -> str | None:
-        return None if path is None else str(path)
-
+    backbone = find_given(flags.backbone, quiet=flags.quiet)
     return {
         "test": tuple(map(str, flags.test)),
-        "train": text(flags.train),
-        "backbone": text(find_given(flags.backbone, quiet=flags.quiet)),
+        "train": None if flags.train is None else str(flags.train),
+        "backbone": None if backbone is None else str(backbone),
         "preset": flags.preset,
         "epochs": flags.epochs,
         "image_size": flags.image_size,
@@ -93,7 +91,7 @@ def names_of(text: str) -> tuple[str, ...]:
 def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
     """Carry out a comparison, and print its tables."""
     from crisalad_jax.experiments.comparison import compare
-    from crisalad_jax.experiments.comparison.tables import as_json, terminal_tables
+    from crisalad_jax.experiments.comparison.tables import as_json, tables_of
 
     notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=flags.quiet)
     summary = compare(
@@ -105,8 +103,8 @@ def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
         quiet=flags.quiet,
     )
-    for table in terminal_tables(summary):
-        show(table)
+    for table in tables_of(summary).values():
+        show(table.terminal())
     for note in summary.notes:
         say(note)
     say(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")

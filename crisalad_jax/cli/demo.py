@@ -30,7 +30,7 @@ def run(arguments: Demo) -> None:
 
     prepare_json(arguments.json)
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
-    show(recall_table(summary.rows, title="Recall@K in percent, synthetic city"))
+    show(recall_table(summary.rows, "Recall@K in percent, synthetic city").terminal())
     say(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
     say(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "

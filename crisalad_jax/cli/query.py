@@ -138,16 +138,16 @@ def run(arguments: Query) -> None:
             print(line)
     with contextlib.ExitStack() as staged:  # so that both files appear, or none
         if arguments.gallery is not None:
-            from crisalad_jax.experiments.report import answers_gallery
+            from crisalad_jax.experiments.report import save, show_retrievals
 
-            answers_gallery(
-                staged.enter_context(atomic_path(arguments.gallery)),
+            figure = show_retrievals(
                 answers,
                 root=arguments.map_images,
                 rows=_ROWS,
                 columns=_COLUMNS,
                 title=str(arguments.map),
             )
+            save(figure, staged.enter_context(atomic_path(arguments.gallery)))
         if file is not None:
             write_answers(file, answers)
     if arguments.gallery is not None:

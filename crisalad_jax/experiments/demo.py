@@ -12,18 +12,19 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
-from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report import (
     RecallRow,
-    prediction_gallery,
     recall_curves,
-    recall_markdown,
+    recall_table,
+    save,
+    show_retrievals,
     training_curves,
 )
+from crisalad_jax.experiments.report.tables import write_text
 from crisalad_jax.nn.model import Model, init_crisalad
 from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
@@ -31,7 +32,7 @@ from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, write_json
+from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.locks import one_writer
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
@@ -72,7 +73,6 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         InputError: `out` holds other files, or a demo of another configuration; or another process
             writes there.
     """
-    started = time.monotonic()
     new = not (out / "city").exists()
     if out.exists() and new and (not out.is_dir() or holds_other_files(out)):
         raise InputError(
@@ -80,20 +80,17 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         )
     with one_writer(out):
         remove_temporaries(out)
-        return _demo(config, out, quiet, started)
+        return _run(config, out, quiet)
 
 
-def _demo(config: DemoConfig, out: pathlib.Path, quiet: bool, started: float) -> DemoSummary:
+def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
+    started = time.monotonic()
     city = SyntheticCityConfig(
         train_places=config.train_places, test_places=config.test_places, seed=config.seed
     )
     with progress_bar("rendering the city", city.images, "images", quiet=quiet) as bar:
         write_synthetic_city(out / "city", city, progress=bar.advance)
     benchmark = open_benchmark(out / "city" / "test")
-    places = read_places(out / "city" / "train")
-
-    settings = demo_recipe(config)
-    untrained = init_crisalad(jax.random.key(config.seed), settings.model)
     measure = functools.partial(
         evaluate,
         benchmark=benchmark,
@@ -102,43 +99,47 @@ def _demo(config: DemoConfig, out: pathlib.Path, quiet: bool, started: float) ->
         seeds=1,
         reading=Reading(quiet=quiet),
     )
-    before = measure(Model(untrained, settings.model))
-    training_started = time.monotonic()
-    fit(settings, places, out / "run", quiet=quiet)
-    training_seconds = time.monotonic() - training_started
-    after = measure(load_weights(out / "run" / "last.safetensors"))
 
-    rows = _rows(benchmark, "HOG, no learning", measure(load("hog")))
-    rows += _rows(benchmark, "untrained", before)
-    rows += _rows(benchmark, "trained", after)
+    settings = demo_recipe(config)
+    params = init_crisalad(jax.random.key(config.seed), settings.model)
+    untrained = measure(Model(params, settings.model))
+    training_started = time.monotonic()
+    fit(settings, read_places(out / "city" / "train"), out / "run", quiet=quiet)
+    training_seconds = time.monotonic() - training_started
+    results = {
+        "HOG, no learning": measure(load("hog")),
+        "untrained": untrained,
+        "trained": measure(load_weights(out / "run" / "last.safetensors")),
+    }
+
+    rows = [
+        RecallRow(benchmark.name, model, result.grouping, result.recalls)
+        for model, of_model in results.items()
+        for result in of_model
+    ]
     pictures = [out / name for name in ("recall.png", "training.png", "gallery.png")]
     recall_curves(
         pictures[0],
         {f"{row.model}, {row.grouping}": row.recalls for row in rows if row.grouping != "shuffled"},
         "Recall@K on places never seen in training",
+        wide=True,
     )
     training_curves(pictures[1], read_metrics(out / "run" / "metrics.jsonl"))
-    prediction_gallery(
-        pictures[2],
-        benchmark.queries,
-        benchmark.database,
-        *after[0].neighbours,
-        benchmark.ground_truth(),
-        title="Queries and what the trained model finds, every image described alone",
-    )
-    with atomic_path(out / "recalls.md") as temporary:
-        temporary.write_text(recall_markdown(rows), encoding="utf-8")
-    seconds = time.monotonic() - started
+    title = "Queries and what the trained model finds, every image described independently"
+    gallery = show_retrievals(results["trained"][0], benchmark, rows=6, title=title)
+    save(gallery, pictures[2])
+    write_text(out / "recalls.md", recall_table(rows).markdown())
+    summary = DemoSummary(rows, pictures, time.monotonic() - started, training_seconds)
     write_json(
         out / "summary.json",
         {
             "config": dataclasses.asdict(config),
-            "seconds": round(seconds, 1),
+            "seconds": round(summary.seconds, 1),
             "training_seconds": round(training_seconds, 1),
             "results": [row._asdict() for row in rows],
         },
     )
-    return DemoSummary(rows, pictures, seconds, training_seconds)
+    return summary
 
 
 def demo_recipe(config: DemoConfig) -> TrainConfig:
@@ -152,7 +153,3 @@ def demo_recipe(config: DemoConfig) -> TrainConfig:
         epochs=config.epochs,
         seed=config.seed,
     )
-
-
-def _rows(benchmark: Benchmark, model: str, results: list[GroupingResult]) -> list[RecallRow]:
-    return [RecallRow(benchmark.name, model, r.grouping, r.recalls) for r in results]

@@ -99,19 +99,15 @@ def train(
 
     def read() -> tuple:
         initial = read_start(
-            config,
-            weights=weights,
-            backbone=backbone,
-            quiet=quiet or not distributed.is_primary(),
+            config, weights=weights, backbone=backbone, quiet=quiet or not distributed.is_primary()
         )
         places = _read_set(config, data, images, grouping, on_bad_image)
-        if validation is None:
-            return initial, places, None
-        return (
-            initial,
-            places,
-            open_benchmark(validation, images=validation_images, on_bad_image=on_bad_image),
-        )
+        benchmark = None
+        if validation is not None:
+            benchmark = open_benchmark(
+                validation, images=validation_images, on_bad_image=on_bad_image
+            )
+        return initial, places, benchmark
 
     initial, places, benchmark = distributed.raise_together(read)
     if (weights, backbone) == (None, None) and config.trainable != "all":
@@ -119,15 +115,13 @@ def train(
             "Note: no --weights or --backbone, so the frozen part of the model "
             f"({config.trainable} trains) is random. --trainable all trains everything."
         )
-    groups = (
-        f"{len(places.queries)} queries with positives"
-        if isinstance(places, QuerySet)
-        else f"{len(places.place_id)} places"
-    )
-    say(
-        f"{data}: {groups}, {len(places.files)} images"
-        + ("" if benchmark is None else f"; validation on {benchmark.name}")
-    )
+    groups = f"{len(places.files)} images"
+    if isinstance(places, QuerySet):
+        groups = f"{len(places.queries)} queries with positives, {groups}"
+    else:
+        groups = f"{len(places.place_id)} places, {groups}"
+    on = "" if benchmark is None else f"; validation on {benchmark.name}"
+    say(f"{data}: {groups}{on}")
     if weights is None:
         distributed.run_on_primary(lambda: check_run(out, config))
         initial = with_vocabulary_of(
@@ -158,7 +152,6 @@ def _read_set(
     on_bad_image: OnBadImage,
 ) -> Places | QuerySet:
     """Read the training set: places, or queries of which tuples are mined."""
-    mining = config.mining
     if not config.mines:
         if images is not None:
             raise InputError("--data-images: found for places, expected it for queries alone")
@@ -169,15 +162,15 @@ def _read_set(
             on_bad_image=on_bad_image,
             **grouping,
         )
-    for name, value in grouping.items():
-        if value is not None:
-            raise InputError(
-                f"--{name.replace('_', '-')}: found for a recipe that mines tuples, expected it "
-                "for one that trains on places"
-            )
-    if images is not None and pathlib.Path(data).is_dir():
-        raise InputError(f"--data-images: found beside the folder {data}, expected it for a file")
+    given = [f"--{name.replace('_', '-')}" for name in grouping if grouping[name] is not None]
+    if given:
+        raise InputError(
+            f"{', '.join(given)}: found for a recipe that mines tuples, expected it for one that "
+            "trains on places"
+        )
     folder = pathlib.Path(data)
+    if images is not None and folder.is_dir():
+        raise InputError(f"--data-images: found with the folder {data}, expected it for a file")
     if (folder / "Dataframes").is_dir() or (folder / TABLE).is_file():
         raise InputError(
             f"{data}: found places, expected queries and a database, "
@@ -185,8 +178,8 @@ def _read_set(
         )
     return read_query_set(
         data,
-        positive_radius=mining.positive_radius,
-        negative_radius=mining.negative_radius,
+        positive_radius=config.mining.positive_radius,
+        negative_radius=config.mining.negative_radius,
         images=images,
         on_bad_image=on_bad_image,
     )

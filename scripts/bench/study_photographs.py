@@ -20,7 +20,7 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.experiments.report import RecallRow, recall_markdown
+from crisalad_jax.experiments.report import RecallRow, recall_table
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training.config import TrainConfig
@@ -104,12 +104,12 @@ def main() -> None:
     rows.sort(key=lambda row: order[row.benchmark])
     with atomic_path(arguments.out / "photographs.md") as temporary:
         temporary.write_text(
-            recall_markdown(rows)
+            recall_table(rows).markdown()
             + "\n| model | seed | training, minutes |\n| --- | ---: | ---: |\n"
             + "".join(timings),
             encoding="utf-8",
         )
-    print(recall_markdown(rows))
+    print(recall_table(rows).markdown())
 
 
 if __name__ == "__main__":

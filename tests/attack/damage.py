@@ -34,7 +34,7 @@ def readers(world: World) -> Mapping[str, tuple[str, str, Reader]]:
     from crisalad_jax.checkpoints.train_state import StateStore
     from crisalad_jax.checkpoints.weights import load_weights
     from crisalad_jax.config.io import read_config
-    from crisalad_jax.experiments.comparison.records import read_result
+    from crisalad_jax.experiments.comparison.results import read_result
     from crisalad_jax.retrieval.descriptor_files import read_descriptors
     from crisalad_jax.retrieval.faiss_index import load_index
     from crisalad_jax.retrieval.maps.map import Map
@@ -64,7 +64,7 @@ def readers(world: World) -> Mapping[str, tuple[str, str, Reader]]:
             pass
 
     def result(folder: pathlib.Path) -> None:
-        read_result(folder / "result.json", benchmark=str, queries=int, groupings=dict)
+        read_result(folder / "result.json")
 
     return {
         "weights": ("", "run/last.safetensors", lambda f: load_weights(f / "run/last.safetensors")),
@@ -114,7 +114,7 @@ def make_rest(folder: pathlib.Path) -> None:
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     save_index(folder / "some.index", build("hnsw", rows))
     ranks = {"single": [1, 2, 0, 4, 5] * 8}
-    value = {"benchmark": "town", "queries": 40, "database": 7, "seconds": 1.5, "groupings": ranks}
+    value = {"settings": {}, "training": None, "ranks": {"town": ranks}, "seconds": 1.5}
     write_json(folder / "result.json", value)
 
 

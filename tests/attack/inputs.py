@@ -1298,42 +1298,9 @@ def layouts() -> Iterator[Case]:
 def comparisons() -> Iterator[Case]:
     """Change what a finished comparison left."""
     files: Mapping[str, dict[str, Callable[[Any], Any]]] = {
-        "gem/seed-0/test-0.json": {
-            "no groupings": lambda v: {k: i for k, i in v.items() if k != "groupings"},
-            "no numbers": _setting("groupings", {}),
-            "ranks of words": _setting("groupings", {"single": ["x"] * 5}),
-            "ranks below zero": _setting("groupings", {"single": [-1] * 5}),
-            "ranks of NaN": _setting("groupings", {"single": [math.nan] * 5}),
-            "too few ranks": _setting("groupings", {"single": [1]}),
-            "ranks in a dictionary": _setting("groupings", {"single": {}}),
-            "another set": _setting("benchmark", "x"),
-            "a list": lambda v: [],
-        },
-        "gem/seed-0/training.json": {
-            "steps of words": _setting("steps", "x"),
-            "seconds of NaN": _setting("step_seconds", math.nan),
-            "seconds below zero": _setting("step_seconds", -1.0),
-            "no sittings": lambda v: {k: i for k, i in v.items() if k != "sittings"},
-            "a text": lambda v: "x",
-        },
-        "speed.json": {
-            "no rounds": _setting("rounds", {}),
-            "rounds of words": _setting("rounds", {"gem": ["x"]}),
-            "rounds of nothing": _setting("rounds", {"gem": []}),
-            "rounds of zero": _setting("rounds", {"gem": [0.0] * 5}),
-            "a batch of words": _setting("batch_size", "x"),
-            "null": lambda v: None,
-        },
-        "config.json": {
-            "a list": lambda v: [],
-            "other seeds": _setting("seeds", 7),
-            "an unknown key": _setting("x", 7),
-            "seeds of words": _setting("seeds", "x"),
-        },
-        "behind.json": {
-            "a list": lambda v: [1],
-            "numbers": lambda v: dict.fromkeys(v, 3),
-            "null": lambda v: None,
+        "crisalad+gem/seed-0/result.json": {
+            "no settings": _setting("settings", {}),
+            "other settings": _setting("settings", {"training": {"epochs": 99}}),
         },
     }
     for name, changes in files.items():

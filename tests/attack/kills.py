@@ -45,7 +45,7 @@ from tests.attack.world import (
     write_rows,
 )
 
-TIMES = ("images_per_second", "waited_for_images", "seconds", "step_seconds", "seconds_of_steps")
+TIMES = ("images_per_second", "waited_for_images", "seconds", "step_seconds")
 """What a log or a result tells of the clock; all else is equal in two runs."""
 
 
@@ -673,7 +673,7 @@ def attack_compare(bench: Bench, kills: int) -> list[Row]:
         found, expected = out / "comparison", folder / "whole" / "comparison"
         (run,) = expected.rglob("run")
         wrong = differences(found / run.relative_to(expected), run)
-        for path in expected.rglob("test-*.json"):
+        for path in expected.rglob("result.json"):
             other = found / path.relative_to(expected)
             values = [without_times(json.loads(each.read_text())) for each in (path, other)]
             wrong += [] if values[0] == values[1] else [path.name]

@@ -606,7 +606,7 @@ def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
         train(CONFIG, shared / "city", out, quiet=True)
     with pytest.raises(InputError, match="--data-images: found for places"):
         train(RECIPE, shared / "city", out, images=tmp_path, quiet=True)
-    with pytest.raises(InputError, match="--data-images: found beside the folder"):
+    with pytest.raises(InputError, match="--data-images: found with the folder"):
         train(CONFIG, street, out, images=tmp_path, quiet=True)
     assert not out.exists()
 

@@ -1,11 +1,18 @@
-"""Methods of `crisalad compare`: the paper's Table 1 and BoQ, and any recipe or part by name."""
+"""What is compared: the methods of the paper's Table 1, the rows of its Table 2, custom rows."""
 
+import dataclasses
+import functools
+import re
+import shlex
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+from crisalad_jax.config.flags import parse_changes
 from crisalad_jax.config.parts import Part
 from crisalad_jax.data.augmentations import Augmentation
-from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import (
     RECIPES,
     find_part,
@@ -15,11 +22,14 @@ from crisalad_jax.training.recipes import (
     split_name,
     with_part,
 )
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
+
+AdapterKind = Literal["depthwise", "multi-resolution", "mlp", "none"]
 
 
 class ComparedMethod(NamedTuple):
-    """A line of the table."""
+    """A line of the table of `crisalad compare`."""
 
     title: str
     """Name of the method as its authors write it."""
@@ -53,13 +63,59 @@ another, on CriSALAD's backbone and with its training. Other names are recipes o
 second stage."""
 
 
-def method_of(name: str, preset: str) -> ComparedMethod:
+class Line(NamedTuple):
+    """What a name stands for."""
+
+    title: str
+    changed: str
+    """What an ablation changes with it, in words."""
+    run: str
+    """Name of the run that makes its model."""
+    training: TrainConfig
+    rerank: str | None = None
+
+
+def find_line(name: str, preset: str, *, from_nothing: bool, what: str = "--methods") -> Line:
+    """Look up a line of a table by its name.
+
+    Args:
+        name: of `METHODS` or `ABLATIONS`, or what `method_of` looks up.
+        preset: the size of the models.
+        from_nothing: whether training starts from random weights, as `from_scratch` has it.
+        what: what messages call the name.
+
+    Returns:
+        The line; Table 2's CriSALAD itself has its settings in place of what it changes.
+
+    Raises:
+        InputError: there is no such method, row, recipe or part, or it does not fit.
+
+    Example:
+        >>> find_line("no-encoder-step", "b14", from_nothing=False).changed
+        'cross-image encoder no, scheduler step'
+    """
+    if name not in ABLATIONS:
+        method = method_of(name, preset, what)
+        training = method_training(method.recipe, preset, from_nothing=from_nothing)
+        return Line(method.title, method.title, method.recipe, training, method.rerank)
+    training = ABLATIONS[name].training(preset, from_nothing=from_nothing)
+    settings = _settings(training)
+    base = _settings(ABLATIONS["crisalad"].training(preset, from_nothing=from_nothing))
+    changed = {each: word for each, word in settings.items() if word != base[each]} or settings
+    title = METHODS[name].title if name in METHODS else name
+    return Line(
+        title, ", ".join(f"{each} {word}" for each, word in changed.items()), name, training
+    )
+
+
+def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod:
     """Look up a method to compare.
 
     Args:
         name: of `METHODS`, or what `recipe` looks up: a recipe, or RECIPE+PART. A part alone
             stands for crisalad+PART.
         preset: the size of the models.
+        what: what messages call the name.
 
     Returns:
         The method; of a recipe its name is the title.
@@ -75,23 +131,24 @@ def method_of(name: str, preset: str) -> ComparedMethod:
         return METHODS[name]
     if mines_tuples(name):
         tell(
-            f"--methods: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
+            f"{what}: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
             f"{name} here, trained on places as all others are (`crisalad train` has the recipe)"
         )
         whole = f"crisalad+{name}"
-        return METHODS.get(whole, ComparedMethod(whole, whole))
-    if name in RECIPES:
-        return ComparedMethod(name, name)
-    base, part = split_name(name)
-    find_part(part, preset, what="--methods", others={*METHODS, *RECIPES})
-    whole = f"{base or 'crisalad'}+{part}"
+    elif name in RECIPES:
+        whole = name
+    else:
+        base, part = split_name(name)
+        others = {*METHODS, *ABLATIONS, *RECIPES}
+        find_part(part, preset, what=what, others=others)
+        whole = f"{base or 'crisalad'}+{part}"
     return METHODS.get(whole, ComparedMethod(whole, whole))
 
 
 def is_method(name: str) -> bool:
     """Return whether a name is a method's or a recipe's, or spells out RECIPE+PART or KIND:NAME.
 
-    A part's name alone is none: with weights it may name any model.
+    A part's name alone is not: with weights it may name any model.
 
     Example:
         >>> is_method("salad"), is_method("crisalad+gem"), is_method("megaloc")
@@ -115,12 +172,12 @@ def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> Tra
     Raises:
         InputError: what `recipe` raises.
     """
-    if recipe_name not in RECIPES:
-        base, part = split_name(recipe_name)
-        found = find_part(part, preset)
-        return training_with(found, preset, from_nothing=from_nothing, base=base or "crisalad")
-    config = recipe(preset, recipe_name)
-    return from_scratch(config) if from_nothing else config
+    if recipe_name in RECIPES:
+        config = recipe(preset, recipe_name)
+        return from_scratch(config) if from_nothing else config
+    base, part = split_name(recipe_name)
+    found = find_part(part, preset)
+    return training_with(found, preset, from_nothing=from_nothing, base=base or "crisalad")
 
 
 def training_with(
@@ -150,3 +207,175 @@ def training_with(
     config = from_scratch(config)
     # `from_scratch` sets its own augmentation, which would replace the one that is compared.
     return with_part(config, part) if isinstance(part, Augmentation) else config
+
+
+class Ablation(NamedTuple):
+    """A row of Table 2: CriSALAD with these settings."""
+
+    adapter: AdapterKind = "depthwise"
+    encoder: bool = True
+    learning_rate: float = 6e-5
+    schedule: Literal["linear", "step"] = "linear"
+
+    def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
+        """Make the paper's recipe with these settings, or from nothing that of `scratch`."""
+        config = recipe(preset, "crisalad")
+        model = config.model
+        backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind=self.adapter))
+        layers = model.cross_image.layers if self.encoder else 0
+        cross_image = dataclasses.replace(model.cross_image, layers=layers)
+        config = dataclasses.replace(
+            config,
+            model=dataclasses.replace(model, backbone=backbone, cross_image=cross_image),
+            # The backbone stays frozen: without adapters the head alone trains.
+            trainable="head" if self.adapter == "none" else config.trainable,
+        )
+        rate = self.learning_rate
+        if from_nothing:
+            config = from_scratch(config)
+            rate *= config.optimiser.learning_rate / OptimiserConfig.learning_rate
+        optimiser = dataclasses.replace(
+            config.optimiser, learning_rate=rate, schedule=self.schedule
+        )
+        return dataclasses.replace(config, optimiser=optimiser)
+
+
+ABLATIONS: Mapping[str, Ablation] = {
+    "crisalad": Ablation(),
+    "lr-1e-4": Ablation(learning_rate=1e-4),
+    "step": Ablation(schedule="step"),
+    "multi-resolution": Ablation("multi-resolution"),
+    "mlp": Ablation("mlp"),
+    "no-adapter": Ablation("none"),
+    "no-encoder": Ablation(encoder=False),
+    "no-encoder-step": Ablation(encoder=False, schedule="step"),
+}
+"""The paper's rows, and one without any adapter, which the paper lacks. Its last row, printed with
+the step schedule, is also here with the linear one, which changes a single part."""
+
+
+def _settings(training: TrainConfig) -> dict[str, str]:
+    """Describe what Table 2 varies."""
+    return {
+        "adapter": adapter_kind(training.model),
+        "cross-image encoder": "yes" if training.model.cross_image.layers else "no",
+        "learning rate": f"{training.optimiser.learning_rate:.2g}",
+        "scheduler": training.optimiser.schedule,
+    }
+
+
+def adapter_kind(model: ModelConfig) -> str:
+    """Return the kind of a model's adapters; "none" where its backbone has no such setting."""
+    return getattr(model.backbone, "adapter", AdapterConfig(kind="none")).kind
+
+
+_SHAPE = "NAME: flag=value, flag=value"
+_ITEM = re.compile(r"""(?:[^,"']|"[^"]*"|'[^']*'|["'])+""")
+"""Text up to a comma that is in no quotes."""
+_LARGEST = 2**40
+"""Largest whole number, as of the command line's flags."""
+_FIXED = (
+    *("seed", "preset", "mining.kind", "patience", "validate-every", "validation-size"),
+    *("monitor", "save-top-k"),
+)
+"""Flags of `train` that are the same for all rows: a comparison has its own seeds and preset,
+trains on places, and validates nothing."""
+
+
+class AblationRow(NamedTuple):
+    """A custom row: a recipe with settings changed by the flags of `train`."""
+
+    name: str
+    recipe: str
+    flags: tuple[tuple[str, str], ...]
+    """Flags of `crisalad train`, without their two hyphens, and their values."""
+
+    @property
+    def words(self) -> str:
+        """What the row changes, for a table."""
+        base = () if self.recipe == "crisalad" else (("recipe", self.recipe),)
+        return ", ".join(f"{flag}={value}" for flag, value in (*base, *self.flags))
+
+    def sets(self, flag: str) -> bool:
+        """Return whether a flag, or one that begins like that, is the row's own."""
+        return any(own.startswith(flag) for own, _ in self.flags)
+
+    def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
+        """Make the recipe with the changes.
+
+        Raises:
+            InputError: no such recipe, flag or part, or a value that does not fit.
+        """
+        try:
+            config = method_training(self.recipe, preset, from_nothing=from_nothing)
+        except InputError as error:
+            raise InputError(f"--row {self.name}: {error}") from error
+        config = self.changed(config, preset)
+        if config.mines:
+            raise InputError(
+                f"--row {self.name}: found recipe {self.recipe}, which mines tuples, expected one "
+                f"that trains on places, such as crisalad+{self.recipe}"
+            )
+        return config
+
+    def changed(self, config: TrainConfig, preset: str) -> TrainConfig:
+        """Put the row's changes into a configuration; raises as `training`."""
+        return _changed(self, config, preset)
+
+
+@functools.lru_cache(64)  # a comparison asks several times, and a parser takes half a second
+def _changed(row: AblationRow, config: TrainConfig, preset: str) -> TrainConfig:
+    arguments = []
+    for flag, value in row.flags:
+        try:
+            arguments += [f"--{flag}", *shlex.split(value)]
+        except ValueError as error:
+            raise InputError(
+                f"--row {row.name}: {flag}: found {value}, expected closed quotes"
+            ) from error
+    return parse_changes(config, arguments, preset, f"--row {row.name}")
+
+
+def parse_row(text: str) -> AblationRow:
+    """Read a row from the text "NAME: flag=value, flag=value".
+
+    The flags are those of `crisalad train` without their two hyphens; `recipe` is what the row
+    starts from, by default crisalad. Separate the numbers of one flag by spaces, as in
+    "image-size=224 224", and quote a value with a comma or a space in it.
+
+    Args:
+        text: the row.
+
+    Returns:
+        The row; flags and values are checked where its configuration is made.
+
+    Raises:
+        InputError: the text has another shape.
+
+    Example:
+        >>> parse_row("flat: recipe=salad, optimiser.learning_rate=1e-5, image_size=224 224").words
+        'recipe=salad, optimiser.learning-rate=1e-5, model.image-size=224 224'
+    """
+    name, colon, rest = (part.strip() for part in text.partition(":"))
+    items = [item for item in map(str.strip, _ITEM.findall(rest)) if item]
+    if not name or not colon or not items or set(name) & set("=,"):
+        raise InputError(f"--row: found {text!r}, expected {_SHAPE}")
+    flags: dict[str, str] = {}
+    for item in items:
+        flag, _, value = (part.strip() for part in item.partition("="))
+        flag = flag.removeprefix("--").replace("_", "-")
+        # As `train` has it, for the size is wanted often.
+        flag = "model.image-size" if flag == "image-size" else flag
+        if not flag or not value or flag in flags:
+            raise InputError(f"--row {name}: found {item!r}, expected flag=value, each flag once")
+        if flag in _FIXED:
+            raise InputError(
+                f"--row {name}: found {item!r}, expected another flag: all rows of a comparison "
+                f"have the same {flag}"
+            )
+        numbers = [word.lstrip("+-") for word in value.split()]
+        if any(word.isdecimal() and int(word) > _LARGEST for word in numbers):
+            raise InputError(f"--row {name}: {flag}: found {value}, expected at most 2**40")
+        flags[flag] = value
+    recipe = flags.pop("recipe", "crisalad")
+    return AblationRow(name, recipe, tuple(flags.items()))

@@ -4,182 +4,106 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int, UInt8
 from matplotlib.axes import Axes
 
-from crisalad_jax.config.checks import check_count
+from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.evaluation.metrics import right_retrievals
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.experiments.report.style import (
-    DPI,
-    GREY,
-    INK,
-    RIGHT,
-    WRONG,
-    Picture,
-    fit_width,
-    save,
-)
+from crisalad_jax.experiments.report.style import GREY, INK, RIGHT, WRONG, Picture, fit_width, save
 from crisalad_jax.retrieval.maps.query import Answers
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.output import counted
 
+_DPI = 120
+_WIDTH, _GAP, _MARGIN = 1.7, 0.16, 0.25
+"""Inches of a picture, between pictures, and around all."""
 _BOX = 0xC4
 """Grey of a picture that is not there."""
 _NAME = 28
 """Largest number of characters of a name: at 7 points they are as wide as a picture."""
 
 
-def prediction_gallery(path: str | os.PathLike[str], *found: Any, **options: Any) -> None:
-    """Write a PNG of queries with what was retrieved for them: see `retrieval_figure`."""
-    save(retrieval_figure(*found, **options), path)
-
-
-def retrieval_figure(
-    queries: Sequence[Path],
-    database: Sequence[Path],
-    indices: Int[np.ndarray, "q k"],
-    similarities: Float[np.ndarray, "q k"],
-    positives: Sequence[Int[np.ndarray, " _"]] | None,
+@takes(found=(Answers, GroupingResult), benchmark=(Benchmark, type(None)))
+def show_retrievals(
+    found: Answers | GroupingResult,
+    benchmark: Benchmark | None = None,
     *,
-    rows: int = 6,
+    queries: Sequence[int] | None = None,
+    rows: int = 4,
     columns: int = 4,
-    chosen: Sequence[int] | None = None,
+    root: str | os.PathLike[str] | None = None,
     title: str = "",
-    names: tuple[Sequence[str], Sequence[str]] | None = None,
-    elsewhere: str | None = None,
 ) -> Picture:
-    """Draw queries, one a row, with what was retrieved for them, best first.
+    """Draw queries, one a row, with what was found for them, best first.
 
-    Retrievals are framed green where right and red where wrong, with rank and similarity below.
-    Unless queries are `chosen`, half of the rows have a right first retrieval and half a wrong one,
-    as far as there are both. Each half is spread evenly over the data set, so that the same input
-    gives the same picture. Without `positives` all are framed grey, and queries spread evenly.
+    Results of an evaluation are framed green where right and red where wrong, with a mark for
+    readers who cannot tell these. Answers of a map are framed grey: what is right is unknown.
 
     Args:
-        queries: image files of the q queries.
-        database: image files that `indices` count.
-        indices: database indices retrieved for each query, best first.
-        similarities: those of `indices`.
-        positives: the database indices that are right for each query; None where that is unknown.
-        rows: queries shown, at most q, where none are chosen.
-        columns: retrievals shown for each, at most k.
-        chosen: the queries shown, in their order.
+        found: answers of `query`, or one of the results of `evaluate`.
+        benchmark: what was evaluated on, for a result.
+        queries: numbers of the queries shown, in their order. None takes half of them right and
+            half wrong where that is known, spread evenly, so that the same input gives the same
+            picture.
+        rows: number of queries shown, at most, where none are named.
+        columns: number of retrievals shown for each, at most.
+        root: folder of a map's images; None is where they were. One that is not there is a grey
+            box, and a note says so.
         title: stands above the picture.
-        names: of the queries and of the database, to stand below each, shortened in the middle.
-        elsewhere: what says where else the database's images may be. With it, one that cannot be
-            read is a grey box, and a note says so.
 
     Returns:
-        The figure.
+        A figure that a notebook shows; `figure.savefig(path)` writes it.
 
     Raises:
-        InputError: no queries or retrievals, numbers of rows that differ, an index beyond the
-            database, rows or columns below 1, or another image that cannot be read.
+        InputError: neither of these; a result without its benchmark, or answers with one; a query
+            that there is not; rows or columns below 1; or an image that cannot be read.
+
+    Example:
+        >>> import numpy as np, pathlib
+        >>> from crisalad_jax.retrieval.maps.map import MapImage
+        >>> from crisalad_jax.retrieval.neighbours import Neighbours
+        >>> near = Neighbours(np.array([[0, 1]]), np.array([[1.0, 0.5]]))
+        >>> images = [MapImage(f"{n}.png", 1, None, str(pictures)) for n in range(4)]
+        >>> figure = show_retrievals(Answers([pictures / "0.png"], near, images, None))
+        >>> [axes.get_xlabel() for axes in figure.axes]
+        ['query 0', '1   1.000', '2   0.500']
     """
-    _check_gallery(queries, database, indices, similarities, positives)
-    for name, value in (("rows", rows), ("columns", columns)):
-        check_count(name, value)
-    shown = indices[:, :columns]
-    right = None
-    if positives is not None:
-        verdicts = zip(shown, positives, strict=True)
-        right = np.stack([np.isin(row, wanted) for row, wanted in verdicts])
-    if chosen is None and right is not None:
-        chosen = _choose_queries(right[:, 0], rows)
-    elif chosen is None:
-        chosen = _evenly(np.arange(len(queries)), min(rows, len(queries)))
-
-    # In inches. Frames and captions are drawn into the gaps.
-    width, gap, margin = 1.7, 0.16, 0.25
-    between = 0.34 if names is None else 0.48
-    head = 0.85 if title else 0.55
-    side = round(width * DPI)
-    thumbnails = {
-        queries[i]: thumbnail(read_image(queries[i], bit_depth="contrast-stretch"), side)
-        for i in chosen
-    }
-    lost: dict[Path, InputError] = {}
-    for file in dict.fromkeys(database[index] for query in chosen for index in shown[query]):
-        try:
-            thumbnails[file] = thumbnail(read_image(file, bit_depth="contrast-stretch"), side)
-        except InputError as error:
-            if elsewhere is None:
-                raise
-            lost[file] = error
-    aspect = float(np.median([image.shape[0] / image.shape[1] for image in thumbnails.values()]))
-    height = width * min(max(aspect, 0.5), 1.5)
-    if lost:
-        box = np.full((round(height * DPI), side, 3), _BOX, np.uint8)
-        thumbnails |= dict.fromkeys(lost, box)
-        tell(
-            f"{counted(len(lost), 'picture')} shown as a grey box, as of "
-            f"{next(iter(lost.values()))}; {elsewhere} says where else"
+    check_count("rows", rows)
+    check_count("columns", columns)
+    is_result = isinstance(found, GroupingResult)
+    if is_result != (benchmark is not None):
+        raise InputError(
+            f"benchmark: found {'none' if is_result else 'one'} for "
+            f"{'a result of evaluate' if is_result else 'answers of a map'}, expected it for "
+            "results alone"
         )
-    count = 1 + shown.shape[1]
-    # One more gap sets the queries apart.
-    size = (
-        2 * margin + count * width + count * gap,
-        margin + head + len(chosen) * (height + between),
-    )
-    figure = Picture(figsize=size)
-
-    def place(row: int, column: int, image: UInt8[np.ndarray, "h w 3"]) -> Axes:
-        left = margin + column * (width + gap) + gap * (column > 0)
-        top = head + row * (height + between)
-        axes = figure.add_axes(
-            (left / size[0], 1 - (top + height) / size[1], width / size[0], height / size[1])
-        )
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[], anchor="NW")
-        return axes
-
-    for row, query in enumerate(chosen):
-        axes = place(row, 0, thumbnails[queries[query]])
-        note = "" if positives is None or np.size(positives[query]) else ", no positive exists"
-        _caption(axes, f"query {query}{note}", INK)
-        axes.spines[:].set(color=GREY, linewidth=0.5)
-        if names is not None:
-            _name(axes, names[0][query])
-        for rank, index in enumerate(shown[query]):
-            axes = place(row, rank + 1, thumbnails[database[index]])
-            if names is not None:
-                _name(axes, names[1][int(index)])
-            caption = f"{rank + 1}   {similarities[query, rank]:.3f}"
-            if right is None:
-                axes.spines[:].set(color=GREY, linewidth=0.5)
-                _caption(axes, caption, INK)
-                continue
-            good = right[query, rank]
-            colour = RIGHT if good else WRONG
-            axes.spines[:].set(color=colour, linewidth=3)
-            # The sign is for readers who cannot tell green from red.
-            sign = "\N{CHECK MARK}" if good else "\N{BALLOT X}"
-            _caption(axes, f"{caption}   {sign}", colour)
-
-    left = margin / size[0]
-    top = 1 - 0.2 / size[1]
-    if title:
-        fit_width(figure.text(left, top, title, fontsize=13, color=INK, va="top"), figure)
-        top -= 0.3 / size[1]
-    parts = [("query, then retrievals: rank, similarity", GREY)]
-    if right is not None:
-        parts += [
-            (", ", GREY),
-            ("\N{CHECK MARK} right   ", RIGHT),
-            ("\N{BALLOT X} wrong", WRONG),
-        ]
-    for text, colour in parts:
-        drawn = figure.text(left, top, text, fontsize=9, color=colour, va="top")
-        left += drawn.get_window_extent().width / figure.bbox.width
-    return figure
+    indices = found.neighbours.indices[:, :columns]
+    if benchmark is None:
+        chosen = _evenly(np.arange(len(indices)), min(rows, len(indices)))
+    else:
+        right = first_right_ranks(found.neighbours, benchmark.ground_truth()) == 1
+        chosen = _half_right(right, rows)
+    if queries is not None:
+        chosen = list(queries)
+        if not chosen or not all(0 <= query < len(indices) for query in chosen):
+            raise InputError(
+                f"queries: found {chosen}, expected numbers from 0 to {len(indices) - 1}"
+            )
+    tiles = [_row(found, benchmark, query, indices[query], root) for query in chosen]
+    legend = "query, then retrievals: rank, similarity"
+    if is_result:
+        legend += ", \N{CHECK MARK} right, \N{BALLOT X} wrong"
+    return _draw(tiles, title, legend, strict=is_result)
 
 
 def write_galleries(
@@ -208,95 +132,29 @@ def write_galleries(
         for result in results:
             label = re.sub(r"[/:]", "-", result.label).replace(" + ", "_")
             names.append(f"gallery_{label}.png")
-            prediction_gallery(
-                folder / names[-1],
-                benchmark.queries,
-                benchmark.database,
-                *result.neighbours,
-                benchmark.ground_truth(),
-                title=f"{benchmark.name}, {model_name}, {result.label}",
-            )
+            title = f"{benchmark.name}, {model_name}, {result.label}"
+            save(show_retrievals(result, benchmark, rows=6, title=title), folder / names[-1])
     return [Path(out) / name for name in names]
 
 
-def answers_gallery(path: str | os.PathLike[str], answers: Answers, **options: Any) -> None:
-    """Write a PNG of queries to a map, one a row, beside their answers: see `answers_figure`."""
-    save(answers_figure(answers, **options), path)
+def first_right_ranks(
+    neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"]]
+) -> Int[np.ndarray, " q"]:
+    """Find the rank of each query's first right retrieval, from 1; 0 where none is right."""
+    right = right_retrievals(neighbours.indices, positives)
+    return np.where(right.any(axis=1), right.argmax(axis=1) + 1, 0)
 
 
-def answers_figure(
-    answers: Answers,
-    *,
-    root: str | os.PathLike[str] | None = None,
-    rows: int = 24,
-    columns: int = 8,
-    chosen: Sequence[int] | None = None,
-    title: str = "",
-) -> Picture:
-    """Draw queries to a map, one a row, beside their answers.
-
-    Args:
-        answers: what `retrieval.maps.query.query` returned.
-        root: folder of the map's images; None is where they were. One that is not there is a grey
-            box, and a note says so.
-        rows: number of queries shown, at most.
-        columns: number of answers to each, at most.
-        chosen: the queries shown, in their order.
-        title: stands above the picture.
-
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: rows or columns below 1, or a query that cannot be read.
-    """
-    indices, similarities = (part[:, :columns] for part in answers.neighbours)
-    used, places = np.unique(indices, return_inverse=True)
-    images = [answers.images[number] for number in used]
-    asked = [
-        name if known else f"unknown: {name}"
-        for name, known in zip(answers.names, answers.known, strict=True)
-    ]
-    return retrieval_figure(
-        answers.queries,
-        [Path(image.root if root is None else root) / image.name for image in images],
-        places.reshape(indices.shape),
-        similarities,
-        None,
-        rows=rows,
-        columns=columns,
-        chosen=chosen,
-        names=(asked, [image.name for image in images]),
-        title=title,
-        elsewhere="--map-images (root=)",
-    )
+def thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Shrink a photograph to at most `side` pixels, so that a page of them fits in memory."""
+    factor = side / max(image.shape)
+    if factor >= 1:
+        return image
+    height, width = (max(1, round(factor * length)) for length in image.shape[:2])
+    return resize_image(image, (height, width))
 
 
-def _check_gallery(
-    queries: Sequence[Path],
-    database: Sequence[Path],
-    indices: Int[np.ndarray, "q k"],
-    similarities: Float[np.ndarray, "q2 k2"],
-    positives: Sequence[Int[np.ndarray, " _"]] | None,
-) -> None:
-    if not indices.size:
-        raise InputError(f"indices: found shape {indices.shape}, expected queries and retrievals")
-    if similarities.shape != indices.shape:
-        raise InputError(
-            f"similarities: found shape {similarities.shape}, expected {indices.shape} "
-            "as of the indices"
-        )
-    for name, given in (("queries", queries), ("positives", positives)):
-        if given is not None and len(given) != len(indices):
-            raise InputError(f"{name}: found {len(given)}, expected {len(indices)} as of indices")
-    if indices.min() < 0 or indices.max() >= len(database):
-        raise InputError(
-            f"indices: found {indices.min()} to {indices.max()}, expected 0 to "
-            f"{len(database) - 1}, positions in the database"
-        )
-
-
-def _choose_queries(right: Bool[np.ndarray, " q"], rows: int) -> list[int]:
+def _half_right(right: Bool[np.ndarray, " q"], rows: int) -> list[int]:
     """Choose right queries, then wrong ones: half each, more of one kind if the other is short."""
     good, bad = np.flatnonzero(right), np.flatnonzero(~right)
     good_count = min(len(good), max(rows - rows // 2, rows - len(bad)))
@@ -310,23 +168,89 @@ def _evenly(queries: Int[np.ndarray, " n"], count: int) -> list[int]:
     return queries[places].tolist()
 
 
-def thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Shrink a photograph to at most `side` pixels, so that a page of them fits in memory."""
-    factor = side / max(image.shape)
-    if factor >= 1:
-        return image
-    height, width = (max(1, round(factor * length)) for length in image.shape[:2])
-    return resize_image(image, (height, width))
+class _Tile(NamedTuple):
+    """A picture of a gallery, with what is below it."""
+
+    file: Path
+    caption: str
+    colour: str = INK
+    """Of the caption, and of the frame where it is right or wrong."""
+    name: str = ""
 
 
-def _caption(axes: Axes, text: str, colour: str) -> None:
-    axes.set_xlabel(text, fontsize=9, color=colour, loc="left", labelpad=4)
+def _row(
+    found: Answers | GroupingResult,
+    benchmark: Benchmark | None,
+    query: int,
+    indices: Int[np.ndarray, " k"],
+    root: str | os.PathLike[str] | None,
+) -> list[_Tile]:
+    """List the tiles of a query and its retrievals."""
+    captions = [
+        f"{rank}   {similarity:.3f}"
+        for rank, similarity in enumerate(found.neighbours.similarities[query][: len(indices)], 1)
+    ]
+    if isinstance(found, Answers):
+        name = found.names[query] if found.known[query] else f"unknown: {found.names[query]}"
+        images = [found.images[index] for index in indices]
+        return [_Tile(found.queries[query], f"query {query}", name=name)] + [
+            _Tile(Path(image.root if root is None else root) / image.name, caption, name=image.name)
+            for image, caption in zip(images, captions, strict=True)
+        ]
+    assert benchmark is not None
+    positives = benchmark.ground_truth()[query]
+    note = "" if len(positives) else ", no positive exists"
+    # The sign is for readers who cannot tell green from red.
+    signs = {True: ("\N{CHECK MARK}", RIGHT), False: ("\N{BALLOT X}", WRONG)}
+    tiles = [_Tile(benchmark.queries[query], f"query {query}{note}")]
+    for index, caption in zip(indices, captions, strict=True):
+        sign, colour = signs[bool(index in positives)]
+        tiles.append(_Tile(benchmark.database[index], f"{caption}   {sign}", colour))
+    return tiles
 
 
-def _name(axes: Axes, name: str) -> None:
-    # The name stands below the caption; a dollar sign in it starts no formula.
+def _draw(rows: Sequence[Sequence[_Tile]], title: str, legend: str, *, strict: bool) -> Picture:
+    """Draw tiles in rows; unless `strict`, a retrieval that cannot be read is a grey box."""
+    images = _read([tile.file for row in rows for tile in row[:1]], strict=True)
+    images |= _read([tile.file for row in rows for tile in row[1:]], strict=strict)
+    aspect = float(np.median([image.shape[0] / image.shape[1] for image in images.values()]))
+    height, columns = _WIDTH * min(max(aspect, 0.5), 1.5), len(rows[0])
+    # In inches. Frames and captions are drawn into the gaps.
+    between = 0.48 if any(tile.name for row in rows for tile in row) else 0.34
+    head = 0.85 if title else 0.55
+    size = (
+        2 * _MARGIN + columns * _WIDTH + (columns - 1) * _GAP,
+        head + len(rows) * (height + between) + _MARGIN,
+    )
+    figure = Picture(figsize=size, dpi=_DPI)
+    left, top = _MARGIN / size[0], 1 - 0.2 / size[1]
+    if title:
+        fit_width(figure.text(left, top, title, fontsize=13, color=INK, va="top"), figure)
+        top -= 0.3 / size[1]
+    figure.text(left, top, legend, fontsize=9, color=GREY, va="top")
+    panels = figure.subplots(len(rows), columns, squeeze=False)
+    figure.subplots_adjust(
+        left=left,
+        right=1 - left,
+        top=1 - head / size[1],
+        bottom=(_MARGIN + between) / size[1],
+        wspace=_GAP / _WIDTH,
+        hspace=between / height,
+    )
+    for row, of_row in zip(rows, panels, strict=True):
+        for tile, axes in zip(row, of_row, strict=True):
+            _draw_tile(axes, tile, images[tile.file])
+    return figure
+
+
+def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    axes.imshow(image)
+    axes.set(xticks=[], yticks=[], anchor="NW")
+    axes.set_xlabel(tile.caption, fontsize=9, color=tile.colour, loc="left", labelpad=4)
+    plain = tile.colour == INK
+    axes.spines[:].set(color=GREY if plain else tile.colour, linewidth=0.5 if plain else 3)
     axes.annotate(
-        shortened(name, _NAME),
+        shortened(tile.name, _NAME),
         (0, 0),
         xycoords="axes fraction",
         xytext=(0, -18),
@@ -335,8 +259,32 @@ def _name(axes: Axes, name: str) -> None:
         fontsize=7,
         family="monospace",
         color=GREY,
-        parse_math=False,
+        parse_math=False,  # a dollar sign in a name starts no formula
     )
+
+
+def _read(files: Sequence[Path], *, strict: bool) -> dict[Path, UInt8[np.ndarray, "h w 3"]]:
+    """Read pictures small; unless `strict`, those that cannot be read are grey boxes, with a note.
+
+    Raises:
+        InputError: a picture cannot be read, if `strict`.
+    """
+    side = round(_WIDTH * _DPI)
+    images, lost = {}, []
+    for file in dict.fromkeys(files):
+        try:
+            images[file] = thumbnail(read_image(file, bit_depth="contrast-stretch"), side)
+        except InputError as error:
+            if strict:
+                raise
+            lost.append(error)
+            images[file] = np.full((round(0.75 * side), side, 3), _BOX, np.uint8)
+    if lost:
+        tell(
+            f"{counted(len(lost), 'picture')} shown as a grey box, as of {lost[0]}; --map-images "
+            "(root=) says where else"
+        )
+    return images
 
 
 def shortened(text: str, most: int) -> str:

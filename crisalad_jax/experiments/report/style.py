@@ -1,19 +1,23 @@
-"""The style of all pictures: colours, axes, and how they are written.
+"""The one layout of all figures, and how they are written and embedded in pages.
 
 They are drawn with matplotlib's object interface: no display, and no state outside the call.
 """
 
+import base64
 import contextlib
 import io
 import os
 import pathlib
 import warnings
 from collections.abc import Iterator
+from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb, to_rgba_array
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text as Label
 
 from crisalad_jax.utils.files import atomic_path
@@ -30,9 +34,10 @@ PLAIN = "#c4c4c4"
 # Okabe and Ito's colours, which the colour-blind can tell apart; without yellow, too light for
 # lines.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-DPI = 120
-NARROW, NARROW_DPI = 4.0, 200
+_WIDE, _DPI = 7.0, 120
+_NARROW, _NARROW_DPI = 4.0, 200
 """Width in inches, and dots an inch: letters of 9 points are then readable on a telephone."""
+_WEBP_QUALITY = 78
 
 
 class Picture(Figure):
@@ -44,6 +49,40 @@ class Picture(Figure):
         with _any_names(self):
             self.savefig(data, format="jpg", facecolor="white", pil_kwargs={"quality": 88})
         return data.getvalue()
+
+
+def new_figure(height: float, title: str = "", *, wide: bool = False) -> Picture:
+    """Make a figure of this height in inches: for a page that telephones show too, or `wide`."""
+    # Inches around everything, so that no name touches the edge.
+    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1)
+    width, dpi = (_WIDE, _DPI) if wide else (_NARROW, _NARROW_DPI)
+    figure = Picture(figsize=(width, height), dpi=dpi, layout=layout)
+    if title:
+        fit_width(figure.suptitle(title, fontsize=12, color=INK, x=0.02, ha="left"), figure)
+    return figure
+
+
+def label_axes(
+    axes: Axes, x: str, y: str, *, grid: Literal["x", "y", "both"] = "y", title: str = ""
+) -> None:
+    """Style axes: names, left and bottom spines, and pale grid lines across or along."""
+    axes.set_xlabel(x, fontsize=10, color=INK)
+    axes.set_ylabel(y, fontsize=10, color=INK)
+    axes.set_title(title, fontsize=10, color=INK, loc="left")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
+    axes.tick_params(colors=GREY, labelcolor=INK, labelsize=9)
+    axes.grid(axis=grid, color=PALE, linewidth=0.8)
+    axes.set_axisbelow(True)
+
+
+def legend_above(figure: Figure) -> None:
+    """Name what is drawn above the axes, in two columns if the names are short enough."""
+    names = [name for axes in figure.axes for name in axes.get_legend_handles_labels()[1]]
+    room = figure.get_figwidth() / 2 - 0.6  # inches; a letter of 9 points is 0.08 wide
+    columns = 2 if max(map(len, names)) * 0.08 <= room else 1
+    where = {"loc": "outside upper left", "ncols": columns}
+    figure.legend(frameon=False, fontsize=9, labelcolor=INK, **where)
 
 
 def fit_width(label: Label, figure: Figure) -> None:
@@ -58,8 +97,8 @@ def fit_width(label: Label, figure: Figure) -> None:
 def _any_names(figure: Figure) -> Iterator[None]:
     """Let texts hold the name of any file while they are drawn.
 
-    Control characters and bytes that are no UTF-8 are drawn as escapes. Letters that the font lacks
-    are drawn as boxes, without the warning that would print them.
+    Control characters and bytes that are not UTF-8 are drawn as escapes. Letters that the font
+    lacks are drawn as boxes, without the warning that would print them.
     """
     for label in figure.findobj(Label):
         text = label.get_text()
@@ -70,76 +109,34 @@ def _any_names(figure: Figure) -> Iterator[None]:
         yield
 
 
-def plain_axes(axes: Axes) -> None:
-    """Style axes: left and bottom spines, numbers, and pale horizontal grid lines."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(GREY)
-    axes.tick_params(colors=GREY, labelcolor=INK, labelsize=9)
-    axes.grid(axis="y", color=PALE, linewidth=0.8)
-    axes.set_axisbelow(True)
-
-
-def save(
-    figure: Figure, path: str | os.PathLike[str], dpi: int = DPI, *, dark: bool = False
-) -> None:
-    """Write a figure as a PNG, whole or not at all, with `dpi` dots an inch.
-
-    Args:
-        figure: what is drawn.
-        path: the picture to write.
-        dpi: its dots an inch.
-        dark: whether to write it a second time, for pages on a dark ground; see `dark_path`.
-    """
-    _write(figure, path, dpi, "white")
-    if dark:
-        _darken(figure)
-        _write(figure, dark_path(path), dpi, _DARK["#ffffff"])
-
-
-def dark_path(path: str | os.PathLike[str]) -> pathlib.Path:
-    """Return the file of a picture's dark variant, beside it."""
-    path = pathlib.Path(path)
-    return path.with_name(f"{path.stem}_dark{path.suffix}")
-
-
-def _write(figure: Figure, path: str | os.PathLike[str], dpi: int, ground: str) -> None:
+def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure as a PNG, whole or not at all."""
     with atomic_path(path) as temporary, _any_names(figure):
-        figure.savefig(temporary, format="png", dpi=dpi, facecolor=ground)
+        figure.savefig(temporary, format="png", facecolor="white")
 
 
-_DARK = {
-    "#ffffff": "#15181c",
-    INK: "#e8eaed",
-    GREY: "#a3acb8",
-    PALE: "#363c44",
-    RIGHT: "#6fcf80",
-    WRONG: "#ff8a80",
-    UNMATCHED: "#d7a6e3",
-    PLAIN: "#6b7480",
-    "#0072b2": "#4aa8e8",
-    "#d55e00": "#ff9147",
-    "#009e73": "#2fcf9f",
-    "#cc79a7": "#e59cc3",
-    "#e69f00": "#f2b632",
-    "#56b4e9": "#a5dcff",
-}
-"""Colours on the ground of page.css in dark mode, by those on white."""
+class Drawing(NamedTuple):
+    """A picture in a page."""
+
+    uri: str
+    width: int
+    height: int
+    alt: str
 
 
-def _darken(figure: Figure) -> None:
-    """Replace the colours of a figure that was drawn, by `_DARK`; pictures in it stay."""
-    known = {tuple(np.round(to_rgb(light), 3)): to_rgb(dark) for light, dark in _DARK.items()}
-    for artist in figure.findobj():
-        if getattr(artist, "get_array", lambda: None)() is not None:
-            continue
-        for name in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
-            getter = getattr(artist, f"get_{name}", None)
-            setter = getattr(artist, f"set_{name}", None)
-            if getter is None or setter is None:
-                continue
-            colours = to_rgba_array(getter())
-            changed = colours.copy()
-            for row in changed:
-                row[:3] = known.get(tuple(np.round(row[:3], 3)), row[:3])
-            if not np.array_equal(changed, colours):
-                setter(changed if len(changed) > 1 else tuple(changed[0]))
+def drawing(path: pathlib.Path, alt: str) -> Drawing:
+    """Embed a PNG; its sides are in its first chunk (W3C PNG specification, 11.2.2)."""
+    data = path.read_bytes()
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    return Drawing(_uri("png", data), width, height, alt)
+
+
+def photograph(image: UInt8[np.ndarray, "h w 3"], alt: str) -> Drawing:
+    """Embed RGB pixels as a WebP of a few kilobytes."""
+    _, data = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
+    height, width = image.shape[:2]
+    return Drawing(_uri("webp", data.tobytes()), width, height, alt)
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

@@ -1,12 +1,61 @@
-"""Recalls as tables, for the terminal and as Markdown."""
+"""Tables for the terminal, for Markdown and for a page, and files of text."""
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from rich.table import Table
+import rich.table
 from rich.text import Text
 
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path
+
+NOTHING = "-"
+"""Cell of what is unknown or does not apply."""
+
+
+class Cell(NamedTuple):
+    """A cell of a table."""
+
+    text: str
+    note: str = ""
+    """What is less important, as an interval: its lines are below the text in a page, elsewhere
+    after it."""
+    kind: str = ""
+    """How a page shows it: best, right or wrong."""
+
+
+class Table(NamedTuple):
+    """A table for any medium."""
+
+    headers: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    labels: int = 1
+    """Number of the first columns, which are words; the others are numbers, at the right."""
+    title: str = ""
+
+    def terminal(self) -> rich.table.Table:
+        """Make the table for the terminal; with three labels a line parts groups of the first."""
+        table = rich.table.Table(title=self.title or None, title_justify="left")
+        for number, header in enumerate(self.headers):
+            justify = "left" if number < self.labels else "right"
+            table.add_column(header, justify=justify, overflow="fold")
+        for cells, following in zip(self.rows, [*self.rows[1:], None], strict=True):
+            last = self.labels > 2 and following is not None and following[0] != cells[0]
+            # `Text` keeps square brackets in a name from being markup.
+            table.add_row(*(Text(_in_line(cell)) for cell in cells), end_section=last)
+        return table
+
+    def markdown(self) -> str:
+        """Write the table as Markdown, one line a row, ending in a newline."""
+        rule = ["---"] * self.labels + ["---:"] * (len(self.headers) - self.labels)
+        body = [[_in_line(cell).replace("|", r"\|") for cell in cells] for cells in self.rows]
+        headers = [header.replace("|", r"\|") for header in self.headers]
+        return "".join(f"| {' | '.join(cells)} |\n" for cells in [headers, rule, *body])
+
+
+def _in_line(cell: Cell) -> str:
+    return " ".join((cell.text, *cell.note.split("\n"))).rstrip()
 
 
 class RecallRow(NamedTuple):
@@ -21,44 +70,12 @@ class RecallRow(NamedTuple):
     """K -> fraction of the queries, 0 to 1."""
 
 
-def recall_table(rows: Sequence[RecallRow], title: str | None = None) -> Table:
-    """Make a table for the terminal: a line per row, recalls in percent with one decimal.
-
-    A line is ruled between data sets.
+def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
+    """Make a table of recalls in percent with one decimal, a line for each row.
 
     Raises:
         InputError: no rows, or a recall outside 0 to 1.
     """
-    header, body = _recall_cells(rows)
-    table = Table(title=title, title_justify="left")
-    for name in header:
-        justify = "right" if name.startswith("R@") else "left"
-        table.add_column(name, justify=justify, overflow="fold")
-    for cells, following in zip(body, [*body[1:], None], strict=True):
-        last = following is not None and following[0] != cells[0]
-        # `Text` keeps square brackets in a name from being markup.
-        table.add_row(*(Text(cell) for cell in cells), end_section=last)
-    return table
-
-
-def no_formula(text: str) -> str:
-    """Put a quote before a text that a spreadsheet would take for a formula."""
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
-
-
-def recall_markdown(rows: Sequence[RecallRow]) -> str:
-    """Write the same table as Markdown, one line per row, ending in a newline.
-
-    Raises:
-        InputError: what `recall_table` raises.
-    """
-    header, body = _recall_cells(rows)
-    rule = ["---:" if name.startswith("R@") else "---" for name in header]
-    escaped = [[cell.replace("|", r"\|") for cell in cells] for cells in body]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in [header, rule, *escaped])
-
-
-def _recall_cells(rows: Sequence[RecallRow]) -> tuple[list[str], list[list[str]]]:
     if not rows:
         raise InputError("rows: found none, expected at least one row of recalls")
     for row in rows:
@@ -66,14 +83,15 @@ def _recall_cells(rows: Sequence[RecallRow]) -> tuple[list[str], list[list[str]]
     ks = sorted({k for row in rows for k in row.recalls})
     body = [
         [row.benchmark, row.model, row.grouping]
-        + [f"{100 * row.recalls[k]:.1f}" if k in row.recalls else "-" for k in ks]
+        + [f"{100 * row.recalls[k]:.1f}" if k in row.recalls else NOTHING for k in ks]
         for row in rows
     ]
-    return ["data set", "model", "grouping", *(f"R@{k}" for k in ks)], body
+    headers = ["data set", "model", "grouping", *(f"R@{k}" for k in ks)]
+    return Table(headers, [list(map(Cell, cells)) for cells in body], labels=3, title=title)
 
 
 def check_fractions(name: str, recalls: Mapping[int, float]) -> None:
-    """Check that there are recalls, and that all lie within 0 to 1.
+    """Check that there are recalls, and that all are within 0 to 1.
 
     Raises:
         InputError: there are none, or one is outside 0 to 1.
@@ -83,3 +101,14 @@ def check_fractions(name: str, recalls: Mapping[int, float]) -> None:
     for at, value in recalls.items():
         if not 0 <= value <= 1:
             raise InputError(f"{name}: found recall {value} at {at}, expected a fraction, 0 to 1")
+
+
+def no_formula(text: str) -> str:
+    """Put a quote before a text that a spreadsheet would take for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a file of UTF-8, whole or not at all; other bytes, as of names, become escapes."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")

@@ -1,4 +1,4 @@
-"""SALAD's transport plan drawn over a photograph: its clusters, and its dustbin."""
+"""The transport plan of a model drawn over a photograph: its clusters, and its dustbin."""
 
 import os
 from collections.abc import Sequence
@@ -8,14 +8,107 @@ import cv2
 import matplotlib
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from matplotlib import colors
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.patches import Patch
 
-from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.config.checks import takes
+from crisalad_jax.data.depth import as_rgb
+from crisalad_jax.data.images import read_pixels
+from crisalad_jax.data.resize import Pixels
+from crisalad_jax.experiments.report.gallery import thumbnail
+from crisalad_jax.experiments.report.style import GREY, INK, Picture
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, check_params, transport_masses
+from crisalad_jax.retrieval.describe import prepare_image
 
 CLUSTER_COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 """Okabe and Ito's colours, which the colour-blind can tell apart, on a grey photograph."""
-HEAT = "inferno"
+_HEAT = "inferno"
 _OPACITY = 0.65
+_PANEL = 3.4
+"""Width of a panel in inches."""
+_PIXELS = 480
+
+
+@takes(params=Crisalad, config=ModelConfig)
+def show_transport(
+    image: str | os.PathLike[str] | Pixels, params: Crisalad, config: ModelConfig
+) -> Picture:
+    """Draw a picture, each patch's share in the dustbin, and the cluster that took most of it.
+
+    The strongest seven clusters have colours; patches that others took stay grey. A colour's
+    strength is the mass that clusters took of the patch. A transport without a dustbin has no
+    middle panel.
+
+    Args:
+        image: a file, or 8-bit RGB or grey, as `prepare_image` takes it.
+        params: the model's parameters.
+        config: the model.
+
+    Returns:
+        A figure that a notebook shows; `figure.savefig(path)` writes it.
+
+    Raises:
+        InputError: the model's aggregator has no transport, parameters of another configuration,
+            an image that cannot be read, or one that the model cannot describe.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, init_crisalad
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> figure = show_transport(pictures / "0.png", params, config)
+        >>> [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:3]]
+        ['80 x 60 pixels', 'dustbin: 67 % of the mass', 'top clusters']
+    """
+    check_params(params, config)
+    pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
+    picture = transport_of(as_rgb(pixels, config.preprocessing.bit_depth), params, config)
+    clusters = strongest_clusters([picture])
+    height, width = picture.image.shape[:2]
+    rows, columns = picture.masses.shape[:2]
+    panels = 2 if picture.dustbin is None else 3
+    size = (panels * _PANEL, _PANEL * min(height / width, 2) + 0.9)
+    figure = Picture(figsize=size, layout="constrained")
+    first, *middle, last = figure.subplots(1, panels)
+    _panel(first, thumbnail(picture.image, _PIXELS), f"{width} x {height} pixels")
+    for axes in middle:
+        limits = heat_range([picture])
+        title = f"dustbin: {100 * (picture.dustbin_share or 0):.0f} % of the mass"
+        _panel(axes, draw_dustbin(picture, limits, _PIXELS), title)
+        scale = ScalarMappable(colors.Normalize(*limits), _HEAT)
+        below = axes.inset_axes((0.1, -0.1, 0.8, 0.04))
+        bar = figure.colorbar(scale, cax=below, orientation="horizontal")
+        bar.set_label("share of the patch in the dustbin", fontsize=8, color=INK)
+        bar.ax.tick_params(labelsize=8, colors=GREY, labelcolor=INK)
+        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    title = f"top clusters, {rows} x {columns} patches"
+    _panel(last, draw_clusters(picture, list(clusters), _PIXELS), title)
+    last.legend(
+        handles=[
+            Patch(color=colour, label=f"{number}: {100 * part:.0f} %")
+            for colour, (number, part) in zip(CLUSTER_COLOURS, clusters.items(), strict=False)
+        ],
+        title="cluster: share of what clusters took",
+        title_fontsize=8,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.02),
+        ncols=4,
+        fontsize=8,
+        frameon=False,
+        handlelength=1,
+        columnspacing=1,
+    )
+    return figure
+
+
+def _panel(axes: Axes, pixels: Pixels, title: str) -> None:
+    axes.imshow(pixels)
+    axes.set_axis_off()
+    axes.set_anchor("N")
+    axes.set_title(title, loc="left", fontsize=9, color=INK)
 
 
 class Transported(NamedTuple):
@@ -27,6 +120,11 @@ class Transported(NamedTuple):
     clusters: int
 
     @property
+    def taken(self) -> Float[np.ndarray, "row column cluster"]:
+        """Mass from each patch to each cluster."""
+        return self.masses[..., : self.clusters]
+
+    @property
     def dustbin(self) -> Float[np.ndarray, "row column"] | None:
         """Share of each patch's mass in the dustbin; None without a dustbin."""
         if self.masses.shape[-1] == self.clusters:
@@ -36,14 +134,22 @@ class Transported(NamedTuple):
     @property
     def dustbin_share(self) -> float | None:
         """Share of all mass in the dustbin; None without a dustbin."""
-        if self.masses.shape[-1] == self.clusters:
+        if self.dustbin is None:
             return None
         return float(self.masses[..., self.clusters].sum() / self.masses.sum())
 
     @property
     def top(self) -> Int[np.ndarray, "row column"]:
         """Cluster that took most of each patch."""
-        return self.masses[..., : self.clusters].argmax(axis=-1)
+        return self.taken.argmax(axis=-1)
+
+
+def transport_of(image: Pixels, params: Crisalad, config: ModelConfig) -> Transported:
+    """Compute the transport of a photograph, resized as the configuration says."""
+    prepared = prepare_image(image, config)
+    grid = config.backbone.grid((prepared.shape[0], prepared.shape[1]))
+    (mass,) = np.asarray(transport_masses(params, prepared[None], config), np.float32)
+    return Transported(image, mass.reshape(*grid, -1), config.token_shape.tokens)
 
 
 def strongest_clusters(
@@ -56,26 +162,24 @@ def strongest_clusters(
     every cluster takes the same mass, so that total would not rank them.)
     """
     mass = np.zeros(pictures[0].clusters)
-    total = 0.0
     for picture in pictures:
-        taken = picture.masses[..., : picture.clusters]
-        np.add.at(mass, picture.top, taken.max(axis=-1))
-        total += taken.sum()
+        np.add.at(mass, picture.top, picture.taken.max(axis=-1))
+    total = sum(picture.taken.sum() for picture in pictures)
     order = np.argsort(-mass, kind="stable")[:most]
     return {int(cluster): float(mass[cluster] / total) for cluster in order if mass[cluster] > 0}
 
 
 def heat_range(pictures: Sequence[Transported]) -> tuple[float, float]:
-    """Find the smallest and largest share of a patch in the dustbin, as one scale for all.
-
-    Raises:
-        InputError: there is no dustbin.
-    """
-    shares = [picture.dustbin for picture in pictures]
-    if not shares or any(share is None for share in shares):
-        raise InputError("transport: found no dustbin, expected one to draw")
-    values = np.concatenate([share.ravel() for share in shares if share is not None])
+    """Find the smallest and largest share of a patch in the dustbin, as one scale for all."""
+    shares = [picture.dustbin for picture in pictures if picture.dustbin is not None]
+    values = np.concatenate(shares, axis=None)
     return float(values.min()), float(values.max())
+
+
+def heat_gradient() -> str:
+    """Return the colours of the dustbin's scale as CSS."""
+    stops = matplotlib.colormaps[_HEAT](np.linspace(0, 1, 9))
+    return ", ".join(map(colors.to_hex, stops))
 
 
 def draw_dustbin(
@@ -84,17 +188,11 @@ def draw_dustbin(
     """Draw each patch's share in the dustbin over the grey photograph.
 
     Patches are dark at the lower end of the scale and bright at the upper; `limits` are its ends.
-
-    Raises:
-        InputError: there is no dustbin.
     """
-    shares = picture.dustbin
-    if shares is None:
-        raise InputError("transport: found no dustbin, expected one to draw")
+    assert picture.dustbin is not None
     low, high = limits
-    scaled = (shares - low) / max(high - low, 1e-6)
-    heat = 255 * matplotlib.colormaps[HEAT](scaled)[..., :3]
-    return _over(picture.image, heat, np.full(shares.shape, _OPACITY), width)
+    heat = 255 * matplotlib.colormaps[_HEAT]((picture.dustbin - low) / max(high - low, 1e-6))
+    return _over(picture.image, heat[..., :3], np.full(heat.shape[:2], _OPACITY), width)
 
 
 def draw_clusters(
@@ -105,18 +203,17 @@ def draw_clusters(
     The colour's strength is the mass that clusters took of the patch, over the largest in the
     picture. Patches whose top cluster is not `chosen` stay grey.
     """
-    taken = picture.masses[..., : picture.clusters].sum(axis=-1)
+    taken = picture.taken.sum(axis=-1)
     strength = np.where(np.isin(picture.top, chosen), taken / taken.max(), 0)
-    colours = np.zeros((*taken.shape, 3))
+    over = np.zeros((*taken.shape, 3))
     for cluster, colour in zip(chosen, CLUSTER_COLOURS, strict=False):
-        rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-        colours[picture.top == cluster] = rgb
-    return _over(picture.image, colours, (0.25 + _OPACITY * strength) * (strength > 0), width)
+        over[picture.top == cluster] = 255 * np.array(colors.to_rgb(colour))
+    return _over(picture.image, over, (0.25 + _OPACITY * strength) * (strength > 0), width)
 
 
 def _over(
     image: UInt8[np.ndarray, "h w 3"],
-    colours: Float[np.ndarray, "row column 3"],
+    over: Float[np.ndarray, "row column 3"],
     opacity: Float[np.ndarray, "row column"],
     width: int,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
@@ -128,14 +225,5 @@ def _over(
     row = np.arange(height) * rows // height
     column = np.arange(width) * columns // width
     alpha = opacity[row][:, column, None]
-    mixed = (1 - alpha) * grey[..., None] + alpha * colours[row][:, column]
+    mixed = (1 - alpha) * grey[..., None] + alpha * over[row][:, column]
     return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
-
-
-def write_picture(path: str | os.PathLike[str], picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write RGB pixels as a PNG, whole or not at all."""
-    with atomic_path(path) as temporary:
-        done, data = cv2.imencode(".png", picture[..., ::-1])
-        if not done:
-            raise InputError(f"{path}: cannot be written as a PNG")
-        temporary.write_bytes(data.tobytes())

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from crisalad_jax.experiments.comparison import ComparisonConfig, ablation, methods, plan
+from crisalad_jax.experiments.comparison import ComparisonConfig, methods, plan
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import from_scratch
@@ -31,8 +31,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         )
 
     monkeypatch.setattr(plan, "_VIEWS", RECIPE.images_per_place)
-    for module in (methods, ablation):
-        monkeypatch.setattr(module, "from_scratch", as_recipe)
+    monkeypatch.setattr(methods, "from_scratch", as_recipe)
 
 
 @pytest.fixture

@@ -1,19 +1,37 @@
-"""Methods and rows that are no line of a table: any recipe, and any registered part."""
+"""What a comparison compares: methods, any recipe, any registered part, and custom rows."""
 
 import dataclasses
 import json
 
 import pytest
 
+from crisalad_jax.cli import ablate, main
 from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.data.augmentations import AUGMENTATIONS
-from crisalad_jax.experiments.comparison import METHODS, ComparisonConfig, compare, ledger, prepare
-from crisalad_jax.experiments.comparison.ablation import row_training
-from crisalad_jax.experiments.comparison.methods import method_of, method_training, training_with
+from crisalad_jax.experiments.comparison import (
+    METHODS,
+    ComparisonConfig,
+    compare,
+    parse_row,
+    plan,
+    prepare,
+)
+from crisalad_jax.experiments.comparison import methods as module
+from crisalad_jax.experiments.comparison.methods import (
+    find_line,
+    method_of,
+    method_training,
+    training_with,
+)
 from crisalad_jax.experiments.comparison.plan import file_name
 from crisalad_jax.training.recipes import from_scratch, recipe
 from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import fails
+from tests.conftest import BATCH
+
+
+def row_training(name):
+    return find_line(name, "tiny", from_nothing=True).training
 
 
 def test_what_names_stand_for():
@@ -42,14 +60,14 @@ def test_a_method_is_trained_as_its_recipe_says():
 
 
 def test_a_row_swaps_one_part():
-    base = row_training("crisalad", "tiny", from_nothing=True)
-    newton = row_training("newton", "tiny", from_nothing=True)
+    base = row_training("crisalad")
+    newton = row_training("newton")
     assert newton.model.aggregator.sinkhorn.step.part_name == "newton"
     sinkhorn = base.model.aggregator.sinkhorn
     aggregator = dataclasses.replace(newton.model.aggregator, sinkhorn=sinkhorn)
     model = dataclasses.replace(newton.model, aggregator=aggregator)
     assert dataclasses.replace(newton, model=model) == base
-    stop = row_training("gradient:stop", "tiny", from_nothing=True)
+    stop = row_training("gradient:stop")
     assert stop.model.aggregator.sinkhorn.gradient.part_name == "stop"
 
 
@@ -59,7 +77,7 @@ def test_an_augmentation_that_is_compared_stays(name):
     part = AUGMENTATIONS.make(name)
     found = training_with(part, "tiny", from_nothing=True)
     assert found.augmentation == part
-    base = row_training("crisalad", "tiny", from_nothing=True)
+    base = row_training("crisalad")
     assert dataclasses.replace(found, augmentation=base.augmentation) == base
 
 
@@ -69,13 +87,13 @@ def test_variants_of_parts(settings):
     assert [variant.labels[0] for variant in prepared.variants] == [
         *("CriSALAD", "crisalad+step:newton", "AnyLoc")
     ]
-    assert [variant.learns for variant in prepared.variants] == [True, True, False]
+    assert [variant.trains for variant in prepared.variants] == [True, True, False]
     ablation = prepare(ComparisonConfig(**settings | {"kind": "ablate", "names": names[:2]}))
-    assert ablation.variants[1].labels == ("step:newton", "depthwise", "yes", "0.001", "linear")
+    assert ablation.variants[1].labels == ("step:newton", "crisalad+step:newton")
 
 
 def test_two_names_of_one_folder(settings):
-    with pytest.raises(InputError, match=r"--methods: found .* expected at least one, each once"):
+    with pytest.raises(InputError, match=r"--methods: found .* expected each once, under"):
         ComparisonConfig(**settings | {"names": ("step:newton", "step:newton")})
 
 
@@ -84,7 +102,6 @@ def test_unknown_names_are_refused(flags, capfd, tmp_path):
     for command, name, words in (
         (("compare", "--methods"), "step:newtons", "--methods: found 'step:newtons', expected one"),
         (("compare", "--methods"), "kind:newton", "kind of aggregator, step, dustbin, loss"),
-        (("ablate", "--rows"), "crisalad-1e-4", "--rows: found 'crisalad-1e-4', expected one of"),
     ):
         fails(capfd, *command, name, *rest, "--out", tmp_path / "out", words=(words,))
     assert not list(tmp_path.iterdir())
@@ -108,15 +125,179 @@ def test_a_plug_ins_part_from_training_to_the_table(settings, tmp_path, monkeypa
         monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
     exec(compile(PLUGIN, "plugin.py", "exec"), {"__name__": "plugin"})
     name, out, lines = "aggregator:average", tmp_path / "out", []
-    monkeypatch.setattr(ledger, "source_digest", lambda part: "first")
+    monkeypatch.setattr(plan, "source_digest", lambda part: "first")
     config = ComparisonConfig(**settings | {"names": (name,), "seeds": 1, "epochs": 1})
     summary = compare(config, out, say=lines.append, quiet=True)
-    assert lines[0] == "1 to compare, tiny, what is trained starts from nothing"
+    assert lines[0] == "1 runs to compare; what is trained starts from nothing"
     (row,) = summary.rows
     assert (row.name, row.labels, row.dimension) == (name, (f"crisalad+{name}",), 32)
     assert (out / "crisalad+aggregator-average" / "seed-0" / "run" / "last.safetensors").is_file()
     assert json.loads((out / "results.json").read_text())["rows"][0]["name"] == name
     assert (out / "index.html").is_file()
-    monkeypatch.setattr(ledger, "source_digest", lambda part: "second")
-    with pytest.raises(InputError, match="aggregator average: found changed since this compar"):
+    monkeypatch.setattr(plan, "source_digest", lambda part: "second")
+    with pytest.raises(InputError, match=r"plug-ins\.aggregator average: was first, is second"):
         compare(config, out, quiet=True)
+
+
+@pytest.fixture
+def ablation(settings):
+    return settings | {"kind": "ablate", "batch_size": BATCH}
+
+
+def test_a_row_is_a_recipe_with_flags():
+    """In any spelling of a flag; quotes keep commas and spaces."""
+    row = parse_row(
+        """far: recipe=salad, --optimiser.clip_norm=2.5, image_size=56 56, cities="A, e" 'B'"""
+    )
+    assert (row.name, row.recipe) == ("far", "salad")
+    assert row.flags == (
+        ("optimiser.clip-norm", "2.5"),
+        ("model.image-size", "56 56"),
+        ("cities", """"A, e" 'B'"""),
+    )
+    assert row.words.startswith("recipe=salad, optimiser.clip-norm=2.5, model.image-size=56 56")
+    assert row.training("tiny", from_nothing=True).cities == ("A, e", "B")
+
+
+def test_flags_change_what_they_name_and_nothing_else():
+    row = parse_row(
+        "all: loss.kind=triplet, loss.kind.margin=0.3, optimiser.clip-norm=None, "
+        "augmentation=none, trainable=head, model.cross-image.layers=0"
+    )
+    found, base = row.training("tiny", from_nothing=True), recipe("tiny")
+    assert (found.loss.kind.part_name, found.loss.kind.margin) == ("triplet", 0.3)
+    assert found.model == dataclasses.replace(
+        base.model, cross_image=dataclasses.replace(base.model.cross_image, layers=0)
+    )
+    assert found.optimiser == dataclasses.replace(base.optimiser, clip_norm=None)
+    assert (found.augmentation.part_name, found.trainable) == ("none", "head")
+    assert dataclasses.replace(found.loss, kind=base.loss.kind) == base.loss
+
+
+REFUSED = [
+    ("epochs=2", "--row: found 'epochs=2', expected NAME: flag=value, flag=value"),
+    ("a b", "--row: found 'a b', expected NAME"),
+    ("x: ,", "--row: found 'x: ,', expected NAME: flag=value"),
+    ("x: epochs", "--row x: found 'epochs', expected flag=value"),
+    ("x: recipe=", "--row x: found 'recipe=', expected flag=value"),
+    ("x: epochs=2, epochs=3", "--row x: found 'epochs=3', expected flag=value, each flag once"),
+    ("x: epochs=two", "--row x: .*--epochs.*'two'"),
+    ("x: epoch=2", r"--row x: --epoch: found no such flag; did you mean .*--epochs INT"),
+    ("x: help=1", "--row x: --help: found no such flag"),
+    ("x: epochs=0", "--row x: TrainConfig.epochs: found 0, expected more than 0"),
+    ("x: epochs=99999999999999", r"--row x: epochs: found 99999999999999, expected at most 2"),
+    ("x: loss.kind=tripel", "--row x: loss: found 'tripel', expected one of circle"),
+    ("x: seed=1", "--row x: found 'seed=1', expected another flag: all rows .* the same seed"),
+    ("x: cities='a", "--row x: cities: found 'a, expected closed quotes"),
+    ("x: recipe=netvlad", r"--row x: found recipe netvlad.*such as crisalad\+netvlad"),
+    ("x: recipe=salat", "--row x: recipe: found 'salat', expected one of"),
+    ("step: epochs=2", "--row: found step and step, expected each once"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), REFUSED, ids=[text for text, _ in REFUSED])
+def test_refused_in_one_line(ablation, text, words):
+    with pytest.raises(InputError, match=words) as caught:
+        ComparisonConfig(**ablation | {"rows": (text,)})
+    assert "\n" not in str(caught.value)
+
+
+def test_names_of_one_folder_are_refused(ablation):
+    rows = ("a/b: epochs=1", "a-b: epochs=2")
+    words = "--rows: found a/b and a-b, expected each once, under names that differ in letters"
+    with pytest.raises(InputError, match=words):
+        ComparisonConfig(**ablation | {"rows": rows})
+
+
+def test_a_row_is_parsed_once(ablation, monkeypatch):
+    """Its parser takes half a second, and a comparison asks for its configuration several times."""
+    module._changed.cache_clear()
+    asked, parse = [], module.parse_changes
+    monkeypatch.setattr(module, "parse_changes", lambda *a: asked.append(a) or parse(*a))
+    config = ComparisonConfig(**ablation | {"rows": ("once: epochs=2",)})
+    dataclasses.replace(config, seeds=2)
+    assert len(asked) == 1
+
+
+def test_what_a_row_sets_stays_as_it_is(ablation):
+    """Else a comparison fits epochs, batches and warm-up to the training set."""
+    rows = (
+        "base: recipe=crisalad",
+        "longer: epochs=40",
+        "fewer: places-per-batch=2, min-images=2, images-per-place=2",
+        "warm: optimiser.warmup-steps=2",
+    )
+    config = ComparisonConfig(**ablation | {"names": (), "rows": rows})
+    assert config.names == ("base", "longer", "fewer", "warm")
+    found = {variant.name: variant.training for variant in prepare(config).variants}
+    base = found["base"]
+    # Eight places of three images: a batch an epoch, of 3 epochs, too few to warm up for one.
+    assert (base.epochs, base.places_per_batch, base.images_per_place) == (3, 8, 3)
+    assert base.optimiser.warmup_steps == 0
+    optimiser = dataclasses.replace(base.optimiser, warmup_steps=10)  # a quarter of 40 steps
+    assert found["longer"] == dataclasses.replace(base, epochs=40, optimiser=optimiser)
+    fewer = found["fewer"]
+    assert (fewer.places_per_batch, fewer.images_per_place, fewer.epochs) == (2, 2, 3)
+    assert fewer.optimiser.warmup_steps == 3  # a quarter of 3 epochs of four batches
+    assert found["warm"].optimiser.warmup_steps == 2
+
+
+def test_the_cities_of_a_row_are_its_training_set(ablation):
+    config = ComparisonConfig(**ablation | {"names": (), "rows": ("half: cities=Brill",)})
+    (variant,) = prepare(config).variants
+    assert (variant.places.cities, len(variant.places.place_id)) == (("Brill",), 4)
+
+
+def test_a_table_says_what_a_row_changes(ablation):
+    rows = ("hot: optimiser.learning-rate=0.01",)
+    names = ("crisalad", "no-encoder-step")
+    config = ComparisonConfig(**ablation | {"names": names, "rows": rows})
+    assert [variant.labels for variant in prepare(config).variants] == [
+        (
+            "crisalad",
+            "adapter depthwise, cross-image encoder yes, learning rate 0.001, scheduler linear",
+        ),
+        ("no-encoder-step", "cross-image encoder no, scheduler step"),
+        ("hot", "optimiser.learning-rate=0.01"),
+    ]
+
+
+def test_a_plug_ins_loss_and_its_settings(ablation, monkeypatch):
+    registry = REGISTRIES["loss"]
+    for name in ("_parts", "_presets"):
+        monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
+    source = """
+import dataclasses, crisalad_jax as cj
+@cj.register_loss("mine")
+@dataclasses.dataclass(frozen=True)
+class Mine(cj.Loss):
+    scale: float = 1.0
+    def apply(self, params, batch):
+        return cj.LossValue(self.scale * batch.distances.sum())
+"""
+    exec(compile(source, "mine.py", "exec"), {"__name__": "mine"})
+    row = parse_row("mine: loss.kind=mine, loss.kind.scale=2")
+    assert row.training("tiny", from_nothing=True).loss.kind.scale == 2
+
+
+def test_the_command_line_takes_several(flags, monkeypatch, tmp_path):
+    """With --row the paper's rows are left out but for the first, unless --rows names them."""
+    seen = []
+    monkeypatch.setattr(ablate, "run_comparison", lambda config, arguments: seen.append(config))
+    given = ["ablate", *map(str, flags[flags.index("--epochs") :]), "--preset", "tiny"]
+    given += ["--out", str(tmp_path / "out")]
+    rows = ["--row", "a: epochs=2", "--row", "b: loss.miner=none", "--reference", "a"]
+    assert main([*given, *rows]) == 0
+    assert main([*given, *rows, "--rows", "crisalad,step"]) == 0
+    assert [config.names for config in seen] == [
+        ("crisalad", "a", "b"),
+        ("crisalad", "step", "a", "b"),
+    ]
+    assert seen[0].rows == ("a: epochs=2", "b: loss.miner=none")
+    assert seen[0].reference == "a"
+
+
+def test_an_unknown_reference(flags, capfd, tmp_path):
+    words = ("--reference: found salad, expected one of those compared, crisalad",)
+    fails(capfd, *flags, "--reference", "salad", "--out", tmp_path / "out", words=words)
+    assert not list(tmp_path.iterdir())

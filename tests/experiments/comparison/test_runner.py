@@ -25,6 +25,7 @@ from crisalad_jax.experiments.comparison import (
     plan,
     runner,
 )
+from crisalad_jax.experiments.comparison.results import runs_of
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -39,9 +40,11 @@ pytestmark = pytest.mark.usefixtures("quick")
 
 
 def run(config: ComparisonConfig, out) -> comparison.Summary:
-    prepared = comparison.prepare(config)
-    comparison.carry_out(prepared, out, say=lambda line: None, quiet=True)
-    return comparison.summarise(prepared, out)
+    return comparison.compare(config, out, quiet=True)
+
+
+def training_of(folder):
+    return read_json(folder / "result.json", "a result")["training"]
 
 
 @pytest.fixture(scope="module")
@@ -98,11 +101,11 @@ def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
     # To itself: either run over either, so that its range is the runs' own.
     seconds = []
     for seed in (0, 1):
-        record = read_json(finished / "crisalad" / f"seed-{seed}" / "training.json", "a record")
+        record = training_of(finished / "crisalad" / f"seed-{seed}")
         seconds.append(record["steps"] * record["step_seconds"])
     ratio = max(seconds) / min(seconds)
-    assert row["training"] == pytest.approx([1, 1 / ratio, ratio])
-    assert row["training_seconds"] == pytest.approx(
+    assert list(row["training"].values()) == pytest.approx([1, 1 / ratio, ratio])
+    assert list(row["training_seconds"].values()) == pytest.approx(
         [statistics.mean(seconds), min(seconds), max(seconds)]
     )
 
@@ -110,8 +113,8 @@ def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
 def test_what_it_leaves(finished):
     written = {path.name for path in finished.iterdir() if path.is_file()}
     assert written == {
-        *("config.json", "behind.json", "speed.json", "results.json", "table.md", "table.csv"),
-        *("index.html", "recall_0.png", "recall_0_dark.png"),
+        *("config.json", "speed.json", "results.json", "table.md", "table.csv"),
+        *("index.html", "recall_0.png"),
     }
     page = (finished / "index.html").read_text()
     assert "CriSALAD" in page
@@ -119,9 +122,9 @@ def test_what_it_leaves(finished):
 
 
 def test_only_what_is_missing_is_done_again(finished, flags, capfd, monkeypatch):
-    missing = finished / "crisalad" / "seed-1" / "test-0.json"
-    content, before = missing.read_text(), stamps(finished)
-    missing.unlink()
+    path = finished / "crisalad" / "seed-1" / "result.json"
+    before, content = stamps(finished), read_json(path, "a result")
+    write_json(path, content | {"ranks": {}})
 
     def never(*args: object, **options: object) -> None:
         raise AssertionError("trained again")
@@ -131,13 +134,8 @@ def test_only_what_is_missing_is_done_again(finished, flags, capfd, monkeypatch)
     succeeds(capfd, *flags, "--out", finished)
     after = stamps(finished)
     changed = {str(path) for path in after if after[path] != before.get(path)}
-    assert changed == {"crisalad/seed-1/test-0.json", "results.json"}
-    differing = ('"seconds": ', '"checksum": ')  # of how long it took, and of the file's bytes
-    assert _without(missing.read_text(), *differing) == _without(content, *differing)
-
-
-def _without(text: str, *starts: str) -> list[str]:
-    return [line for line in text.splitlines() if not line.strip().startswith(starts)]
+    assert changed == {"crisalad/seed-1/result.json", "config.json", "results.json"}
+    assert read_json(path, "a result")["ranks"] == content["ranks"]
 
 
 def test_interrupted_between_training_and_evaluation(finished, flags, capfd, tmp_path, monkeypatch):
@@ -154,7 +152,8 @@ def test_interrupted_between_training_and_evaluation(finished, flags, capfd, tmp
     monkeypatch.setattr(runner, "evaluate", interrupted)
     assert main([*map(str, flags), "--out", str(out)]) == 130
     capfd.readouterr()
-    assert sorted(path.name for path in out.rglob("test-*.json")) == ["test-0.json"]
+    ranks = [read_json(path, "a result")["ranks"] for path in sorted(out.rglob("result.json"))]
+    assert [len(each) for each in ranks] == [1, 0]
     assert not (out / "results.json").exists()
     succeeds(capfd, *flags, "--out", out)
     assert calls == [0, 1, 1]
@@ -162,50 +161,41 @@ def test_interrupted_between_training_and_evaluation(finished, flags, capfd, tmp
         json.loads((folder / "results.json").read_text())["rows"][0] for folder in (out, finished)
     )
     assert ours["recalls"] == theirs["recalls"]
-    assert ours["sittings"] == 1
 
 
 def test_a_run_that_was_cut_short_goes_on(finished, flags, capfd, tmp_path):
-    """As a kill leaves it before training.json: its steps are not taken again."""
+    """As a kill leaves it before the end of training is recorded: no step is taken again."""
     folder = finished / "crisalad" / "seed-0"
     weights = (folder / "run" / "last.safetensors").read_bytes()
-    for name in ("training.json", "test-0.json"):
-        (folder / name).unlink()
-    out = succeeds(capfd, *flags, "--out", finished)
-    assert "Resumed, so that its steps' times are of several calls: CriSALAD." in out
+    content = read_json(folder / "result.json", "a result")
+    write_json(folder / "result.json", content | {"training": None, "ranks": {}})
+    succeeds(capfd, *flags, "--out", finished)
     assert (folder / "run" / "last.safetensors").read_bytes() == weights
-    assert json.loads((folder / "training.json").read_text())["steps"] == STEPS
+    assert training_of(folder)["steps"] == STEPS
 
 
 def test_a_file_of_results_that_is_cut_short(finished, flags, capfd):
-    path = finished / "crisalad" / "seed-0" / "test-0.json"
+    path = finished / "crisalad" / "seed-0" / "result.json"
     path.write_text(path.read_text()[:40])
     fails(capfd, *flags, "--out", finished, words=(path, "found no JSON", "delete it"))
 
 
-@pytest.mark.parametrize(
-    "name", ["crisalad/seed-0/test-0.json", "crisalad/seed-1/training.json", "speed.json"]
-)
+@pytest.mark.parametrize("name", ["crisalad/seed-0/result.json", "speed.json"])
 def test_a_file_of_results_that_was_changed(finished, flags, capfd, name):
     path = finished / name
     text = path.read_text()
-    path.write_text(
-        text.replace('"device": "', '"device": "x').replace('"queries": 5', '"queries": 6')
-    )
+    path.write_text(text.replace('"device": "', '"device": "x'))
     assert path.read_text() != text
     words = (path, "found other bytes than were written", "delete it, and the same command")
     fails(capfd, *flags, "--out", finished, words=words)
 
 
-def test_a_result_of_another_set(finished, flags, capfd):
-    path = finished / "crisalad" / "seed-0" / "test-0.json"
-    write_json(path, read_json(path, "a result") | {"queries": 4})
-    words = (path, "with 4 queries and 7 database images, expected", "with 5 and 7; delete it")
-    fails(capfd, *flags, "--out", finished, words=words)
-
-
 def test_another_comparison_is_refused(finished, flags, capfd):
-    words = (finished, "holds another comparison: epochs: was 3, is 4; give the same to go on")
+    """Before its runs are trained on, as when they were interrupted."""
+    words = (finished / "crisalad" / "seed-0", "other settings: training.epochs: was 3, is 4; give")
+    fails(capfd, *flags, "--epochs", 4, "--out", finished, words=words)
+    village = finished / "crisalad" / "seed-0" / "result.json"
+    write_json(village, read_json(village, "a result") | {"training": None, "ranks": {}})
     fails(capfd, *flags, "--epochs", 4, "--out", finished, words=words)
 
 
@@ -221,7 +211,7 @@ def test_weights_that_change_behind_their_name_are_refused(
     summary = run(config, out)
     assert run(config, out).rows == summary.rows
     save_weights(weights, Model(jax.tree.map(lambda x: x + 1, params), model))
-    with pytest.raises(InputError, match=r"out: .*weights\.safetensors: found changed since"):
+    with pytest.raises(InputError, match=r"other settings: weights: was .*, is "):
         run(config, out)
 
 
@@ -303,7 +293,7 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
     fresh = init_crisalad(key, model)
     moved = jax.tree.map(lambda x: x + 1, fresh.aggregator)
     assert_equal(params, dataclasses.replace(fresh, aggregator=moved))
-    (out / "anyloc" / "seed-0" / "test-0.json").unlink()
+    (out / "anyloc" / "seed-0" / "result.json").unlink()
     again = run(config, out)
     assert len(built) == 2
     assert again.rows == summary.rows
@@ -312,7 +302,7 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
 def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
     """The second one re-ranks; how is another module's, which is given its words."""
     monkeypatch.setitem(METHODS, "ranked", ComparedMethod("Ranked", "crisalad", rerank="by-name"))
-    anything = types.SimpleNamespace(check=lambda model: None)
+    anything = types.SimpleNamespace(check=lambda model, database: None)
     monkeypatch.setattr(plan, "parse_reranking", lambda text: anything)
     monkeypatch.setattr(runner, "parse_reranking", lambda text: f"parsed {text}")
     seen = []
@@ -329,9 +319,10 @@ def test_methods_of_one_recipe_share_its_runs(finished, settings, monkeypatch):
     summary = run(config, finished)
     assert seen == [(0, "parsed by-name:5"), (1, "parsed by-name:5")]
     first, second = summary.rows
-    assert first.recalls == second.recalls
+    for k, recall in second.recalls["town"].items():
+        assert recall._replace(difference=None) == first.recalls["town"][k]
     assert (first.speed, second.speed, second.training) == (1, 1, first.training)
-    assert second.differences["town"][1].interval == (0, 0)
+    assert second.recalls["town"][1].difference.interval == (0, 0)
 
 
 def test_rows_draw_seeds_together_where_they_share_them(finished, settings, shared):
@@ -342,23 +333,19 @@ def test_rows_draw_seeds_together_where_they_share_them(finished, settings, shar
         ComparisonConfig(**settings | {"names": names, "weights": weights})
     )
     ranks = {0: [1] * 5, 1: [0] * 5}
-    record = read_json(finished / "crisalad" / "seed-0" / "test-0.json", "a result")
-    trained = read_json(finished / "crisalad" / "seed-0" / "training.json", "a record")
-    for variant, seed in prepared.units:
-        folder = runner.folder_of(finished, variant.name, seed)
-        factor = 2 if variant.name == "salad" else 1
-        took = {"step_seconds": factor * trained["step_seconds"]}
-        write_json(folder / "training.json", trained | took)
-        write_json(folder / "test-0.json", record | {"groupings": {"single": ranks[seed]}})
-    speed = read_json(finished / "speed.json", "times")
-    write_json(finished / "speed.json", speed | {"rounds": {name: [1.0] for name in names}})
-    _, same, alone = comparison.summarise(prepared, finished).rows
-    assert same.differences["town"][1].interval == (0, 0)
+    trained = training_of(finished / "crisalad" / "seed-0")
+    for each in runs_of(prepared, finished):
+        factor = 2 if each.variant.name == "salad" else 1
+        result = each.read()
+        result.training = trained | {"step_seconds": factor * trained["step_seconds"]}
+        result.ranks = {each.evaluations[0].key: {"single": ranks[each.seed]}}
+        result.write(each.folder)
+    speed = read_json(finished / "speed.json", "times") | {"rounds": dict.fromkeys(names, (1.0,))}
+    _, same, alone = comparison.summarise(prepared, finished, speed).rows
+    assert same.recalls["town"][1].difference.interval == (0, 0)
     assert (same.training, alone.training) == ((2, 2, 2), None)  # over the reference's
     # All queries hit or miss with their seed: two seeds miss both in a quarter of the resamples.
-    assert alone.differences["town"][1].interval == (0, 1)
-    notes = " ".join(comparison.summarise(prepared, finished).notes)
-    assert "runs of one seed share initial values and batches; a model from a file shares" in notes
+    assert alone.recalls["town"][1].difference.interval == (0, 1)
 
 
 def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
@@ -385,7 +372,8 @@ def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
     assert evaluated == [("village", 0), ("village", 1), ("village", 2), ("town", 2)]
     after = stamps(finished)
     changed = {str(path) for path in before if after[path] != before[path]}
-    assert changed == {"config.json", "behind.json", "results.json"}
+    results = {f"crisalad/seed-{seed}/result.json" for seed in (0, 1)}
+    assert changed == {*results, "config.json", "results.json"}
     succeeds(capfd, *flags, "--out", finished)  # a part of it, as at the beginning
     succeeds(capfd, *flags, "--test", shared / "town", village, "--seeds", 3, "--out", finished)
     assert (len(trained), len(evaluated)) == (1, 4)
@@ -399,93 +387,70 @@ def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
 def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
     """It holds seed 0, and ends it while this one waits; seed 1 is done here, and only that."""
     prepared = comparison.prepare(config)
-    for seed in (0, 1):
-        (finished / "crisalad" / f"seed-{seed}" / "test-0.json").rename(finished / f"{seed}.json")
+    runs = runs_of(prepared, finished)
+    for each in runs:
+        (each.folder / "result.json").rename(finished / f"{each.seed}.json")
     one, lines = [], []
 
-    def done(seed):
-        (finished / f"{seed}.json").rename(finished / "crisalad" / f"seed-{seed}" / "test-0.json")
+    def done(each):
+        (finished / f"{each.seed}.json").rename(each.folder / "result.json")
 
-    monkeypatch.setattr(runner, "_one", lambda p, o, n, v, seed, *_: one.append(seed) or done(seed))
+    monkeypatch.setattr(runner, "_complete", lambda p, r, *_: one.append(r.seed) or done(r))
     with contextlib.ExitStack() as other:
-        other.enter_context(locks.one_writer(finished / "crisalad" / "seed-0"))
+        other.enter_context(locks.one_writer(runs[0].folder))
 
         def ended(seconds):
-            done(0)
+            done(runs[0])
             other.close()
 
         monkeypatch.setattr(runner.time, "sleep", ended)
         runner.take_runs(prepared, finished, say=lines.append)
     assert one == [1]
-    assert lines == [
-        "crisalad, seed 1: method 1 of 1, 0 of 2 runs done",
+    assert lines[1:] == [
+        "crisalad, seed 1: 0 of 2 runs done",
         "waiting for the runs of other processes",
     ]
 
 
 def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     """Its lock's file is left, and the kernel has released the lock."""
-    lock = finished / "crisalad" / "seed-0" / temporaries.LOCK
-    lock.write_text(f"process 1 on {socket.gethostname()}\n")
-    (finished / "crisalad" / "seed-0" / "test-0.json").unlink()
+    folder = finished / "crisalad" / "seed-0"
+    (folder / temporaries.LOCK).write_text(f"process 1 on {socket.gethostname()}\n")
+    write_json(folder / "result.json", read_json(folder / "result.json", "it") | {"ranks": {}})
     monkeypatch.delattr(runner, "fit")
-    assert not runner._has_neighbours(finished)
     runner.take_runs(comparison.prepare(config), finished, say=print)
-    assert not lock.exists()
+    assert not (folder / temporaries.LOCK).exists()
 
 
 def test_a_training_time_is_of_runs_with_a_device_of_their_own(finished, flags, capfd):
-    """Of a process of this host; another host's is no neighbour."""
-    with locks.one_writer(finished / "crisalad" / "seed-1"):
-        lock = finished / "crisalad" / "seed-1" / temporaries.LOCK
-        assert not runner._has_neighbours(finished)  # it is this process's own
-        lock.write_text(f"process 1 on {socket.gethostname()}\n")
-        assert runner._has_neighbours(finished)
-        lock.write_text("process 1 on elsewhere\n")
-        assert not runner._has_neighbours(finished)
-    paths = [finished / "crisalad" / f"seed-{seed}" / "training.json" for seed in (0, 1)]
-    second = read_json(paths[1], "a record")
-    write_json(paths[1], second | {"beside": True, "step_seconds": 1e6})
+    path = finished / "crisalad" / "seed-1" / "result.json"
+    second = read_json(path, "a record")
+    second["training"] |= {"beside": True, "step_seconds": 1e6}
+    write_json(path, second)
     # One run is left, whose time has no spread.
     told = succeeds(capfd, *flags, "--out", finished)
-    assert "median and range of the runs that had their device to themselves, where these" in told
+    assert "of runs that had their device to themselves, at least two" in told
     (row,) = json.loads((finished / "results.json").read_text())["rows"]
     assert (row["training"], row["training_seconds"]) == (None, None)
-    assert (finished / "table.md").read_text().splitlines()[2].endswith("| - |")
 
 
-def test_the_time_left_is_told_by_runs_of_the_same_method(tmp_path):
-    """A slow method's seconds say nothing of a fast one; re-ranking shares its training."""
+def test_the_time_left_is_told_by_runs_of_the_same_method():
+    """A slow method's seconds say nothing of a fast one."""
 
-    def variant(name, run, *, trains=True):
-        return types.SimpleNamespace(name=name, run=run, trains=trains)
+    def fake(name, seed, seconds=None):
+        return types.SimpleNamespace(
+            variant=types.SimpleNamespace(run=name),
+            seed=seed,
+            is_done=seconds is not None,
+            read=lambda: types.SimpleNamespace(seconds=seconds),
+        )
 
-    slow, again, fast = variant("slow", "slow"), variant("slow+r", "slow"), variant("fast", "fast")
-    file = variant("file", "file", trains=False)
-    units = [(v, seed) for v in (slow, again, fast) for seed in (0, 1, 2)] + [(file, 0)]
-    prepared = types.SimpleNamespace(units=units)
-    assert runner.time_left(prepared, tmp_path, [0]) == (0, 0)
-
-    def trained(run, seed, seconds):
-        path = runner.folder_of(tmp_path, run, seed) / "training.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, {"seconds_of_steps": seconds})
-
-    def evaluated(which, seed, seconds):
-        path = runner.result_path(tmp_path, which, seed, 0)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, {"seconds": seconds})
-
-    trained("slow", 0, 1000.0)
-    evaluated(slow, 0, 10.0)
-    # Seeds 1 and 2 of slow; of the others none has finished.
-    assert runner.time_left(prepared, tmp_path, [0]) == (2 * 1010, 2)
-    evaluated(again, 0, 30.0)
-    # Two evaluations each, and one training of each seed.
-    assert runner.time_left(prepared, tmp_path, [0]) == (2 * (1000 + 10 + 30), 4)
-    trained("slow", 1, 2000.0)
-    # Seed 1 is to be evaluated only; seed 2 trains as long as the two did on average.
-    assert runner.time_left(prepared, tmp_path, [0]) == (1500 + 2 * (10 + 30), 4)
-    trained("fast", 0, 5.0)
-    evaluated(fast, 0, 1.0)
-    assert runner.time_left(prepared, tmp_path, [0]) == (1500 + 2 * (10 + 30) + 2 * 6, 6)
+    slow, fast = [fake("slow", 0, 1200.0), fake("slow", 1, 2400.0)], [fake("fast", 0)]
+    left = [fake("slow", 2), fake("slow", 3)]
+    for runs, words in (
+        (fast, "0 of 1 runs done"),
+        ([*slow, *left], "2 of 4 runs done, about 60 min left"),
+        ([*slow, *left, *fast], "2 of 5 runs done, about 60 min left for 2 of the 3"),
+    ):
+        assert runner.progress_words(runs[-1], runs, 1).partition(": ")[2] == words
+    assert "about 30 min left" in runner.progress_words(left[0], [*slow, *left], 2)

@@ -5,40 +5,13 @@ import io
 import json
 import types
 
-import numpy as np
 import pytest
 import rich.console
 
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.experiments.comparison import AdapterCost, Recall, Row, Summary, tables
-from crisalad_jax.experiments.comparison.page import write_page
-from crisalad_jax.experiments.comparison.paired import Difference
-from crisalad_jax.experiments.comparison.summary import Spread, recall_of
-from crisalad_jax.experiments.comparison.timing import Race, race
+from crisalad_jax.experiments.comparison.results import Difference, Spread
 from crisalad_jax.utils.errors import InputError
-
-
-def test_recalls_of_ranks_by_hand():
-    """Two seeds, four queries: at 1 they hit 2 and 1, at 5 they hit 3 and 2."""
-    ranks = np.array([[1, 1, 3, 0], [1, 6, 5, 0]])
-    at_1, at_5 = recall_of(ranks, 1), recall_of(ranks, 5)
-    assert at_1.by_seed == (0.5, 0.25)
-    assert (at_1.mean, at_5.mean) == (0.375, 0.625)
-    # The sample deviation of two numbers is their distance over the square root of 2.
-    assert at_1.spread == pytest.approx(0.25 / np.sqrt(2), abs=1e-15)
-    assert recall_of(ranks[:1], 1).spread is None
-
-
-def test_the_interval_is_the_bootstraps():
-    """Against resampling itself; its ends lie on a grid of 1/24, and may be one step off."""
-    ranks = np.array([[1, 0, 2, 9, 1, 1, 0, 1], [1, 0, 1, 2, 0, 1, 3, 0], [2, 0, 0, 1, 1, 1, 1, 1]])
-    hits = (ranks == 1).mean(axis=0)
-    drawn = np.random.default_rng(0).integers(0, 8, (20_000, 8))
-    low, high = np.quantile(hits[drawn].mean(axis=1), (0.025, 0.975))
-    found = recall_of(ranks, 1).interval
-    assert found == pytest.approx((low, high), abs=1 / 24 + 1e-9)
-    assert found.low < found.high
-
 
 ONE = Recall(0.625, 0.125, Interval(0.4, 0.8), (0.75, 0.5))
 LONE = Recall(0.25, None, Interval(0.1, 0.4), (0.25,))
@@ -55,7 +28,6 @@ def row(name, grouping, recall, **changes):
         "trained": 10_000,
         "training": Spread(0.5, 0.4, 0.75),
         "training_seconds": Spread(90.0, 84.0, 120.0),
-        "sittings": 1,
     }
     return Row(name=name, grouping=grouping, **values | changes)
 
@@ -63,8 +35,8 @@ def row(name, grouping, recall, **changes):
 SUMMARY = Summary(
     "compare",
     ("method",),
-    "first",
-    {},
+    "First",
+    {"town": types.SimpleNamespace(name="town", queries=[0], database=[0], rule="within 25 m")},
     [
         row("first", "single", ONE),
         row("first", "shuffled", ONE),
@@ -77,14 +49,19 @@ SUMMARY = Summary(
 
 
 def test_markdown():
-    assert tables.markdown(SUMMARY).splitlines()[2:] == [
-        "| First, single | 8,448 "
-        + "| 62.5 ± 12.5 (40.0-80.0) " * 3
-        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x (0.40 to 0.75) |",
-        "| First, shuffled | 8,448 "
-        + "| 62.5 ± 12.5 (40.0-80.0) " * 3
-        + "| 1.25 x | 1,000,000 | 10,000 | 0.50 x (0.40 to 0.75) |",
-        r"| A\|B | 8,448 " + "| 25.0 (10.0-40.0) " * 3 + "| 1.25 x | 1,000,000 | - | - |",
+    recalls = "| 62.5 ± 12.5 (40.0-80.0) " * 3
+    costs = "| 8,448 | 1.25 x | 1,000,000 | 10,000 | 0.50 x (0.40 to 0.75) |"
+    assert tables.markdown(SUMMARY).splitlines() == [
+        "| method | town R@1 | town R@5 | town R@10 |",
+        "| --- | ---: | ---: | ---: |",
+        f"| First, single {recalls}|",
+        f"| First, shuffled {recalls}|",
+        r"| A\|B " + "| 25.0 (10.0-40.0) " * 3 + "|",
+        "",
+        "| method | dimension | images/s | parameters | trained | training time |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        f"| First {costs}",
+        r"| A\|B | 8,448 | 1.25 x | 1,000,000 | - | - |",
         "",
         "A note.",
     ]
@@ -103,8 +80,7 @@ def test_a_training_time_without_a_spread_is_not_shown(images_per_second):
 
 
 def test_csv_has_a_line_for_each_number():
-    summary = SUMMARY._replace(sets={"town": None})
-    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(summary))))
+    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(SUMMARY))))
     assert len(lines) == 3 * 3
     assert lines[0] == {
         **{"method": "First", "name": "first", "grouping": "single", "set": "town", "k": "1"},
@@ -112,8 +88,8 @@ def test_csv_has_a_line_for_each_number():
         **{"seeds": "2", "dimension": "8448", "speed": "1.25", "images_per_second": ""},
         **{"parameters": "1000000", "trained": "10000", "training": "0.5"},
         **{"training_least": "0.4", "training_most": "0.75"},
-        # On a CPU.
-        **dict.fromkeys((f"training_seconds{end}" for end in ("", "_least", "_most")), ""),
+        **{"training_seconds": "90.0", "training_seconds_least": "84.0"},
+        "training_seconds_most": "120.0",
         **dict.fromkeys(("difference", "difference_low", "difference_high", "verdict"), ""),
     }
     assert lines[-1]["standard_deviation"] == lines[-1]["training"] == ""
@@ -121,24 +97,24 @@ def test_csv_has_a_line_for_each_number():
 
 def test_a_row_that_changes_nothing_has_an_empty_cell_in_csv_and_a_hyphen_for_readers():
     plain = row("first", "single", LONE, labels=("base", ""))
-    summary = SUMMARY._replace(headers=("row", "changed"), rows=[plain], sets={"town": None})
+    summary = SUMMARY._replace(headers=("row", "changed"), rows=[plain])
     lines = list(csv.DictReader(io.StringIO(tables.comma_separated(summary))))
     assert [line["changed"] for line in lines] == ["", "", ""]
     assert not {"-", "'-", "\N{EM DASH}"} & {cell for line in lines for cell in line.values()}
-    assert tables.markdown(summary).splitlines()[2].startswith("| base | - | 8,448 | 25.0")
+    assert tables.markdown(summary).splitlines()[2].startswith("| base | - | 25.0")
 
 
 def test_on_a_narrow_page_what_a_row_changes_stands_below_its_name(tmp_path):
     """A column of its own pushed all recalls out of sight, at 390 pixels."""
     words = "model.aggregator=gem, <b>"
     plain = row("first", "single", LONE, labels=("base", words))
-    town = types.SimpleNamespace(queries=[0], database=[0], rule="within 25 m")
     summary = SUMMARY._replace(kind="ablate", headers=("row", "changed"), rows=[plain])
-    page = write_page(summary._replace(sets={"town": town}), tmp_path).read_text()
+    tables.write_tables(summary, tmp_path)
+    page = (tmp_path / "index.html").read_text()
     shown = "model.<wbr>aggregator=gem, &lt;b&gt;"
     assert f'base<small class="under">{shown}</small></th>' in page
     assert f'<td class="label">{shown}</td>' in page
-    narrow = page.partition("@media (max-width: 40rem) {\n  /* Beside")[2].partition("\n}")[0]
+    narrow = page.partition("@media (max-width: 40rem) {")[2].partition("\n}")[0]
     assert "td.label { display: none; }" in narrow
     assert ".under { display: block; }" in narrow
 
@@ -148,8 +124,9 @@ def test_json_is_json():
     assert found["rows"][0]["recalls"]["town"]["R@5"] == {
         "mean": 0.625,
         "spread": 0.125,
-        "interval": [0.4, 0.8],
+        "interval": {"low": 0.4, "high": 0.8},
         "by_seed": [0.75, 0.5],
+        "difference": None,
     }
 
 
@@ -181,28 +158,23 @@ def test_a_table_in_a_page(tmp_path):
         tables.put_in_page(page, "town", "")
 
 
-def test_races_are_run_in_turns():
-    """Round by round; the first call of all compiles, the first of a turn warms up, three count."""
-    order = []
-    contenders = {name: lambda name=name: lambda: order.append(name) for name in "ab"}
-    found = race(contenders, rounds=2)
-    assert order == ["a", "b"] + (["a"] * 4 + ["b"] * 4) * 2
-    assert {name: len(rounds) for name, rounds in found.rounds.items()} == {"a": 2, "b": 2}
-
-
-def test_ratios_are_of_one_round():
-    raced = Race({"slow": [2.0, 40.0, 9.0], "fast": [1.0, 10.0, 3.0]})
-    assert raced.slower("slow", "fast") == (3.0, 2.0, 4.0)
-
-
-BETTER = Difference(0.0449, Interval(0.004, 0.0861))
-UNTOLD = Difference(-0.0001, Interval(-0.1, 0.1))
-WORSE = Difference(-0.25, Interval(-0.5, -0.01))
+BETTER = Difference(0.0449, Interval(0.004, 0.0861), "better")
+UNTOLD = Difference(-0.0001, Interval(-0.1, 0.1), "not told apart")
+WORSE = Difference(-0.25, Interval(-0.5, -0.01), "worse")
 COMPARED = SUMMARY._replace(
-    sets={"town": None},
     rows=[
         row("first", "single", ONE),
-        row("other", "single", LONE, differences={"town": {1: BETTER, 5: UNTOLD, 10: WORSE}}),
+        row(
+            "other",
+            "single",
+            LONE,
+            recalls={
+                "town": {
+                    k: LONE._replace(difference=each)
+                    for k, each in ((1, BETTER), (5, UNTOLD), (10, WORSE))
+                }
+            },
+        ),
     ],
 )
 
@@ -211,8 +183,8 @@ def test_differences_in_markdown():
     assert tables.markdown(COMPARED).splitlines()[5:8] == [
         "| method, less First | town Δ R@1 | town Δ R@5 | town Δ R@10 |",
         "| --- | ---: | ---: | ---: |",
-        "| Other | +4.5 (+0.4 to +8.6), better | +0.0 (-10.0 to +10.0), not told apart "
-        "| -25.0 (-50.0 to -1.0), worse |",
+        "| Other | +4.5 (+0.4 to +8.6) better | +0.0 (-10.0 to +10.0) not told apart "
+        "| -25.0 (-50.0 to -1.0) worse |",
     ]
 
 
@@ -224,25 +196,25 @@ def test_differences_in_csv_and_json():
     ]
     assert (lines[3]["difference"], lines[3]["difference_low"]) == ("0.0449", "0.004")
     assert lines[3]["difference_high"] == "0.0861"
-    first, second = json.loads(json.dumps(tables.as_json(COMPARED._replace(sets={}))))["rows"]
-    assert first["differences"] is None
-    assert second["differences"]["town"]["R@10"] == {
+    first, second = json.loads(json.dumps(tables.as_json(COMPARED)))["rows"]
+    assert first["recalls"]["town"]["R@10"]["difference"] is None
+    assert second["recalls"]["town"]["R@10"]["difference"] == {
         "mean": -0.25,
-        "interval": [-0.5, -0.01],
+        "interval": {"low": -0.5, "high": -0.01},
         "verdict": "worse",
     }
 
 
 def test_differences_in_the_terminal(capsys):
-    console = rich.console.Console(width=120)
-    for table in tables.terminal_tables(COMPARED):
-        console.print(table)
+    console = rich.console.Console(width=160)
+    for table in tables.tables_of(COMPARED).values():
+        console.print(table.terminal())
     printed = capsys.readouterr().out
     assert "method, less First" in printed
-    assert "+4.5 (+0.4 to +8.6), better" in printed
+    assert "+4.5 (+0.4 to +8.6) better" in printed
 
 
 def test_no_differences_of_a_single_row():
     alone = SUMMARY._replace(rows=SUMMARY.rows[:1])
-    assert len(tables.terminal_tables(alone)) == 2
+    assert list(tables.tables_of(alone)) == ["recall", "costs"]
     assert "less" not in tables.markdown(alone)

@@ -7,8 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments import report
-from crisalad_jax.experiments.report.gallery import _choose_queries, shortened
+from crisalad_jax.experiments.report.gallery import _half_right, shortened
 from crisalad_jax.retrieval.maps.map import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
@@ -25,17 +27,25 @@ from tests.experiments.report.pictures import (
 
 
 def _gallery(photographs, path, indices, positives, **options):
+    """Draw a result, or a map's answers where what is right is unknown."""
     indices = np.array(indices)
     similarities = np.linspace(0.9, 0.1, indices.shape[1])[None].repeat(len(indices), axis=0)
-    report.prediction_gallery(
-        path,
-        photographs["queries"][: len(indices)],
-        photographs["database"],
-        indices,
-        similarities,
-        positives and [np.array(p, np.int64) for p in positives],
-        **options,
-    )
+    near = Neighbours(indices, similarities.astype(np.float32))
+    queries, database = photographs["queries"][: len(indices)], photographs["database"]
+    if positives is None:
+        images = [MapImage(file.name, 1, None, str(file.parent)) for file in database]
+        found, benchmark = Answers(queries, near, images, None), None
+    else:
+        found = GroupingResult("single", {1: 0.5}, near)
+        benchmark = Benchmark(
+            "town",
+            queries[0].parent.parent,
+            tuple(database),
+            tuple(queries),
+            tuple(np.array(each, np.int64) for each in positives),
+            "by hand",
+        )
+    report.save(report.show_retrievals(found, benchmark, **options), path)
     return read_picture(path)
 
 
@@ -96,7 +106,7 @@ def test_gallery_shows_the_pictures_asked_for(photographs, tmp_path):
     ],
 )
 def test_gallery_takes_half_right_half_wrong(right, rows, expected):
-    assert _choose_queries(np.array(right, bool), rows) == expected
+    assert _half_right(np.array(right, bool), rows) == expected
 
 
 def test_gallery_is_deterministic_and_takes_mixed_sizes(photographs, tmp_path):
@@ -116,16 +126,14 @@ def test_gallery_is_deterministic_and_takes_mixed_sizes(photographs, tmp_path):
 
 def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
     path = tmp_path / "gallery.png"
-    for indices, positives, options, message in (
-        (np.zeros((0, 2), int), [], {}, r"^indices: found shape \(0, 2\)"),
-        ([[0, 6]], [[0]], {}, r"^indices: found 0 to 6, expected 0 to 5"),
-        ([[-1, 0]], [[0]], {}, r"^indices: found -1 to 0"),
-        ([[0, 1]], [[0], [1]], {}, r"^positives: found 2, expected 1"),
-        ([[0, 1]], [[0]], {"rows": 0}, r"^rows: found 0"),
-        ([[0, 1]], [[0]], {"columns": 0}, r"^columns: found 0"),
+    for options, message in (
+        ({"rows": 0}, r"^rows: found 0"),
+        ({"columns": 0}, r"^columns: found 0"),
+        ({"queries": [1]}, r"^queries: found \[1\], expected numbers from 0 to 0"),
+        ({"queries": []}, r"^queries: found \[\], expected numbers from 0 to 0"),
     ):
         with pytest.raises(InputError, match=message):
-            _gallery(photographs, path, indices, positives, **options)
+            _gallery(photographs, path, [[0, 1]], [[0]], **options)
     photographs["database"][1].write_bytes(b"")
     with pytest.raises(InputError, match=r"database.1\.png: found an empty file"):
         _gallery(photographs, path, [[0, 1]], [[0]])
@@ -151,7 +159,7 @@ def test_a_picture_of_a_map_that_is_gone_is_a_grey_box_and_a_note(photographs, t
     path = tmp_path / "gallery.png"
     words = r"1 picture shown as a grey box, as of .*4\.png: found no such .*; --map-images"
     with pytest.warns(Note, match=words):
-        report.answers_gallery(path, answers)
+        report.save(report.show_retrievals(answers), path)
     grey, there = (is_colour(read_picture(path), c) for c in ((196, 196, 196), (60, 80, 90)))
     # As large as the picture of the other answer, but for edges that are drawn softly.
     assert grey.sum() == pytest.approx(there.sum(), rel=0.02)
@@ -159,24 +167,21 @@ def test_a_picture_of_a_map_that_is_gone_is_a_grey_box_and_a_note(photographs, t
         shutil.copy(each, tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", Note)
-        report.answers_gallery(path, answers, root=tmp_path)
+        report.save(report.show_retrievals(answers, root=tmp_path), path)
     # The soft edges of letters have any grey.
     assert is_colour(read_picture(path), (196, 196, 196)).sum() < 0.01 * grey.sum()
 
 
-def test_names_stand_below_the_captions_as_they_are(photographs, tmp_path):
-    """Ink in the row of names where there are names; a name with dollars is drawn as any other."""
-    names = ["$x_1$"], ["a" * 200, "", *"cdef"]
-    picture = _gallery(photographs, tmp_path / "g.png", [[0, 1]], None, names=names)
-    plain = _gallery(photographs, tmp_path / "p.png", [[0, 1]], None)
-    width = picture.shape[1]
-    assert width == plain.shape[1]
-    assert picture.shape[0] == pytest.approx(plain.shape[0] + 0.14 * 120, abs=1)
-    ink = [(picture[-60:-44, left : left + 204] < 200).any(axis=(0, 2)) for left in (30, 273, 496)]
-    assert [part.any() for part in ink] == [True, True, False]
-    # 28 letters of one width fill a picture's width, and not more; five take less.
-    assert 180 < np.flatnonzero(ink[1])[-1] < 203
-    assert np.flatnonzero(ink[0])[-1] < 60
+def test_names_stand_below_the_captions_as_they_are(photographs):
+    """Of answers; a name with dollars is drawn as any other."""
+    long, plain = "a" * 200, photographs["database"][0].name
+    folder = str(photographs["database"][0].parent)
+    images = [MapImage(plain, 1, None, folder), MapImage(long, 1, None, folder)]
+    near = Neighbours(np.array([[0]]), np.array([[1.0]], np.float32))
+    figure = report.show_retrievals(Answers(photographs["queries"][:1], near, images, None))
+    names = [axes.texts[0] for axes in figure.axes]
+    assert [name.get_text() for name in names][1] == plain
+    assert not any(name.get_parse_math() for name in names)
 
 
 def test_long_names_are_shortened_in_the_middle():
@@ -187,7 +192,7 @@ def test_long_names_are_shortened_in_the_middle():
 
 def test_gallery_shows_the_queries_chosen_in_their_order(photographs, tmp_path):
     picture = _gallery(
-        photographs, tmp_path / "gallery.png", [[0], [1], [2], [3]], [[0]] * 4, chosen=[3, 1]
+        photographs, tmp_path / "gallery.png", [[0], [1], [2], [3]], [[0]] * 4, queries=[3, 1]
     )
     rows = {n: np.argwhere(_is_level(picture, n))[:, 0].mean() for n in (1, 3)}
     assert rows[3] < rows[1]
@@ -207,3 +212,15 @@ def test_names_of_any_letters_are_drawn_without_a_word(photographs, tmp_path, re
         moved["database"][number] = path
     _gallery(moved, tmp_path / "g.png", [[0, 1, 2]], [[0]], title="\x1b[31m caf\udce9")
     assert not [str(warning.message) for warning in recwarn]
+
+
+def test_what_is_shown_is_of_the_right_class(photographs, benchmark):
+    near = Neighbours(np.array([[0]]), np.array([[1.0]], np.float32))
+    with pytest.raises(InputError, match="found: found 'own', expected Answers, or GroupingResult"):
+        report.show_retrievals("own")
+    with pytest.raises(InputError, match="benchmark: found 'town', expected Benchmark, or None"):
+        report.show_retrievals(GroupingResult("single", {1: 1.0}, near), "town")
+    with pytest.raises(InputError, match="benchmark: found none for a result"):
+        report.show_retrievals(GroupingResult("single", {1: 1.0}, near))
+    with pytest.raises(InputError, match="benchmark: found one for answers"):
+        report.show_retrievals(Answers(photographs["queries"][:1], near, [], None), benchmark)

@@ -1,8 +1,14 @@
 """What is drawn over a photograph, by its numbers and its pixels."""
 
+import dataclasses
+
+import cv2
+import jax
 import numpy as np
+import PIL.Image
 import pytest
 
+import crisalad_jax as cj
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.experiments.report.transport import (
@@ -12,12 +18,10 @@ from crisalad_jax.experiments.report.transport import (
     draw_dustbin,
     heat_range,
     strongest_clusters,
-    write_picture,
+    transport_of,
 )
-from crisalad_jax.experiments.report.transport_section import transport_of
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.nn.model import parameter_shapes
 from tests.conftest import MODEL
-from tests.experiments.report.pictures import read_picture
 
 GREY = np.full((20, 30, 3), 100, np.uint8)
 # Two rows of three patches, two clusters and a dustbin.
@@ -46,8 +50,8 @@ def test_shares_by_hand():
 
 
 def test_shares_are_those_of_the_model(benchmark, params):
-    paths = list(benchmark.queries[:2])
-    for path, picture in zip(paths, transport_of(paths, params, MODEL), strict=True):
+    for path in benchmark.queries[:2]:
+        picture = transport_of(read_image(path), params, MODEL)
         assert picture.masses.shape == (3, 4, MODEL.aggregator.clusters + 1)
         # Rows are updated last: each patch has sent all it has, to rounding of float32.
         np.testing.assert_allclose(picture.masses.sum(axis=-1), 1, rtol=1e-5)
@@ -64,9 +68,6 @@ def test_the_dustbin_is_bright_where_much_was_thrown_away():
     assert order[0] == order[1]
     # inferno begins at (0, 0, 4) of 255 and its 0.65 lies over 100.
     assert drawn[15, 15].tolist() == pytest.approx([35, 35, 37], abs=1)
-    for draw in (lambda: draw_dustbin(WITHOUT, (0, 1)), lambda: heat_range([WITHOUT])):
-        with pytest.raises(InputError, match=r"^transport: found no dustbin"):
-            draw()
 
 
 def test_clusters_have_their_colours_strong_where_much_was_kept():
@@ -80,12 +81,6 @@ def test_clusters_have_their_colours_strong_where_much_was_kept():
     assert distance[1, 1] < distance[0, 0] < distance[1, 0] < distance[1, 2]
 
 
-def test_a_picture_is_written_as_it_is(tmp_path):
-    drawn = draw_clusters(PICTURE, [1, 0])
-    write_picture(tmp_path / "x.png", drawn)
-    np.testing.assert_array_equal(read_picture(tmp_path / "x.png"), drawn)
-
-
 def test_patches_lie_where_the_model_saw_them():
     """Of a photograph that is squeezed, the right half is right."""
     image = np.zeros((40, 90, 3), np.uint8)
@@ -94,3 +89,46 @@ def test_patches_lie_where_the_model_saw_them():
     picture = Transported(image, np.stack([1 - bright, bright], -1), 1)
     drawn = draw_dustbin(picture, (0.0, 1.0), width=90).astype(int).sum(axis=2)
     assert drawn[:, 50:].min() > drawn[:, :40].max()
+
+
+def _pixels(figure):
+    shown = cv2.imdecode(np.frombuffer(figure._repr_jpeg_(), np.uint8), cv2.IMREAD_COLOR)
+    assert shown.shape[1] == round(figure.get_figwidth() * figure.dpi)
+    return shown[..., ::-1]
+
+
+def test_transport_shows_picture_dustbin_and_clusters(params, benchmark, tmp_path):
+    image = cj.read_image(benchmark.queries[0])
+    figure = cj.show_transport(image, params, MODEL)
+    first, dustbin, clusters = figure.axes
+    np.testing.assert_array_equal(first.images[0].get_array(), image)
+    # Twelve patches for four clusters leave two thirds in the dustbin, within what three
+    # iterations leave.
+    assert dustbin.get_title(loc="left") in (
+        "dustbin: 66 % of the mass",
+        "dustbin: 67 % of the mass",
+    )
+    legend = [text.get_text() for text in clusters.get_legend().get_texts()]
+    assert len(legend) == len({label.split(":")[0] for label in legend}) <= 4
+    colours = [patch.get_facecolor()[:3] for patch in clusters.get_legend().get_patches()]
+    expected = [[int(c[i : i + 2], 16) / 255 for i in (1, 3, 5)] for c in CLUSTER_COLOURS]
+    np.testing.assert_allclose(colours, expected[: len(colours)])
+    assert _pixels(figure).std() > 10  # not blank
+    same = cj.show_transport(benchmark.queries[0], params, MODEL)
+    np.testing.assert_array_equal(_pixels(same), _pixels(figure))
+
+
+def test_a_model_without_a_transport_is_refused(benchmark):
+    alone = cj.CrossImageConfig(layers=0)
+    model = dataclasses.replace(MODEL, aggregator="gem", cross_image=alone)
+    other = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), parameter_shapes(model))
+    with pytest.raises(cj.InputError, match="found gem, expected one that transports"):
+        cj.show_transport(benchmark.queries[0], other, model)
+
+
+def test_the_order_of_the_arguments_is_one_line(params, benchmark):
+    picture = PIL.Image.open(benchmark.queries[0])
+    with pytest.raises(cj.InputError, match="image: found JpegImageFile, expected uint8 or uint16"):
+        cj.show_transport(picture, params, MODEL)
+    with pytest.raises(cj.InputError, match="params: found JpegImageFile, expected Crisalad"):
+        cj.show_transport(params, picture, MODEL)

@@ -1,14 +1,21 @@
-"""Timing of models that describe images, in turns, so that all meet the same load."""
+"""What models cost: their speed, timed in turns under the same load, and the paper's Table 3."""
 
+import dataclasses
+import functools
 import statistics
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.experiments.comparison.methods import AdapterKind
+from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.costs import adapter_macs, paper_adapter_macs
 from crisalad_jax.nn.model import (
     Crisalad,
     attend_across_images,
@@ -16,10 +23,11 @@ from crisalad_jax.nn.model import (
     extract_tokens,
     self_mask,
 )
+from crisalad_jax.utils.compiler import jit
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
-from crisalad_jax.utils.target import target
+from crisalad_jax.utils.pytree import named_leaves
 
 _CALLS = 3
 """Number of calls of each in a round; their median counts."""
@@ -110,6 +118,69 @@ def machine() -> str:
     return device.device_kind
 
 
-def is_absolute() -> bool:
-    """Return whether times are comparable; a CPU's are not, for they depend on other load."""
-    return target().platform != "cpu"
+class AdapterCost(NamedTuple):
+    """A row of Table 3."""
+
+    adapter: str
+    paper_parameters: int
+    """Number of parameters as the paper counts them: docs/comparison.md."""
+    parameters: int
+    """Number of parameters of one adapter here, with batch norms' running statistics."""
+    paper_macs: int
+    macs: int
+    """Multiply-accumulates that an image really takes."""
+    time: tuple[float, float, float] | None
+    """Time over the depthwise adapter's: median, least and most of the rounds."""
+
+
+NOTES = (
+    "Table 3 at the paper's size (ViT-B/14, 224 x 224 pixels); docs/comparison.md says what the "
+    "paper counts.",
+)
+
+
+def adapter_costs(*, measure: bool = True, rounds: int = 5, images: int = 4) -> list[AdapterCost]:
+    """Compute Table 3, of one adapter at the paper's size.
+
+    Args:
+        measure: whether to time the adapters, in turns.
+        rounds: number of turns of each.
+        images: number of images in a batch.
+    """
+    kinds: tuple[AdapterKind, ...] = ("mlp", "multi-resolution", "depthwise")
+    calls = {kind: functools.partial(_adapter_call, kind, images) for kind in kinds}
+    raced = race(calls, rounds) if measure else None
+    return [_adapter_cost(kind, raced) for kind in kinds]
+
+
+def _adapter_cost(kind: AdapterKind, raced: Race | None) -> AdapterCost:
+    config = AdapterConfig(kind=kind)
+    backbone = ViTConfig(adapter=config)
+    model = dataclasses.replace(PRESETS["b14"], backbone=backbone)
+    make = functools.partial(init_adapter, dim=backbone.dim, config=config)
+    shapes = named_leaves(jax.eval_shape(make, jax.random.key(0)))
+    sizes = {name: leaf.size for name, leaf in shapes.items()}
+    total = parameters = sum(sizes.values())
+    macs = paper_adapter_macs(model)
+    if kind == "multi-resolution":
+        parameters = sum(
+            size
+            for name, size in sizes.items()
+            if name.startswith(("down.", "up.")) or name.endswith("conv.weight")
+        )
+    if kind == "mlp":
+        macs = 2 * macs + sum(size for name, size in sizes.items() if name.endswith("bias"))
+    time = None if raced is None else raced.slower(kind, "depthwise")
+    return AdapterCost(kind, parameters, total, macs, adapter_macs(model), time)
+
+
+def _adapter_call(kind: AdapterKind, images: int) -> Callable[[], Any]:
+    dim, grid = ViTConfig().dim, (16, 16)
+    tokens = jnp.ones((images, 1 + grid[0] * grid[1], dim), jnp.float32)
+    params = init_adapter(jax.random.key(0), dim, AdapterConfig(kind=kind))
+    return lambda: jax.block_until_ready(_apply_adapter(params, tokens, grid))
+
+
+@functools.partial(jit, static_argnames="grid")
+def _apply_adapter(params: Any, tokens: jax.Array, grid: tuple[int, int]) -> jax.Array:
+    return adapter(params, tokens, grid)

@@ -1,4 +1,4 @@
-"""Tables 2 and 3."""
+"""Tables 2 and 3, and times that are taken in turns."""
 
 import json
 
@@ -8,10 +8,12 @@ import pytest
 from crisalad_jax.experiments.comparison import (
     ABLATIONS,
     ComparisonConfig,
-    ablation,
     adapter_costs,
     prepare,
+    runner,
 )
+from crisalad_jax.experiments.comparison.costs import Race, race
+from crisalad_jax.experiments.comparison.methods import find_line
 from crisalad_jax.training.recipes import from_scratch, recipe
 from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH
@@ -57,7 +59,15 @@ def test_rows_change_one_thing_each():
     assert rows["no-encoder"].model.cross_image.layers == 0
     assert rows["no-encoder"].optimiser == base.optimiser
     assert rows["no-encoder-step"].optimiser == rows["step"].optimiser
-    assert ablation.row_labels(rows["lr-1e-4"]) == ("depthwise", "yes", "0.0001", "linear")
+    for name, words in (
+        (
+            "crisalad",
+            "adapter depthwise, cross-image encoder yes, learning rate 6e-05, scheduler l",
+        ),
+        ("lr-1e-4", "learning rate 0.0001"),
+        ("no-encoder-step", "cross-image encoder no, scheduler step"),
+    ):
+        assert find_line(name, "b14", from_nothing=False).changed.startswith(words)
 
 
 def test_from_nothing_rates_are_in_the_papers_proportion():
@@ -74,23 +84,23 @@ def test_from_nothing_rates_are_in_the_papers_proportion():
 def test_ablate(flags, capfd, tmp_path, monkeypatch):
     """The row of the whole model is trained as `compare` trains CriSALAD."""
     timed = [cost._replace(time=(1.0, 1.0, 1.0)) for cost in adapter_costs(measure=False)]
-    monkeypatch.setattr(ablation, "adapter_costs", lambda: timed)
+    monkeypatch.setattr(runner, "adapter_costs", lambda: timed)
     out = tmp_path / "out"
     given = ("ablate", "--rows", "crisalad", "--seeds", 1, *flags[flags.index("--epochs") :])
     printed = succeeds(capfd, *given, "--preset", "tiny", "--out", out)
     assert "741,504" in printed
-    assert "follow from neither count" in printed
     (row,) = json.loads((out / "results.json").read_text())["rows"]
-    assert row["labels"] == ["crisalad", "depthwise", "yes", "0.001", "linear"]
+    settings = "adapter depthwise, cross-image encoder yes, learning rate 0.001, scheduler linear"
+    assert row["labels"] == ["crisalad", settings]
     assert "761,472" in (out / "index.html").read_text()
     # Measured once: what is on the disk is what is shown again.
-    monkeypatch.setattr(ablation, "adapter_costs", lambda: 1 / 0)
+    monkeypatch.setattr(runner, "adapter_costs", lambda: 1 / 0)
     assert "741,504" in succeeds(capfd, *given, "--preset", "tiny", "--out", out)
 
 
 def test_an_unknown_row(flags, capfd, tmp_path):
     given = ("ablate", "--rows", "half", *flags[flags.index("--epochs") :])
-    words = ("--rows: found 'half', expected one of crisalad, lr-1e-4",)
+    words = ("--rows: found 'half', expected one of anyloc, boq",)
     fails(capfd, *given, "--preset", "tiny", "--out", tmp_path / "out", words=words)
 
 
@@ -100,3 +110,17 @@ def test_every_row_can_be_made(shared):
     names = tuple(ABLATIONS)
     prepared = prepare(ComparisonConfig("ablate", names, batch_size=BATCH, **settings))
     assert [variant.name for variant in prepared.variants] == list(names)
+
+
+def test_races_are_run_in_turns():
+    """Round by round; the first call of all compiles, the first of a turn warms up, three count."""
+    order = []
+    contenders = {name: lambda name=name: lambda: order.append(name) for name in "ab"}
+    found = race(contenders, rounds=2)
+    assert order == ["a", "b"] + (["a"] * 4 + ["b"] * 4) * 2
+    assert {name: len(rounds) for name, rounds in found.rounds.items()} == {"a": 2, "b": 2}
+
+
+def test_ratios_are_of_one_round():
+    raced = Race({"slow": [2.0, 40.0, 9.0], "fast": [1.0, 10.0, 3.0]})
+    assert raced.slower("slow", "fast") == (3.0, 2.0, 4.0)

@@ -1,4 +1,4 @@
-"""Paired differences, against scipy and against every resample that there is."""
+"""Recalls and their paired differences, against scipy and against every resample that there is."""
 
 import itertools
 
@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 from crisalad_jax.experiments.comparison import paired_difference
+from crisalad_jax.experiments.comparison.results import recall_of
 from crisalad_jax.utils.errors import InputError
 
 
@@ -111,5 +112,27 @@ def test_it_is_the_same_every_time():
 def test_other_queries_are_refused():
     with pytest.raises(InputError, match=r"found shapes \(1, 4\) and \(1, 5\), expected"):
         paired_difference(drawn(1, 4, 0.5, 0), drawn(1, 5, 0.5, 0))
-    with pytest.raises(InputError, match="found 1 and 2 seeds, expected the same number, or same"):
+    with pytest.raises(InputError, match=r"found shapes \(1, 4\) and \(2, 4\), .* same_seeds=F"):
         paired_difference(drawn(1, 4, 0.5, 0), drawn(2, 4, 0.5, 0))
+
+
+def test_recalls_of_ranks_by_hand():
+    """Two seeds, four queries: at 1 they hit 2 and 1, at 5 they hit 3 and 2."""
+    ranks = np.array([[1, 1, 3, 0], [1, 6, 5, 0]])
+    at_1, at_5 = recall_of(ranks, 1), recall_of(ranks, 5)
+    assert at_1.by_seed == (0.5, 0.25)
+    assert (at_1.mean, at_5.mean) == (0.375, 0.625)
+    # The sample deviation of two numbers is their distance over the square root of 2.
+    assert at_1.spread == pytest.approx(0.25 / np.sqrt(2), abs=1e-15)
+    assert recall_of(ranks[:1], 1).spread is None
+
+
+def test_the_interval_is_the_bootstraps():
+    """Against resampling itself; its ends lie on a grid of 1/24, and may be one step off."""
+    ranks = np.array([[1, 0, 2, 9, 1, 1, 0, 1], [1, 0, 1, 2, 0, 1, 3, 0], [2, 0, 0, 1, 1, 1, 1, 1]])
+    hits = (ranks == 1).mean(axis=0)
+    drawn = np.random.default_rng(0).integers(0, 8, (20_000, 8))
+    low, high = np.quantile(hits[drawn].mean(axis=1), (0.025, 0.975))
+    found = recall_of(ranks, 1).interval
+    assert found == pytest.approx((low, high), abs=1 / 24 + 1e-9)
+    assert found.low < found.high

@@ -1,0 +1,474 @@
+"""The results of a comparison: a file for each run, and their summary, a row for each method."""
+
+import dataclasses
+import pathlib
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from crisalad_jax.config.concise import brief
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
+from crisalad_jax.experiments.comparison.costs import NOTES, AdapterCost, Race
+from crisalad_jax.experiments.comparison.plan import (
+    Prepared,
+    Variant,
+    file_name,
+    short_names,
+)
+from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.training.run_files import checksum_of_benchmark
+from crisalad_jax.training.trainable import count_trainable
+from crisalad_jax.utils.errors import InputError, few
+from crisalad_jax.utils.files import read_json, write_json
+
+KS = (1, 5, 10)
+"""Values of K in the paper's tables."""
+RESAMPLES = 10_000
+"""Number of resamples: the ends of an interval then vary by about a hundredth of its width."""
+
+
+def read_result(path: pathlib.Path) -> dict[str, Any]:
+    """Read a file of results.
+
+    Raises:
+        InputError: it cannot be read, or was changed.
+    """
+    try:
+        return read_json(path, "a result of a comparison")
+    except InputError as error:
+        raise InputError(f"{error}; delete it, and the same command makes it again") from error
+
+
+class Evaluation(NamedTuple):
+    """One of the evaluations of a run."""
+
+    variant: Variant
+    benchmark: Benchmark
+    key: str
+    """Everything that its result depends on besides the run's model."""
+
+
+@dataclasses.dataclass
+class RunResult:
+    """All that a run has come to: `result.json` in its folder."""
+
+    settings: Mapping[str, Any]
+    """What decided its model, as `Variant.settings`."""
+    training: dict[str, Any] | None = None
+    """Steps and times of its training, once that is finished."""
+    ranks: dict[str, dict[str, list[int]]] = dataclasses.field(default_factory=dict)
+    """Evaluation -> grouping -> rank of each query's first right retrieval, from 1; 0 for none."""
+    seconds: float = 0.0
+    """How long training, without compiling, and all evaluations took."""
+
+    def write(self, folder: pathlib.Path) -> None:
+        """Write it into the run's folder, whole or not at all."""
+        write_json(folder / "result.json", dataclasses.asdict(self))
+
+
+class Run(NamedTuple):
+    """A model that is made once, by one process at a time, and evaluated for its variants."""
+
+    variants: list[Variant]
+    seed: int
+    folder: pathlib.Path
+    evaluations: list[Evaluation]
+
+    @property
+    def variant(self) -> Variant:
+        """The first of the variants that share its model."""
+        return self.variants[0]
+
+    def read(self) -> RunResult:
+        """Read its result, or begin one.
+
+        Raises:
+            InputError: the file was damaged, or the run was made with other settings.
+        """
+        path, settings = self.folder / "result.json", self.variant.settings
+        if not path.exists():
+            return RunResult(settings)
+        result = RunResult(**read_result(path))
+        changed = list(_changes(result.settings, settings))
+        if changed:
+            raise InputError(
+                f"{self.folder}: holds a run with other settings: {few(changed)}; give the same to "
+                "go on with it (methods, rows, seeds and sets may be added), or another folder"
+            )
+        return result
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is left to train or to evaluate."""
+        result = self.read()
+        trained = result.training is not None or not self.variant.trains
+        return trained and all(each.key in result.ranks for each in self.evaluations)
+
+
+def runs_of(prepared: Prepared, out: pathlib.Path) -> list[Run]:
+    """List the runs of a comparison: a seed each, and one of a model from a file."""
+    config = prepared.config
+    sharing: dict[str, list[Variant]] = {}
+    for variant in prepared.variants:
+        sharing.setdefault(variant.run, []).append(variant)
+    sets = [
+        (each, f"{each.name} {checksum_of_benchmark(each):08x}") for each in prepared.benchmarks
+    ]
+    how = f"{config.grouping}, batches of {config.batch_size}"
+    runs = []
+    for name, variants in sharing.items():
+        evaluations = [
+            Evaluation(variant, benchmark, f"{variant.rerank or 'one stage'}, {words}, {how}")
+            for variant in variants
+            for benchmark, words in sets
+        ]
+        for seed in range(1 if variants[0].weights is not None else config.seeds):
+            folder = out / file_name(name) / f"seed-{seed}"
+            runs.append(Run(variants, seed, folder, evaluations))
+    return runs
+
+
+def _changes(was: Any, now: Any, name: str = "") -> Iterator[str]:
+    """Yield in words where two trees of settings differ."""
+    if isinstance(was, Mapping) and isinstance(now, Mapping):
+        for key in {**was, **now}:
+            yield from _changes(was.get(key), now.get(key), f"{name}.{key}" if name else key)
+    elif was != now:
+        words = ("none" if each in (None, {}) else each for each in (was, now))
+        yield "{}: was {}, is {}".format(name, *words)
+
+
+class Difference(NamedTuple):
+    """A method's recall less the reference's, as fractions of the same queries."""
+
+    mean: float
+    """Difference of the means over the seeds."""
+    interval: Interval
+    """95 % interval of it over queries and seeds."""
+
+    verdict: Literal["better", "worse", "not told apart"]
+    """What the interval decides: "better" or "worse" where it excludes 0."""
+
+
+def paired_difference(
+    hits: Bool[np.ndarray, "seed q"],
+    reference: Bool[np.ndarray, "other_seed q"],
+    *,
+    same_seeds: bool = True,
+    resamples: int = RESAMPLES,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Difference:
+    """Compute the difference of two recalls, and its percentile bootstrap's interval.
+
+    A resample draws as many queries with replacement, the same ones for both methods, and as many
+    seeds. Runs of one seed share initial values and batches, so that the same seeds are drawn for
+    both methods; what a seed does to both cancels. Queries with the same hits are drawn together,
+    by a multinomial distribution, which is exact and takes no more time for more queries.
+
+    Args:
+        hits: whether each query was a hit, for each seed of the method.
+        reference: the same of the reference, on the same queries.
+        same_seeds: whether row i of both is a run of the same seed. If not, as for a model from a
+            file, the seeds of each method are drawn independently.
+        resamples: number of resamples.
+        confidence: of the interval, 0 to 1.
+        seed: of the resampling; the same one gives the same interval.
+
+    Returns:
+        The difference, positive where the method recalls more.
+
+    Raises:
+        InputError: no queries or seeds, other queries than the reference's, another number of seeds
+            although they are the same, or no such confidence.
+
+    Example:
+        >>> first, second = np.array([[True, True, True, False]]), np.array([[False] * 4])
+        >>> paired_difference(first, second).mean
+        0.75
+    """
+    fits = hits.size and hits.shape[1] == reference.shape[1] and 0 < confidence < 1
+    if not fits or (same_seeds and len(hits) != len(reference)):
+        raise InputError(
+            f"hits: found shapes {hits.shape} and {reference.shape}, expected (seeds, queries) of "
+            "the same queries, as many seeds unless same_seeds=False, and a confidence below 1"
+        )
+    generator = np.random.default_rng(seed)
+    queries = hits.shape[1]
+    patterns, counts = np.unique(np.concatenate([hits, reference]), axis=1, return_counts=True)
+    drawn = generator.multinomial(queries, counts / queries, size=resamples)
+    recalls = drawn @ patterns.T.astype(float) / queries
+    ours, theirs = recalls[:, : len(hits)], recalls[:, len(hits) :]
+    weights = _drawn_seeds(generator, resamples, len(hits))
+    other = weights if same_seeds else _drawn_seeds(generator, resamples, len(reference))
+    differences = (weights * ours).sum(axis=1) - (other * theirs).sum(axis=1)
+    tail = (1 - confidence) / 2
+    # Sums that are equal in exact arithmetic must not differ by their rounding.
+    low, high = np.quantile(differences.round(12), (tail, 1 - tail))
+    verdict = "better" if low > 0 else "worse" if high < 0 else "not told apart"
+    mean = float(hits.mean() - reference.mean())
+    return Difference(mean, Interval(float(low), float(high)), verdict)
+
+
+def _drawn_seeds(generator: np.random.Generator, resamples: int, seeds: int) -> np.ndarray:
+    """Draw seeds with replacement; return the share of each in each resample."""
+    return generator.multinomial(seeds, [1 / seeds] * seeds, size=resamples) / seeds
+
+
+class Recall(NamedTuple):
+    """Recall@K of a method on a set, as fractions."""
+
+    mean: float
+    """Mean over the seeds."""
+    spread: float | None
+    """Sample standard deviation over the seeds; None with a single one."""
+    interval: Interval
+    """95 % interval of the mean over the queries: see `metrics.bootstrap_interval`."""
+    by_seed: tuple[float, ...]
+    difference: Difference | None = None
+    """Difference to the reference; None of the reference itself."""
+
+
+class Spread(NamedTuple):
+    """What repeats of a measurement range over."""
+
+    median: float
+    least: float
+    most: float
+
+
+@brief
+class Row(NamedTuple):
+    """A line of the table: a method under one grouping."""
+
+    name: str
+    labels: tuple[str, ...]
+    grouping: str
+    dimension: int
+    recalls: Mapping[str, Mapping[int, Recall]]
+    """Recalls by set, then by K."""
+    speed: float
+    """Number of images described in the time that the reference takes for one."""
+    images_per_second: float | None
+    """Speed in images a second; None on a CPU, where it depends on other load."""
+    parameters: int
+    trained: int | None
+    """Number of parameters that were trained; None for a model from a file."""
+    training: Spread | None
+    """Training time over the reference's, of each of its runs to each of the reference's; None
+    where one of the two has fewer than two runs that had their device to themselves."""
+    training_seconds: Spread | None
+    """Steps times a step's median seconds, of those runs; None of fewer than two."""
+
+
+@brief
+class Summary(NamedTuple):
+    """Contents of the tables and the page."""
+
+    kind: str
+    headers: tuple[str, ...]
+    """Headers above the rows' labels."""
+    reference: str
+    """Label of the row that differences, speeds and training times are relative to."""
+    sets: Mapping[str, Benchmark]
+    rows: list[Row]
+    notes: list[str]
+    adapters: list[AdapterCost]
+    settings: Mapping[str, Any]
+
+
+def summarise(
+    prepared: Prepared,
+    out: pathlib.Path,
+    speed: Mapping[str, Any],
+    adapters: Sequence[AdapterCost] = (),
+) -> Summary:
+    """Read the results of all runs, and summarise them by row.
+
+    Args:
+        prepared: the comparison, whose runs are done.
+        out: its folder.
+        speed: the times of all models: "rounds", "batch_size", "device", and whether seconds are
+            "absolute".
+        adapters: Table 3, for an ablation.
+
+    Returns:
+        The summary.
+
+    Raises:
+        InputError: a result was changed since it was written.
+    """
+    config = prepared.config
+    sets = dict(zip(short_names(prepared.benchmarks), prepared.benchmarks, strict=True))
+    variants = {variant.name: variant for variant in prepared.variants}
+    reference = variants.get(config.reference or "crisalad", prepared.variants[0])
+    runs: dict[str, list[Run]] = {}
+    for run in runs_of(prepared, out):
+        runs.setdefault(run.variant.run, []).append(run)
+    rows = [
+        row for variant in prepared.variants for row in _rows(variant, reference, sets, runs, speed)
+    ]
+    notes = [*_notes(prepared, reference, speed), *(NOTES if adapters else ())]
+    return Summary(
+        config.kind,
+        ("method",) if config.kind == "compare" else ("row", "changed"),
+        reference.labels[0],
+        sets,
+        rows,
+        notes,
+        list(adapters),
+        to_plain(config),
+    )
+
+
+def _rows(
+    variant: Variant,
+    reference: Variant,
+    sets: Mapping[str, Benchmark],
+    runs: Mapping[str, Sequence[Run]],
+    speed: Mapping[str, Any],
+) -> Iterator[Row]:
+    """Yield a variant's row under each grouping."""
+    raced = Race(speed["rounds"])
+    batch = statistics.median(raced.rounds[variant.run])
+    ours, others = (_training_seconds(runs[each.run]) for each in (variant, reference))
+    theirs = _ranks(reference, sets, runs[reference.run])
+    for grouping, ranks in _ranks(variant, sets, runs[variant.run]).items():
+        # A grouping that the reference lacks is compared with its first.
+        other = theirs.get(grouping, next(iter(theirs.values())))
+        recalls = {
+            name: {
+                k: recall_of(ranks[name], k, None if variant is reference else other[name])
+                for k in KS
+            }
+            for name in sets
+        }
+        yield Row(
+            variant.name,
+            variant.labels,
+            grouping,
+            variant.model.descriptor_dim,
+            recalls,
+            1 / raced.slower(variant.run, reference.run)[0],
+            speed["batch_size"] / batch if speed["absolute"] else None,
+            *_parameters(variant),
+            # Runs are not interleaved: one of the same seed met no more of the same load.
+            _spread([each / other for each in ours for other in others]),
+            _spread(ours),
+        )
+
+
+def _ranks(
+    variant: Variant, sets: Mapping[str, Benchmark], runs: Sequence[Run]
+) -> dict[str, dict[str, np.ndarray]]:
+    """Collect a variant's (seed, query) ranks of first right retrievals, by grouping and set."""
+    ranks: dict[str, dict[str, list[list[int]]]] = {}
+    for run in runs:
+        result = run.read()
+        own = [each.key for each in run.evaluations if each.variant is variant]
+        for name, key in zip(sets, own, strict=True):
+            for grouping, of_seed in result.ranks[key].items():
+                ranks.setdefault(grouping, {}).setdefault(name, []).append(of_seed)
+    return {
+        grouping: {name: np.array(of_seeds) for name, of_seeds in of_sets.items()}
+        for grouping, of_sets in ranks.items()
+    }
+
+
+def recall_of(ranks: np.ndarray, k: int, reference: np.ndarray | None = None) -> Recall:
+    """Compute Recall@K of (seed, query) ranks of the first right retrieval, from 1; 0 is none.
+
+    All that is trained here has the same seeds; a model from a file has a single one.
+    """
+    hits = (ranks > 0) & (ranks <= k)
+    by_seed = tuple(hits.mean(axis=1).tolist())
+    difference = None
+    if reference is not None:
+        theirs = (reference > 0) & (reference <= k)
+        difference = paired_difference(hits, theirs, same_seeds=len(hits) == len(theirs))
+    return Recall(
+        statistics.fmean(by_seed),
+        statistics.stdev(by_seed) if len(by_seed) > 1 else None,
+        bootstrap_interval(hits.sum(axis=0), trials=len(hits)),
+        by_seed,
+        difference,
+    )
+
+
+def _training_seconds(runs: Sequence[Run]) -> list[float]:
+    """Return the seconds of the runs that had their device to themselves, if at least two had."""
+    records = [record for record in (run.read().training for run in runs) if record is not None]
+    alone = [each["steps"] * each["step_seconds"] for each in records if not each["beside"]]
+    return alone if len(alone) > 1 else []
+
+
+def _spread(values: Sequence[float]) -> Spread | None:
+    return Spread(statistics.median(values), min(values), max(values)) if values else None
+
+
+def _parameters(variant: Variant) -> tuple[int, int | None]:
+    """Count all parameters, and those that were trained."""
+    total = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(variant.model)))
+    if variant.weights is not None:
+        return total, None
+    if not variant.trains:
+        return total, 0
+    return total, count_trainable(variant.model, variant.training.trainable)
+
+
+def _notes(prepared: Prepared, reference: Variant, speed: Mapping[str, Any]) -> list[str]:
+    """Say how the numbers came about; docs/comparison.md says more."""
+    config, variants = prepared.config, prepared.variants
+    trained = [variant for variant in variants if variant.trains]
+    unlearnt = [v for v in variants if v.weights is None and not v.trains]
+    reranked = [variant for variant in variants if variant.rerank is not None]
+    over = "" if speed["absolute"] else f", over {reference.labels[0]}'s"
+    seeds = f"Seeds of all but models from files: {config.seeds}; weights after the last step."
+    notes = [
+        "Recalls in percent of all queries: the mean over the seeds ± their standard deviation, "
+        "and in brackets 95 % by bootstrap over the queries, as if they were independent. "
+        + (seeds if trained or unlearnt else "All models are from files."),
+        f"Images/s: describing batches of {speed['batch_size']}, each image alone, all models in "
+        f"turns, on {speed['device']}{over}." + (" Re-ranking comes on top." if reranked else ""),
+    ]
+    if len(variants) > 1:
+        notes.append(
+            f"Δ: recall less {reference.labels[0]}'s in points, with 95 % by a paired bootstrap "
+            f"over queries and seeds, {RESAMPLES:,} resamples. Better or worse: the interval "
+            "excludes 0."
+        )
+    if trained:
+        start = "nothing, by the recipe scratch" if config.from_nothing else "a given backbone"
+        sizes = {
+            variant.labels[0]: f"{variant.training.epochs} epochs, batches of "
+            f"{variant.training.places_per_batch} places x {variant.training.images_per_place}"
+            for variant in trained
+        }
+        same = len(set(sizes.values())) == 1
+        words = [sizes[trained[0].labels[0]]] if same else [f"{t}: {s}" for t, s in sizes.items()]
+        notes += [
+            f"Training time: steps x the median time of a step{over}, without compiling, of runs "
+            "that had their device to themselves, at least two: median and range.",
+            f"Trained from {start} on {pathlib.Path(config.train or '').name}. {'; '.join(words)}.",
+        ]
+    if config.grouping != "single":
+        notes.append(
+            f"A grouping other than single lets the {config.batch_size} images of a batch attend "
+            "to each other."
+        )
+    if reranked:
+        notes.append(f"Re-ranked, the first {config.rerank} retrievals: {_titles(reranked)}.")
+    if unlearnt:
+        start = ", here of random features" if config.from_nothing else ""
+        notes.append(f"Never trained, a vocabulary of features alone{start}: {_titles(unlearnt)}.")
+    return [*notes, *prepared.left_out]
+
+
+def _titles(variants: Sequence[Variant]) -> str:
+    return ", ".join(dict.fromkeys(variant.labels[0] for variant in variants))
