@@ -92,9 +92,14 @@ def test_an_error_of_a_process_ends_all_in_one_line(flags, capfd, tmp_path, plug
     assert [path.name for path in tmp_path.iterdir()] == ["small.py"]
 
 
-def children(pid: int) -> list[int]:
-    path = pathlib.Path(f"/proc/{pid}/task/{pid}/children")
-    return [int(word) for word in path.read_text().split()]
+def workers_of(pid: int) -> list[int]:
+    """Its processes, without multiprocessing's own that tracks resources."""
+    found = map(int, pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+    return [
+        each
+        for each in found
+        if b"spawn_main" in pathlib.Path(f"/proc/{each}/cmdline").read_bytes()
+    ]
 
 
 def is_alive(pid: int) -> bool:
@@ -122,7 +127,7 @@ def test_an_interruption_ends_all_and_the_same_command_goes_on(flags, tmp_path, 
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     metrics = [out / "crisalad" / f"seed-{seed}" / "run" / "metrics.jsonl" for seed in (0, 1)]
     wait_for(lambda: all(path.exists() and path.stat().st_size for path in metrics))
-    workers = children(process.pid)
+    workers = workers_of(process.pid)
     assert len(workers) == 2
     process.send_signal(how)
     assert process.wait(300) == (-how if how == signal.SIGKILL else 128 + how)
@@ -142,7 +147,7 @@ def test_a_killed_process_leaves_its_run_to_the_other(flags, tmp_path, plugin):
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     metrics = [out / "crisalad" / f"seed-{seed}" / "run" / "metrics.jsonl" for seed in (0, 1)]
     wait_for(lambda: all(path.exists() and path.stat().st_size for path in metrics))
-    os.kill(children(process.pid)[0], signal.SIGKILL)
+    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     _, errors = process.communicate(timeout=500)
     assert process.returncode == 0, errors
     assert "ended with code -9; the others go on" in errors
