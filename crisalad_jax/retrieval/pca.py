@@ -16,7 +16,6 @@ from crisalad_jax.config.checks import PATH, check_seed, check_types, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
-from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.shapes import Float, Float32, Float64
@@ -321,12 +320,7 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
     """
     path = pathlib.Path(path)
     expected = f"a file of principal components ({FORMAT!r}), as `crisalad pca` writes it"
-    with checked_safetensors(path, verify=verify):
-        return _load(path, expected)
-
-
-def _load(path: pathlib.Path, expected: str) -> Pca:
-    value, arrays = read_sealed(path, FORMAT, expected)
+    value, arrays = read_sealed(path, FORMAT, expected, verify=verify)
     if arrays.keys() != set(_ARRAYS):
         raise InputError(f"{path}: found arrays {sorted(arrays)[:3]}, expected {expected}")
     # In memory of its own: the file may be written anew while a map uses them.

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from crisalad_jax.checkpoints.torch_io import with_backbone_of
+from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_pixels

@@ -568,13 +568,13 @@ class Map:
         Raises:
             InputError: there is no such file, or it is of another model.
         """
-        from crisalad_jax.checkpoints.weights import load_with_hash
+        from crisalad_jax.checkpoints.weights import read_weights
 
         file = self._weights(weights)
-        params, _, digest = load_with_hash(file)
-        check_model(self.head, self.folder, digest, file)
-        self._checked = params
-        return params
+        found = read_weights(file)
+        check_model(self.head, self.folder, found.digest, file)
+        self._checked = found.params
+        return found.params
 
     def load_runtime(
         self,
