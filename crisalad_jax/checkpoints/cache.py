@@ -17,6 +17,7 @@ from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX
 from crisalad_jax.checkpoints.public import Checkpoint, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.nn.model import Model
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
@@ -195,7 +196,8 @@ def _convert(
         if address is not None:
             published.unlink()
         raise
-    save_weights(_weights(model), checkpoint.params, checkpoint.config, extras=checkpoint.extras)
+    converted = Model(checkpoint.params, checkpoint.config)
+    save_weights(_weights(model), converted, extras=checkpoint.extras)
     url = address or record.get("url")
     known = {"url": url, "file": model.file, "sha256": digest, "version": VERSION}
     write_json(_folder(model) / _RECORD, known)

@@ -42,7 +42,7 @@ from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target, is_html, parse_json
@@ -284,10 +284,10 @@ def convert(
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, init_crisalad, load, save_weights
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad, load, save_weights
         >>> config = PRESETS["tiny"]
         >>> params = init_crisalad(jax.random.key(0), config)
-        >>> save_weights(folder / "ours.safetensors", params, config)
+        >>> save_weights(folder / "ours.safetensors", Model(params, config))
         >>> done = convert(folder / "ours.safetensors", folder / "public.pth", "reference")
         >>> load(folder / "public.pth").config == config
         True
@@ -313,7 +313,7 @@ def convert(
             "this package, in full precision"
         )
     check_target(target, ".safetensors")
-    save_weights(target, params, config, extras=extras, half=half)
+    save_weights(target, Model(params, config), extras=extras, half=half)
     return Conversion(found, None, config)
 
 
@@ -338,10 +338,10 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, init_crisalad, save_weights
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad, save_weights
         >>> config = PRESETS["tiny"]
         >>> params = init_crisalad(jax.random.key(0), config)
-        >>> save_weights(folder / "model.safetensors", params, config)
+        >>> save_weights(folder / "model.safetensors", Model(params, config))
         >>> fresh = config.backbone.init(jax.random.key(1))
         >>> backbone = read_backbone(folder / "model.safetensors", config.backbone, fresh)
         >>> bool((backbone.cls_token == params.backbone.cls_token).all())

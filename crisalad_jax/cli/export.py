@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Literal
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
 from crisalad_jax.config.preprocessing import WORDS
 from crisalad_jax.utils.errors import InputError
@@ -80,14 +81,11 @@ def run(arguments: Export) -> None:
         format=arguments.format,
         pixels=arguments.pixels,
     )
-    params, config, _ = load_model(
-        arguments.weights,
-        image_size=arguments.image_size,
-        resize=arguments.resize,
-        compute_dtype=arguments.compute_dtype,
-    )
-    calibration = None if arguments.int8 is None else read_calibration(arguments.int8, config)
-    manifest = write_export(arguments.out, params, config, how, calibration=calibration)
+    model, _ = load_model(find_weights(arguments.weights), arguments)
+    calibration = None
+    if arguments.int8 is not None:
+        calibration = read_calibration(arguments.int8, model.config)
+    manifest = write_export(arguments.out, model, how, calibration=calibration)
     shapes = (
         f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"
         for name in ("images", "descriptors")
@@ -118,7 +116,7 @@ def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray
 
     from crisalad_jax.data.images import read_pixels
     from crisalad_jax.data.sources import open_source
-    from crisalad_jax.retrieval.photographs import prepare_image
+    from crisalad_jax.retrieval.describe import prepare_image
     from crisalad_jax.utils.errors import InputError
 
     if config.preprocessing.size_rule != "fixed":

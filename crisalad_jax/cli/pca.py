@@ -3,10 +3,11 @@
 import dataclasses
 import pathlib
 
-from crisalad_jax.checkpoints.load import Model, find_weights, load
+from crisalad_jax.checkpoints.load import find_weights, load
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.config.checks import require
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.files import check_target
@@ -80,7 +81,7 @@ def run(arguments: Pca) -> None:
         layer, projection = pca.projection()
         params = dataclasses.replace(model.params, projection=layer)
         config = dataclasses.replace(model.config, projection=projection)
-        save_weights(arguments.out, params, config)
+        save_weights(arguments.out, Model(params, config))
     fitted = min(arguments.samples, len(descriptors))
     say(
         f"{arguments.out}: {arguments.dim} of {descriptors.shape[1]} components, "

@@ -9,8 +9,7 @@ from typing import Any
 
 import uvicorn
 
-from crisalad_jax.config.checks import require
-from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.serve.access import Access, check_host, check_token
 from crisalad_jax.serve.app import MOST_ANSWERS, make_app
@@ -61,7 +60,7 @@ def serve_map(
     Raises:
         InputError: a number out of range; an address that is not this machine's or in use; one that
             others can reach without a token; no such folder; or what `Map.open`,
-            `Map.load_params` and `open_for_appending` raise.
+            `Map.load_model` and `open_for_appending` raise.
 
     Example:
         >>> serve_map("city.map", host="0.0.0.0")
@@ -69,7 +68,7 @@ def serve_map(
         ...
         crisalad_jax.utils.errors.InputError: host: found '0.0.0.0', which other machines ...
     """
-    check_grouping((), batch_size, seed=0)
+    check_count("batch size", batch_size)
     require(1 <= k <= MOST_ANSWERS, f"k: found {k}, expected 1 to {MOST_ANSWERS}")
     require(0 <= port < 2**16, f"port: found {port}, expected 0 to 65535")
     require(max_bytes >= 1, f"max_bytes: found {max_bytes}, expected at least 1")
@@ -83,7 +82,8 @@ def serve_map(
         stop = stack.enter_context(defer_signals())
         listener = stack.enter_context(contextlib.closing(_bound(host, port)))
         places = stack.enter_context(_opened(folder, append=append, verify=verify))
-        worker = MapWorker(places, places.load_params(weights), batch_size=batch_size)
+        places.load_model(weights)
+        worker = MapWorker(places, places.describer(), batch_size=batch_size)
         worker.compile(quiet=quiet)
         stop.check()
         stop.has_work = True
@@ -142,8 +142,8 @@ def _opened(folder: str | os.PathLike[str], *, append: bool, verify: bool) -> It
         if not append:
             yield places
             return
-        description, calibration = places.description, places.calibration
-    with open_for_appending(folder, description) as places:
+        metadata, calibration = places.metadata, places.calibration
+    with open_for_appending(folder, metadata) as places:
         places.calibration = calibration
         yield places
 

@@ -16,8 +16,8 @@ from crisalad_jax.data.images import decode_image, read_image
 from crisalad_jax.data.positions import AXES, Positions
 from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.data.video import file_of
+from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_similarity, position_fields
-from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.serve.names import check_new_name
 from crisalad_jax.serve.worker import ADDED, Addition, Found, MapWorker, Question
 from crisalad_jax.utils.errors import InputError
@@ -63,7 +63,7 @@ class MapService:
         return {
             "status": "ok",
             "images": len(places),
-            "model": places.description.model,
+            "model": places.metadata.model,
             "search": places.search_kind,
             "stale_search": places.stale_search,
             "uptime_s": round(time.monotonic() - self._since, 1),
@@ -165,7 +165,7 @@ class MapService:
 
     async def _prepared(self, data: bytes, name: str) -> Pixels:
         def prepare() -> Pixels:
-            config = self._worker.places.description.config
+            config = self._worker.places.config
             return prepare_image(decode_image(data, name), config, name)
 
         return await asyncio.get_running_loop().run_in_executor(self._threads, prepare)

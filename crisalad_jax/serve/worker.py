@@ -16,11 +16,10 @@ from jaxtyping import Float32
 
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.resize import Pixels
-from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.alone import describe_prepared
+from crisalad_jax.retrieval.describe import describe_prepared, prepare_image
+from crisalad_jax.retrieval.describer import Describer
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answer
-from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import durable_path, real_path
 from crisalad_jax.utils.progress import progress_bar
@@ -73,15 +72,15 @@ class _Waiting(NamedTuple):
 class MapWorker:
     """A thread that describes, appends and searches; a context manager that ends with its work."""
 
-    def __init__(self, places: Map, params: Crisalad, *, batch_size: int) -> None:
+    def __init__(self, places: Map, describer: Describer, *, batch_size: int) -> None:
         """Take the map, open for appending if pictures shall be added, and the model that made it.
 
         Args:
             places: the map, which the thread owns until the end.
-            params: its model.
+            describer: its model.
             batch_size: largest number of pictures described together.
         """
-        self.places, self._params, self._batch_size = places, params, batch_size
+        self.places, self._describer, self._batch_size = places, describer, batch_size
         # Each is a program to compile before the first answer, so that they are few.
         powers = (4**i for i in range(batch_size.bit_length()))
         self._sizes = [*(size for size in powers if size < batch_size), batch_size]
@@ -104,7 +103,7 @@ class MapWorker:
         Raises:
             InputError: the store is damaged or gone.
         """
-        config = self.places.description.config
+        config = self.places.config
         blank = prepare_image(np.zeros((*config.image_size, 3), np.uint8), config)
         with progress_bar("compiling", len(self._sizes), "programs", quiet=quiet) as bar:
             for size in self._sizes:
@@ -156,8 +155,7 @@ class MapWorker:
         if len({picture.shape for picture in pictures}) == 1:
             size = next(size for size in self._sizes if size >= count)
             padded += padded[:1] * (size - count)
-        config = self.places.description.config
-        described = describe_prepared(self._params, config, padded, batch_size=self._batch_size)
+        described = describe_prepared(self._describer, padded, self._batch_size)
         return self.places.shorten(described)[:count]
 
     def _append(self, batch: Sequence[_Waiting], descriptors: Float32[np.ndarray, "n d"]) -> None:

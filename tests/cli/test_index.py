@@ -16,12 +16,13 @@ from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.cli.info import _map_lines
 from crisalad_jax.data.images import list_images
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
-from crisalad_jax.retrieval.maps.manifest import describe_map
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.metadata import new_metadata
 from tests.cli.test_cli import fails, files_in, succeeds
-from tests.conftest import BATCH, MODEL, random_params
+from tests.conftest import BATCH, MODEL, describe_single, random_params
 from tests.retrieval.maps.test_stores import ROUNDING, brute_force
 from tests.retrieval.test_hloc_pairs import brute_force as nearest
 from tests.retrieval.test_hloc_pairs import by_name, pairs_as_hloc_reads_them
@@ -59,11 +60,8 @@ def folder(shared, database, tmp_path, capfd) -> pathlib.Path:
 
 def expected_answers(shared, database, queries, k: int) -> list[list[bytes]]:
     """Pictures, by descriptors of the library and brute force."""
-    params, config = load_weights(shared / "weights.safetensors")
-    sides = []
-    for paths in (list_images(database), list_images(queries)):
-        tokens = read_tokens(params, config, paths, batch_size=BATCH, label="", quiet=True)
-        sides.append(group(params, config, tokens, "single", batch_size=BATCH))
+    model = load_weights(shared / "weights.safetensors")
+    sides = [describe_single(model, list_images(side)) for side in (database, queries)]
     names = [path.name for path in list_images(database)]
     return pictures(database, [[names[i] for i in row] for row in brute_force(*sides, k)])
 
@@ -267,7 +265,7 @@ def test_a_map_of_another_model_is_refused(shared, folder, database, queries, tm
     )
     config = dataclasses.replace(MODEL, aggregator=salad)
     other = tmp_path / "other.safetensors"
-    save_weights(other, random_params(config), config)
+    save_weights(other, Model(random_params(config), config))
     before = files_in(folder)
     words = (f"{folder}: found a map made by model", "is model", other)
     made = ("index", "--weights", other, "--images", database, "--out", folder)
@@ -279,7 +277,7 @@ def test_a_map_of_another_model_is_refused(shared, folder, database, queries, tm
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--image-size", 56, 56), "found image size (56, 56), expected (42, 56) as in the map"),
+        (("--image-size", 56, 56), "found images at 56 x 56, bilinear"),
         (("--compute-dtype", "bfloat16"), "found compute dtype bfloat16, expected float32"),
         (("--dtype", "float16"), "found dtype float16, expected float32 as in the map"),
         (("--store", "milvus:x.db"), "expected files as in the map"),
@@ -330,14 +328,14 @@ def test_a_command_that_failed_binds_the_corrected_one_to_nothing(
     nowhere = ("--store", "milvus:http://127.0.0.1:9")
     fails(capfd, *index(shared, database, out, *nowhere), words=("Fail connecting",))
     assert not out.exists()
-    params, config = load_weights(shared / "weights.safetensors")
-    other = describe_map(params, config, tmp_path / "w", out, dtype="float16")
+    describer = describer_of(load_weights(shared / "weights.safetensors"))
+    other = new_metadata(describer, tmp_path / "w", out, dtype="float16")
     other = dataclasses.replace(other, model="0" * 64)
     with open_for_appending(out, other):
         pass
     succeeds(capfd, *index(shared, database, out, "--dtype", "float32"))
     with Map.open(out) as found:
-        assert (len(found), found.description.dtype) == (7, "float32")
+        assert (len(found), found.metadata.dtype) == (7, "float32")
 
 
 def test_positions_of_images_that_are_there_are_said_to_stay(
@@ -354,9 +352,7 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
     images.mkdir()
     (images / "new.png").write_bytes(known[0].read_bytes())
     table.write_text("name,lat,lon\nnew.png,1,2\n")
-    monkeypatch.setattr(
-        "crisalad_jax.retrieval.maps.build.describe_alone", None
-    )  # nothing is described
+    monkeypatch.setattr("crisalad_jax.retrieval.maps.build.described", None)
     made = index(shared, images, folder, "--positions", table)
     fails(
         capfd, *made, words=("degrees of longitude from the middle of zone 10 south, whose metres",)

@@ -154,7 +154,7 @@ def test_weights_by_name(capfd, tmp_path):
     assert np.load(tmp_path / "d.npy").shape == (1, 64)
     runs(capfd, "index", *given, *size, "--out", tmp_path / "map")
     with Map.open(tmp_path / "map") as places:
-        assert places.description.weights == str(weights)
+        assert places.metadata.weights == str(weights)
     out, _ = runs(capfd, "query", tmp_path / "images", "--map", tmp_path / "map", *given[:2])
     assert "a.png" in out
 

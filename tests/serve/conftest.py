@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import pytest
 import uvicorn
 
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.serve.access import Access
@@ -67,8 +69,9 @@ def serving(
     with contextlib.ExitStack() as stack:
         places = stack.enter_context(Map.open(folder))
         if appends:
-            places = stack.enter_context(open_for_appending(folder, places.description))
-        worker = stack.enter_context(MapWorker(places, params, batch_size=TOGETHER))
+            places = stack.enter_context(open_for_appending(folder, places.metadata))
+        describer = places.describer(Model(params, places.config))
+        worker = stack.enter_context(MapWorker(places, describer, batch_size=TOGETHER))
         service = MapService(worker, appends=appends, images=options.pop("images", None))
         stack.enter_context(contextlib.closing(service))
         app = make_app(service, Access(token), max_bytes=LIMIT, **options)
@@ -98,7 +101,13 @@ def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
 def folder(shared, params, sides, tmp_path_factory) -> pathlib.Path:
     out = tmp_path_factory.mktemp("serve") / "town.map"
     weights = shared / "weights.safetensors"
-    index(params, MODEL, sides[0], out, weights=weights, batch_size=BATCH, quiet=True)
+    index(
+        Model(params, MODEL),
+        sides[0],
+        out,
+        weights=weights,
+        reading=Reading(batch_size=BATCH, quiet=True),
+    )
     return out
 
 

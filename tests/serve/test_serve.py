@@ -22,6 +22,8 @@ import pytest
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.images import IMAGE_SUFFIXES, read_image
 from crisalad_jax.data.positions import Positions
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
@@ -29,7 +31,7 @@ from crisalad_jax.retrieval.maps.query import answer_fields, query
 from crisalad_jax.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
-from tests.conftest import BATCH, MODEL, write_video
+from tests.conftest import BATCH, MODEL, read_options, write_video
 from tests.data.test_sources import write_jpeg
 from tests.serve.conftest import LIMIT, serving
 
@@ -42,7 +44,13 @@ CLIENTS, EACH = 32, 3
 def expected(folder, params, pictures):
     """What `crisalad query --json` prints of each picture, by its name."""
     with Map.open(folder) as places:
-        answers = query(places, params, pictures, k=3, batch_size=BATCH, quiet=True)
+        answers = query(
+            places,
+            pictures,
+            model=Model(params, places.config),
+            k=3,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
     rows = [(path.name, [answer_fields(a, answers.axes) for a in r]) for path, r in answers.rows()]
     return dict(rows)
 
@@ -78,10 +86,16 @@ def test_many_clients_get_the_answers_of_query(service, pictures, expected):
 
 def test_a_map_of_the_model_in_the_package_is_served_by_it(sides, pictures, tmp_path):
     own, config = load("starter")
-    index(own, config, sides[0], tmp_path / "map", weights="starter", quiet=True)
+    index(
+        Model(own, config),
+        sides[0],
+        tmp_path / "map",
+        weights="starter",
+        reading=Reading(quiet=True),
+    )
     with Map.open(tmp_path / "map") as places:
-        params = places.load_params()
-        answers = query(places, params, sides[1], k=1, quiet=True)
+        params = places.load_model().params
+        answers = query(places, sides[1], k=1, reading=Reading(quiet=True))
     with serving(tmp_path / "map", params) as service:
         for path, ranked in answers.rows():
             reply = service.ask("POST", "/locate?k=1", path.read_bytes())
@@ -96,7 +110,7 @@ def test_a_calibrated_map_knows_what_it_does_not_know(own_map, params, pictures,
     # In the widest gap between two pictures: rounding does not decide.
     low, high = max(itertools.pairwise(ordered), key=lambda pair: pair[1] - pair[0])
     with Map.open(own_map) as places:
-        model = places.description.model
+        model = places.metadata.model
     write_calibration(own_map, Calibration((low + high) / 2, 0.9, 1, 1, 1, 0, 0, 7, "", "", model))
     with serving(own_map, params) as service:
         for path in pictures:
@@ -221,8 +235,8 @@ def test_a_picture_is_added_where_its_exif_data_says(shared, params, tmp_path, a
     cv2.imwrite(str(bare), np.full((50, 70, 3), 90, np.uint8))
     of = Positions(axes, {} if there is None else {"b.png": there})
     out, weights = tmp_path / "map", shared / "weights.safetensors"
-    more = {"weights": weights, "batch_size": BATCH, "quiet": True}
-    index(params, MODEL, bare, out, positions=None if there is None else of, **more)
+    more = {"weights": weights} | read_options({})
+    index(Model(params, MODEL), bare, out, positions=None if there is None else of, **more)
     data = picture.read_bytes()
     with serving(out, params, appends=True) as own:
         added = own.ask("POST", "/images?name=new.jpg", data).json
@@ -274,7 +288,7 @@ def test_health_and_interface(service, folder):
         assert (health["status"], health["images"], health["model"]) == (
             "ok",
             7,
-            places.description.model,
+            places.metadata.model,
         )
         described = service.ask("GET", "/map").json
         assert (described["axes"], described["zone"]) == (["east", "north"], "10 south")
@@ -304,7 +318,7 @@ def test_head_is_get_without_a_body(service, path):
 
 @pytest.mark.parametrize("appends", [False, True])
 def test_a_stale_search_is_told_at_the_start_and_by_health(own_map, params, pictures, appends):
-    with Map.open(own_map) as places, open_for_appending(own_map, places.description) as target:
+    with Map.open(own_map) as places, open_for_appending(own_map, places.metadata) as target:
         target.build_search("hnsw")
         first = target.descriptors
         row = next(iter(first))[:1]
@@ -361,7 +375,13 @@ def test_a_frame_of_a_video_is_shown_under_its_name(shared, params, tmp_path):
     video = write_video(tmp_path / "walk.avi", 13)
     weights = shared / "weights.safetensors"
     out = tmp_path / "walk.map"
-    index(params, MODEL, f"{video}#t=1.2", out, weights=weights, batch_size=BATCH, quiet=True)
+    index(
+        Model(params, MODEL),
+        f"{video}#t=1.2",
+        out,
+        weights=weights,
+        reading=Reading(batch_size=BATCH, quiet=True),
+    )
     with serving(out, params) as own:
         (found,) = own.ask(
             "POST", "/locate", cv2.imencode(".png", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
@@ -378,7 +398,13 @@ def test_a_thermal_picture_is_shown_with_contrast(shared, params, tmp_path):
     thermal, weights = tmp_path / "thermal.png", shared / "weights.safetensors"
     cv2.imwrite(str(thermal), np.tile(np.linspace(7200, 8900, 70).astype(np.uint16), (50, 1)))
     out = tmp_path / "map"
-    index(params, MODEL, thermal, out, weights=weights, batch_size=BATCH, quiet=True)
+    index(
+        Model(params, MODEL),
+        thermal,
+        out,
+        weights=weights,
+        reading=Reading(batch_size=BATCH, quiet=True),
+    )
     with serving(out, params, appends=True) as own:
         data = own.ask("GET", "/images/0").data
         # The first position of a map says of which zone all are.

@@ -150,14 +150,15 @@ class FileStore:
             ).reshape(some.shape)
         return similarities
 
-    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n d"]:
+    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
         """Read the descriptors of these numbers; their files stay mapped into memory.
 
         Raises:
             InputError: a file is damaged or gone.
         """
         firsts = np.array(list(self._counts))
-        rows = np.empty((len(numbers), self._length), np.float32)
+        wide = np.promote_types(self._dtype, np.float32)
+        rows = np.empty((len(numbers), self._length), wide)
         segments = np.searchsorted(firsts, numbers, side="right") - 1
         for segment in _distinct(segments):
             places, first = np.flatnonzero(segments == segment), int(firsts[segment])

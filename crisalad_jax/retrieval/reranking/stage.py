@@ -11,11 +11,12 @@ from typing import Any, Self
 import numpy as np
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.data.loader import ImageBatch, ImageCache
+from crisalad_jax.data.loader import ImageBatch
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, cast_params
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.retrieval.reranking import patch_netvlad, selavpr, transvpr
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
@@ -145,19 +146,14 @@ def rerank(
     neighbours: Neighbours,
     database: Sequence[pathlib.Path],
     queries: Sequence[pathlib.Path],
-    *,
-    batch_size: int = 16,
-    cache: ImageCache | None = None,
-    quiet: bool = False,
+    reading: Reading = Reading(),
 ) -> Neighbours:
     """Re-rank the neighbours of one first stage; see `Reranker`.
 
     Raises:
         InputError: what `Reranker` raises.
     """
-    with Reranker(
-        reranking, database, queries, batch_size=batch_size, cache=cache, quiet=quiet
-    ) as stage:
+    with Reranker(reranking, database, queries, reading) as stage:
         return stage(neighbours)
 
 
@@ -175,10 +171,7 @@ class Reranker:
         reranking: Reranking,
         database: Sequence[pathlib.Path],
         queries: Sequence[pathlib.Path],
-        *,
-        batch_size: int = 16,
-        cache: ImageCache | None = None,
-        quiet: bool = False,
+        reading: Reading = Reading(),
     ) -> None:
         """Prepare the second stage; enter it as a context before use.
 
@@ -190,7 +183,7 @@ class Reranker:
         reranking.check(reranking.config, len(database))
         self._top, self._config = reranking.top, reranking.config
         self._method = _METHODS[reranking.name]
-        self._label, self._quiet = reranking.name, quiet
+        self._label, self._quiet = reranking.name, reading.quiet
         self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
         self._scores: dict[tuple[int, int], float | list[float]] = {}
 
@@ -198,13 +191,15 @@ class Reranker:
             return self._method.describe(shared, devices.shard_batch(images), self._config)
 
         def read(paths: Sequence[pathlib.Path]) -> Iterator[ImageBatch]:
-            return photograph_batches(self._config, paths, batch_size=batch_size, cache=cache)
+            config = self._config
+            how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
+            return reading.batches(paths, how, config.check_image_size)
 
         def side(name: str, paths: Sequence[pathlib.Path]) -> _Features:
             file = pathlib.Path(self._folder.name) / name
             return _Features(paths, read, describe, self._method.shape(self._config), file)
 
-        devices = devices_for(batch_size)
+        devices = devices_for(reading.batch_size)
         shared = devices.replicate(cast_params(reranking.params, reranking.config))
         self._database, self._queries = side("database", database), side("queries", queries)
 

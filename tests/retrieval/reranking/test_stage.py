@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import (
@@ -98,8 +100,7 @@ def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark, mo
         first_stage,
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
+        Reading(batch_size=BATCH, quiet=True),
     )
     for query, row in enumerate(first_stage.indices):
         scores = dict(zip(row, method.fuse(parts[query, row[:top]], config), strict=False))
@@ -119,7 +120,11 @@ def test_an_image_is_most_like_itself(name: str, first_stage, benchmark) -> None
     last = np.array([np.roll(np.arange(7), -1 - i) for i in range(5)])
     neighbours = Neighbours(last, first_stage.similarities)
     found = rerank(
-        reranking(name, 7), neighbours, benchmark.database, own, batch_size=BATCH, quiet=True
+        reranking(name, 7),
+        neighbours,
+        benchmark.database,
+        own,
+        Reading(batch_size=BATCH, quiet=True),
     )
     np.testing.assert_array_equal(found.indices[:, 0], np.arange(5))
 
@@ -140,8 +145,7 @@ def test_equal_scores_keep_the_first_stages_order(
         first_stage,
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
+        Reading(batch_size=BATCH, quiet=True),
     )
     np.testing.assert_array_equal(found.indices, first_stage.indices)
     assert np.isfinite(found.similarities).all()
@@ -162,8 +166,7 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
         reranking("transvpr", 2),
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
+        Reading(batch_size=BATCH, quiet=True),
     ) as reranker:
         folder = reranker._folder.name
         found = reranker(two)
@@ -177,9 +180,11 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
 
 def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
     own = random_params(PLAIN)
-    plain = evaluate(own, PLAIN, benchmark, batch_size=BATCH, quiet=True)
+    plain = evaluate(Model(own, PLAIN), benchmark, reading=Reading(batch_size=BATCH, quiet=True))
     with_own = reranking("transvpr", 3)
-    both = evaluate(own, PLAIN, benchmark, batch_size=BATCH, rerank=with_own, quiet=True)
+    both = evaluate(
+        Model(own, PLAIN), benchmark, rerank=with_own, reading=Reading(batch_size=BATCH, quiet=True)
+    )
     assert [(r.grouping, r.rerank) for r in both] == [("any", None), ("any", "transvpr:3")]
     assert both[0].recalls == plain[0].recalls
     np.testing.assert_array_equal(both[0].neighbours.indices, plain[0].neighbours.indices)
@@ -188,8 +193,7 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
         plain[0].neighbours,
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
+        Reading(batch_size=BATCH, quiet=True),
     )
     np.testing.assert_array_equal(both[1].neighbours.indices, expected.indices)
     # Any order of the first three has as many right ones among them as they had.
@@ -201,7 +205,12 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
 def test_the_first_stages_model_serves_where_it_can(name: str, benchmark) -> None:
     own, config = model_of(name)
     results = [
-        evaluate(own, config, benchmark, batch_size=BATCH, rerank=given, quiet=True)[1]
+        evaluate(
+            Model(own, config),
+            benchmark,
+            rerank=given,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )[1]
         for given in (Reranking(name, 7), Reranking(name, 7, own, config))
     ]
     assert results[0].rerank == f"{name}:7"
@@ -251,7 +260,12 @@ def test_what_does_not_fit_is_found_before_any_work(
     monkeypatch.setattr("crisalad_jax.retrieval.describe.read_tokens", None)
     rerank = parse_reranking(given)
     with pytest.raises(InputError, match=words):
-        evaluate(random_params(config), config, benchmark, rerank=rerank, quiet=True)
+        evaluate(
+            Model(random_params(config), config),
+            benchmark,
+            rerank=rerank,
+            reading=Reading(quiet=True),
+        )
 
 
 def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark) -> None:
@@ -260,7 +274,7 @@ def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark
         rerank(Reranking("transvpr", 3), first_stage, *sides)
     few = Neighbours(*(part[:, :2] for part in first_stage))
     with pytest.raises(InputError, match="found 2 neighbours of 5 queries, expected at least 3"):
-        rerank(reranking("transvpr", 3), few, *sides, batch_size=BATCH, quiet=True)
+        rerank(reranking("transvpr", 3), few, *sides, Reading(batch_size=BATCH, quiet=True))
 
 
 def test_a_full_disk_is_one_line(first_stage, benchmark, monkeypatch) -> None:
@@ -268,5 +282,9 @@ def test_a_full_disk_is_one_line(first_stage, benchmark, monkeypatch) -> None:
     monkeypatch.setattr(stage.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(InputError, match=r"GiB free, expected .* for the local features of 5 im"):
         rerank(
-            reranking("transvpr", 3), first_stage, benchmark.database, benchmark.queries, quiet=True
+            reranking("transvpr", 3),
+            first_stage,
+            benchmark.database,
+            benchmark.queries,
+            Reading(quiet=True),
         )
