@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import read_safetensors, unseal, write_sealed
@@ -230,7 +229,7 @@ def _fill(
     problems = misfits(arrays, wanted) or not_finite(arrays)
     if problems:
         raise InputError(f"{path}: weights do not fit: {few(problems)}")
-    leaves = [jnp.asarray(arrays.pop(name)) for name in wanted]
+    leaves = jax.device_put([arrays.pop(name) for name in wanted])
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
