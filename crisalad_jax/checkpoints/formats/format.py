@@ -247,5 +247,7 @@ def infer_encoder(state: State) -> CrossImageConfig:
     """Infer the encoder's sizes; the number of heads is the published one."""
     read = Reader(state)
     layers = read.count("encoder.layers.")
-    feedforward = {"feedforward": read.size("encoder.layers.0.linear1.weight", 0)} if layers else {}
-    return CrossImageConfig(layers=layers, heads=_ENCODER_HEADS, **feedforward)
+    if not layers:
+        return CrossImageConfig(layers=0, heads=_ENCODER_HEADS)
+    feedforward = read.size("encoder.layers.0.linear1.weight", 0)
+    return CrossImageConfig(layers, _ENCODER_HEADS, feedforward)

@@ -1,5 +1,7 @@
 """How public checkpoints name the parameters of each aggregator."""
 
+from typing import Any
+
 import numpy as np
 
 from crisalad_jax.checkpoints.formats.format import Head, Reader
@@ -79,7 +81,7 @@ def _network_lines(prefix: str) -> Lines:
         yield from affine(f"aggregator.{name}.fc2", f"{prefix}{name}.{second}", form)
 
 
-def _network_sizes(read: Reader) -> dict[str, int]:
+def _network_sizes(read: Reader) -> dict[str, Any]:
     return {
         "clusters": read.size("score.3.weight", 0),
         "cluster_dim": read.size("cluster_features.3.weight", 0),
