@@ -32,7 +32,7 @@ from crisalad_jax.checkpoints.torch_io import (
     read_torch,
     write_torch,
 )
-from crisalad_jax.checkpoints.weights import FORMAT, check_layers, save_weights, unpack_weights
+from crisalad_jax.checkpoints.weights import FORMAT, check_sizes, save_weights, unpack_weights
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.fields import with_free_fields_of
@@ -117,7 +117,7 @@ def _model_of(content: Content, source: str) -> Checkpoint:
         value = parse_json(content.declared, f"{source} ({DECLARED})", "a configuration")
         declared = from_plain(_Declared, value, source=f"{source} ({DECLARED})")
         name, config = declared.format, declared.config
-        check_layers(config, len(state), source)
+        check_sizes(config, state.values(), source)
         state = renamed_to(state, public_shapes(config, name).keys())
     state = {key: _float32(key, array, source) for key, array in state.items()}
     params, extras = to_params(state, config, name, source=source)

@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -221,7 +221,7 @@ def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
 def _fill(
     config: ModelConfig, arrays: dict[str, np.ndarray], path: str | os.PathLike[str]
 ) -> Crisalad:
-    check_layers(config, len(arrays) + config.backbone.depth, str(path))  # blocks are stacked
+    check_sizes(config, arrays.values(), str(path))
     template = parameter_shapes(config)
     wanted = named_leaves(template)
     halves = {name: array for name, array in arrays.items() if array.dtype == np.float16}
@@ -233,25 +233,34 @@ def _fill(
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def check_layers(config: ModelConfig, arrays: int, source: str) -> None:
-    """Check that a configuration has no more layers than there are arrays.
+def check_sizes(config: ModelConfig, arrays: Collection[np.ndarray], source: str) -> None:
+    """Check that a configuration may be that of some arrays.
 
-    Before a template is made of it: a file may claim any number.
+    Before a template is made of it: a file may claim any sizes.
 
     Raises:
-        InputError: it has, naming `source`.
+        InputError: it has many more layers, or far larger ones, naming `source`.
     """
-    layers = _count_layers(to_plain(config))
-    if layers > arrays:
+    sizes = dict(_whole_numbers(to_plain(config)))
+    layers = sum(size for name, size in sizes.items() if name.endswith((".layers", ".depth")))
+    largest = max(sizes.values())
+    # Blocks of a backbone may be stacked.
+    if layers > len(arrays) + config.backbone.depth or largest > max(
+        2**20, sum(array.size for array in arrays)
+    ):
         raise InputError(
-            f"{source}: found {arrays} arrays, expected those of {layers} blocks and layers, as "
-            "its configuration says"
+            f"{source}: found {len(arrays)} arrays, far from the sizes that its configuration "
+            f"says: {layers} layers, and up to {largest}"
         )
 
 
-def _count_layers(plain: Mapping[str, Any]) -> int:
-    inner = sum(_count_layers(value) for value in plain.values() if isinstance(value, Mapping))
-    return inner + sum(plain[name] for name in ("layers", "depth") if name in plain)
+def _whole_numbers(plain: Any, name: str = "") -> Iterator[tuple[str, int]]:
+    """Yield all whole numbers of a configuration by their dotted names."""
+    if isinstance(plain, Mapping):
+        for key, value in plain.items():
+            yield from _whole_numbers(value, f"{name}.{key}")
+    elif type(plain) is int:
+        yield name, plain
 
 
 def model_hash(params: Crisalad, config: ModelConfig) -> str:

@@ -234,7 +234,10 @@ SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
         (lambda a: a.update({SCORE: a[SCORE].astype("f8")}), ["float64", "expected float32"]),
         (lambda a: a.update({DUST: np.float32(np.nan)[...]}), [f"{DUST} holds NaN or infinity"]),
         (lambda a: (a.pop(SCORE), a.pop(DUST)), [f"{SCORE} missing", f"{DUST} missing"]),
-        (lambda a: a.clear(), ["aggregator.cluster_features.fc1.bias missing; ", " more"]),
+        (
+            lambda a: [a.pop(name) for name in list(a) if name.startswith("aggregator.")],
+            ["aggregator.cluster_features.fc1.bias missing; ", " more"],
+        ),
     ],
 )
 def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
@@ -256,10 +259,10 @@ def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
         ({"parts": []}, r"found \[\], expected dict @ config.parts"),
         ({"version": None}, "version missing @ config"),
         ({"model_sha256": 7}, "found 7, expected str @ config.model_sha256"),
-        ({"config": {"cross_image": {"layers": 900}}}, "arrays, expected those of 9.. blocks"),
-        ({"config": {"cross_image": {"layers": 99999999999}}}, "expected those of 1000000000"),
-        ({"config": {"aggregator": {"name": "boq", "layers": 900}}}, "expected those of 9.. bl"),
-        ({"config": {"backbone": {"name": "vit", "dim": 9 * 10**12}}}, "weights do not fit: "),
+        ({"config": {"cross_image": {"layers": 900}}}, "far from the sizes"),
+        ({"config": {"cross_image": {"layers": 99999999999}}}, "up to 99999999999"),
+        ({"config": {"aggregator": {"name": "boq", "layers": 900}}}, "far from the sizes"),
+        ({"config": {"backbone": {"name": "vit", "dim": 9 * 10**12}}}, "up to 9000000000000"),
     ],
 )
 def test_foreign_metadata_with_a_right_checksum_are_refused(tmp_path, shared, value, words):
