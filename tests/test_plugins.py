@@ -1,7 +1,6 @@
 """Plug-ins from --plugin to the tables, and what is said of those that are wrong."""
 
 import dataclasses
-import importlib.machinery
 import json
 import pathlib
 import pickle
@@ -9,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-import types
 from typing import Any
 
 import jax
@@ -59,25 +57,6 @@ def test_an_installed_packages_entry_points_are_plugins(kind, tmp_path, monkeypa
     del sys.modules["installed_part"]
     plugins.load_entry_points()
     assert "first-patch" in REGISTRIES["aggregator"]
-
-
-def test_where_no_package_has_entry_points_importlib_metadata_is_not_asked(tmp_path, monkeypatch):
-    folder = tmp_path / "other-1.0.dist-info"
-    folder.mkdir()
-    (folder / "entry_points.txt").write_text("[console_scripts]\nother = other:main\n")
-    (tmp_path / "empty-1.0.dist-info").mkdir()
-    monkeypatch.setattr(sys, "meta_path", [importlib.machinery.PathFinder])
-    monkeypatch.setattr(sys, "path", [str(tmp_path), str(tmp_path / "none")])
-    assert not plugins._may_have_entry_points()
-    # What is not plain is left to it: archives, eggs, and finders that know packages elsewhere.
-    (tmp_path / "modules.zip").touch()
-    for more in ("modules.zip", "other.egg"):
-        monkeypatch.setattr(sys, "path", [str(tmp_path / more)])
-        assert plugins._may_have_entry_points()
-    monkeypatch.setattr(sys, "path", [])
-    finder = types.SimpleNamespace(find_distributions=lambda context: [])
-    monkeypatch.setattr(sys, "meta_path", [importlib.machinery.PathFinder, finder])
-    assert plugins._may_have_entry_points()
 
 
 # Bad input, in the library and through the command line

@@ -43,27 +43,16 @@ class Pca:
     """No progress bar."""
 
 
-def _model(arguments: Pca) -> Model:
-    """Load the model that the components become a part of.
-
-    Raises:
-        InputError: it has a projection already.
-    """
-    weights = find_weights(str(arguments.weights), quiet=arguments.quiet)
-    model = load(weights, verify=arguments.verify)
-    require(
-        not model.config.projection.dim,
-        f"{weights}: found a model with a projection to {model.config.projection.dim} numbers, "
-        "expected one without",
-    )
-    return model
-
-
 def run(arguments: Pca) -> None:
     """Fit components, write them, and print their share of the variance."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    model = None if arguments.weights is None else _model(arguments)
+    model = None
+    if arguments.weights is not None:
+        weights = find_weights(arguments.weights, quiet=arguments.quiet)
+        model = load(weights, verify=arguments.verify)
+        dim = model.config.projection.dim
+        require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
     descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
     pca = fit_pca(
         descriptors,

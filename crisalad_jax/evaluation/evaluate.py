@@ -19,7 +19,6 @@ from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summar
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.describer import Describer, Rows, describer_of
-from crisalad_jax.retrieval.euclidean import to_unit_vectors
 from crisalad_jax.retrieval.grouping import (
     DEFAULT_GROUPINGS,
     Grouping,
@@ -29,7 +28,7 @@ from crisalad_jax.retrieval.grouping import (
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
-from crisalad_jax.retrieval.search import search
+from crisalad_jax.retrieval.search import search, to_unit_vectors
 from crisalad_jax.utils.errors import InputError
 
 KS = (1, 5, 10, 20)

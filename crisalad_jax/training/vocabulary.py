@@ -33,7 +33,7 @@ from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target
+from crisalad_jax.utils.files import check_source, check_target
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.progress import progress_bar
 
@@ -172,7 +172,8 @@ def start_vocabulary(
     part = dataclasses.replace(part, **(fields or {}))
     config = dataclasses.replace(config, aggregator=part).resized(image_size, resize)
     if backbone is not None:
-        params = init_crisalad(jax.random.key(seed), config)
+        check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
+    params = init_crisalad(jax.random.key(seed), config)
     if backbone is not None:
         params = with_backbone_of(params, config, backbone)
     return params, config

@@ -14,7 +14,7 @@ import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.cli import main
-from crisalad_jax.cli.info import _map_lines
+from crisalad_jax.cli.tables import fact_lines
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describer import describer_of
@@ -194,13 +194,14 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
     day = json.loads((folder / "segments" / "0000000000.json").read_text())["added"][:10]
     root = (shared / "town" / "images" / "test" / "database").resolve()
     for words in (
-        "images 7, at 42 x 56, ",
-        "folders top folder: 7 images",
-        f"additions {day}: 7 images of {root}",
-        f"positions 7, east {east[0]:.9g} to {east[1]:.9g}, north {north[0]:.9g} to {north[1]:.9g}",
+        "images 7 positions 7 axes east, north",
+        "folders folder ., images 7",
+        f"additions day {day}, root {root}, images 7",
+        f"extent east {east[0]:.9g} to {east[1]:.9g}, north {north[0]:.9g} to {north[1]:.9g}",
+        "resize 42 x 56, ",
         "search exact",
-        f"model {shared / 'weights.safetensors'} (",
-        "verified no descriptor has changed",
+        f"weights {shared / 'weights.safetensors'}",
+        "verified yes",
     ):
         assert words in said
     assert "none" not in said
@@ -215,19 +216,22 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
     both = "info", "--map", folder, "--batch-size", 4
     fails(capfd, *both, words=("--batch-size: found beside --map",))
     fails(capfd, "info", "--map", folder, "--verify", words=("descriptors 0 to 6 have changed",))
-    # Of a large map with videos, of an older version.
-    days = ({"folder": str(day), "images": 2, "first": "1d", "last": "2d"} for day in range(11))
-    more = {"folders": [{"folder": "a.avi", "images": 1, "first": 0.5, "last": 12.25}, *days]}
-    more |= {"additions": [{"day": None, "root": "/r", "images": 23}], "extent": None}
-    lines = list(_map_lines(summary | more | {"stale_search": "faiss"}))
-    assert [line for name, line in lines if name in ("folders", "additions", "search")] == [
-        "a.avi: 1 image, 0.5 to 12.25 s",
-        *(f"{day}: 2 images, 1d to 2d" for day in range(9)),
-        "and 2 more",
-        "day unknown: 23 images of /r",
-        "exact; faiss lacks images",
+
+
+def test_a_long_fact_is_cut_after_ten_rows():
+    rows = [
+        {"folder": "a.avi", "images": 1200, "first": 0.5},
+        *({"folder": str(i)} for i in range(11)),
     ]
-    assert "positions" not in dict(lines)
+    lines = list(fact_lines({"map": None, "folders": rows, "axes": ("lat", "lon"), "ok": True}))
+    assert lines == [
+        "map      not said",
+        "folders  folder a.avi, images 1,200, first 0.5",
+        *(f"         folder {i}" for i in range(9)),
+        "         and 2 more",
+        "axes     lat, lon",
+        "ok       yes",
+    ]
 
 
 def test_positions_come_from_a_table(shared, database, tmp_path, capfd):

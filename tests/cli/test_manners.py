@@ -125,16 +125,11 @@ def test_a_flag_that_is_not_common_still_parses_and_stands_in_the_whole_help(cap
     assert "--model.aggregator.sinkhorn" not in succeeds(capfd, "train", *part, "--help-all")
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("One. Two.", ["One. Two (5)"]),
-        ("A first clause that is long enough; and one that does not fit", None),
-    ],
-)
-def test_a_text_is_cut_after_a_clause(text, expected):
-    lines = helping._fitted(text, " (5)", 44, 1)
-    assert lines == (expected or ["A first clause that is long enough (5)"])
+def test_a_text_is_cut_after_a_clause_and_keeps_its_default(capfd):
+    out = succeeds(capfd, "evaluate", "--help")
+    assert "or hog, a baseline that learns nothing" in " ".join(out.split())
+    assert "... (single,shuffled,sequential,window/single) --batch-size INT" in out
+    assert "--[no-]verify" in succeeds(capfd, "pca", "--help")
 
 
 # Completion

@@ -11,7 +11,6 @@ import pytest
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval import extract as extract_module
-from crisalad_jax.retrieval.chunks import is_mapped
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
@@ -197,7 +196,7 @@ def test_memory_does_not_grow_with_the_images(params, town, expected, tmp_path, 
     monkeypatch.setattr(Segments, "append", append)
     found = run(params, town, tmp_path / "d.npy")
     assert held == [BATCH] * (len(expected) // BATCH)
-    assert is_mapped(found.descriptors)
+    assert isinstance(found.descriptors, np.memmap)
     np.testing.assert_array_equal(found.descriptors, expected)
 
 

@@ -189,7 +189,7 @@ def test_a_vocabulary_of_another_backbone_is_refused(capfd, built, shared, tmp_p
     value, arrays = read_sealed(path, FORMAT, "weights")
     arrays["backbone.cls_token"] = arrays["backbone.cls_token"] + 1
     write_sealed(path, arrays, FORMAT, value)
-    start = extract(Model(shared, shared / "town"), tmp_path / "d.npy")
+    start = extract(shared, shared / "town", tmp_path / "d.npy")
     start = tuple(path if part == shared / "weights.safetensors" else part for part in start)
     fails(capfd, *start, words=(f"{path}: found a vocabulary of another backbone, expected one",))
 

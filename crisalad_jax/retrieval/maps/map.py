@@ -322,7 +322,6 @@ class Map:
             self._segments.spans,
             self._segments.store,
             self._segments.blocks,
-            self.metadata.descriptor_length,
             quiet=quiet,
         )
         return None if self._approximate is None else self._approximate.recall

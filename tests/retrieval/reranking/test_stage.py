@@ -1,7 +1,8 @@
 """The new order against scores of single pairs; each image is described once; bad input."""
 
 import dataclasses
-from collections.abc import Callable
+import pathlib
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -20,10 +21,9 @@ from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import (
     Reranker,
     Reranking,
+    matching,
     parse_reranking,
-    rerank,
     stage,
-    transvpr,
 )
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, random_params
@@ -55,6 +55,16 @@ def first_stage() -> Neighbours:
     indices = np.stack([rng.permutation(7) for _ in range(5)])
     similarities = -np.sort(-rng.random((5, 7)).astype(np.float32), axis=1)
     return Neighbours(indices, similarities)
+
+
+def rerank(
+    given: Reranking,
+    neighbours: Neighbours,
+    database: Sequence[pathlib.Path],
+    queries: Sequence[pathlib.Path],
+) -> Neighbours:
+    with Reranker(given, database, queries, Reading(batch_size=BATCH, quiet=True)) as second:
+        return second(neighbours)
 
 
 def reranking(name: str, top: int) -> Reranking:
@@ -100,7 +110,6 @@ def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark, mo
         first_stage,
         benchmark.database,
         benchmark.queries,
-        Reading(batch_size=BATCH, quiet=True),
     )
     for query, row in enumerate(first_stage.indices):
         scores = dict(zip(row, method.fuse(parts[query, row[:top]], config), strict=False))
@@ -119,13 +128,7 @@ def test_an_image_is_most_like_itself(name: str, first_stage, benchmark) -> None
     own = benchmark.database[:5]
     last = np.array([np.roll(np.arange(7), -1 - i) for i in range(5)])
     neighbours = Neighbours(last, first_stage.similarities)
-    found = rerank(
-        reranking(name, 7),
-        neighbours,
-        benchmark.database,
-        own,
-        Reading(batch_size=BATCH, quiet=True),
-    )
+    found = rerank(reranking(name, 7), neighbours, benchmark.database, own)
     np.testing.assert_array_equal(found.indices[:, 0], np.arange(5))
 
 
@@ -145,7 +148,6 @@ def test_equal_scores_keep_the_first_stages_order(
         first_stage,
         benchmark.database,
         benchmark.queries,
-        Reading(batch_size=BATCH, quiet=True),
     )
     np.testing.assert_array_equal(found.indices, first_stage.indices)
     assert np.isfinite(found.similarities).all()
@@ -153,7 +155,7 @@ def test_equal_scores_keep_the_first_stages_order(
 
 def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monkeypatch) -> None:
     described, scored = [], []
-    describe, score = transvpr.describe, transvpr.score
+    describe, score = matching.describe_transvpr, matching.count_inliers
     changed(
         monkeypatch,
         "transvpr",
@@ -175,7 +177,7 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
         again = reranker(two)
         assert (len(described), len(scored)) == (batches, 5)
     np.testing.assert_array_equal(found.indices, again.indices)
-    assert not stage.pathlib.Path(folder).exists()
+    assert not pathlib.Path(folder).exists()
 
 
 def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
@@ -193,7 +195,6 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
         plain[0].neighbours,
         benchmark.database,
         benchmark.queries,
-        Reading(batch_size=BATCH, quiet=True),
     )
     np.testing.assert_array_equal(both[1].neighbours.indices, expected.indices)
     # Any order of the first three has as many right ones among them as they had.
@@ -274,17 +275,11 @@ def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark
         rerank(Reranking("transvpr", 3), first_stage, *sides)
     few = Neighbours(*(part[:, :2] for part in first_stage))
     with pytest.raises(InputError, match="found 2 neighbours of 5 queries, expected at least 3"):
-        rerank(reranking("transvpr", 3), few, *sides, Reading(batch_size=BATCH, quiet=True))
+        rerank(reranking("transvpr", 3), few, *sides)
 
 
 def test_a_full_disk_is_one_line(first_stage, benchmark, monkeypatch) -> None:
     usage = stage.shutil.disk_usage("/")._replace(free=1000)
     monkeypatch.setattr(stage.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(InputError, match=r"GiB free, expected .* for the local features of 5 im"):
-        rerank(
-            reranking("transvpr", 3),
-            first_stage,
-            benchmark.database,
-            benchmark.queries,
-            Reading(quiet=True),
-        )
+        rerank(reranking("transvpr", 3), first_stage, benchmark.database, benchmark.queries)
