@@ -4,8 +4,8 @@ from crisalad_jax import sinkhorn as sinkhorn
 from crisalad_jax.checkpoints.export import ExportConfig as ExportConfig
 from crisalad_jax.checkpoints.export import write_export as write_export
 from crisalad_jax.checkpoints.load import load as load
-from crisalad_jax.checkpoints.torch_io import convert as convert
-from crisalad_jax.checkpoints.torch_io import read_backbone as read_backbone
+from crisalad_jax.checkpoints.public import convert as convert
+from crisalad_jax.checkpoints.public import read_backbone as read_backbone
 from crisalad_jax.checkpoints.weights import save_weights as save_weights
 from crisalad_jax.config.plugins import load_plugin as load_plugin
 from crisalad_jax.config.preprocessing import PreprocessingConfig as PreprocessingConfig

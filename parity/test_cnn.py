@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from crisalad_jax import describe
-from crisalad_jax.checkpoints.layouts import to_state
+from crisalad_jax.checkpoints.formats import to_state
 from crisalad_jax.nn.aggregators import Aggregator
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig

@@ -16,9 +16,9 @@ import torch
 from safetensors.numpy import load_file
 from transformers import DINOv3ViTConfig, DINOv3ViTModel
 
-from crisalad_jax.checkpoints.layouts import infer, to_params, to_state
+from crisalad_jax.checkpoints.formats import infer, to_params, to_state
+from crisalad_jax.checkpoints.public import convert, read_checkpoint, write_checkpoint
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
-from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint, write_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.backbones import FeatureRequest
@@ -85,11 +85,11 @@ def test_names_are_transformers_own(gated: bool, tmp_path: pathlib.Path) -> None
     path = saved(model, tmp_path)
     theirs = load_file(path)
     found = read_checkpoint(path)
-    assert found.layout == LAYOUT
+    assert found.format == LAYOUT
     assert found.config == expected_config(gated)
     write_checkpoint(tmp_path / "meta.pth", found.params, found.config, "dinov3", found.extras)
     other = read_checkpoint(tmp_path / "meta.pth")
-    assert (other.layout, other.config) == ("dinov3", found.config)
+    assert (other.format, other.config) == ("dinov3", found.config)
     for each in (found, other):
         state = to_state(each.params, each.config, LAYOUT, each.extras)
         assert state.keys() == theirs.keys()

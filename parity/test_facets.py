@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.checkpoints.layouts import to_state
-from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.checkpoints.formats import to_state
+from crisalad_jax.checkpoints.public import read_checkpoint
 from crisalad_jax.nn.backbones import FeatureRequest, Features
 from crisalad_jax.nn.backbones.vit import vit
 from crisalad_jax.nn.model import Crisalad

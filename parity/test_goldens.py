@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.layouts import to_params, to_state
-from crisalad_jax.checkpoints.layouts.base import head_lines
-from crisalad_jax.checkpoints.layouts.dinov2 import adapter_lines
-from crisalad_jax.checkpoints.layouts.encoder import encoder_lines
-from crisalad_jax.checkpoints.layouts.forms import Entry, Extra
+from crisalad_jax.checkpoints.formats import to_params, to_state
+from crisalad_jax.checkpoints.formats.format import encoder_lines
+from crisalad_jax.checkpoints.formats.forms import Entry, Extra
+from crisalad_jax.checkpoints.formats.heads import head_lines
+from crisalad_jax.checkpoints.formats.vit import adapter_lines
 from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
 from crisalad_jax.nn.aggregators.base import to_descriptor
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig

@@ -31,9 +31,9 @@ from transformers import (
     Dinov2WithRegistersModel,
 )
 
-from crisalad_jax.checkpoints.layouts import to_state
-from crisalad_jax.checkpoints.layouts.encoder import encoder_lines
-from crisalad_jax.checkpoints.torch_io import read_checkpoint, write_checkpoint
+from crisalad_jax.checkpoints.formats import to_state
+from crisalad_jax.checkpoints.formats.format import encoder_lines
+from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
@@ -186,7 +186,7 @@ def test_names_are_transformers_own(kind: Kind, tmp_path: pathlib.Path) -> None:
     path = saved(model, tmp_path)
     theirs = load_file(path)
     found = read_checkpoint(path)
-    assert found.layout == "huggingface"
+    assert found.format == "huggingface"
     assert found.config == expected_config(kind)
     state = to_state(found.params, found.config, "huggingface", found.extras)
     assert state.keys() == theirs.keys()

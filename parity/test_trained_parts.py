@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from crisalad_jax import describe
-from crisalad_jax.checkpoints.layouts import to_params, to_state
+from crisalad_jax.checkpoints.formats import to_params, to_state
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig

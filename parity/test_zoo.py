@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from crisalad_jax import describe
-from crisalad_jax.checkpoints.layouts import infer, to_params, to_state
-from crisalad_jax.checkpoints.layouts.anyloc import vocabulary_model
+from crisalad_jax.checkpoints.formats import infer, to_params, to_state
+from crisalad_jax.checkpoints.public import vocabulary_model
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc, nearest_words
 from crisalad_jax.nn.aggregators.edtformer import decode
 from crisalad_jax.nn.aggregators.selavpr import local_features
@@ -178,7 +178,7 @@ def test_anylocs_facets_are_the_public_codes(facet: str) -> None:
     golden = zoo.golden(zoo.ANYLOC)
     _, base = infer(state, source="backbone")
     backbone = to_params(state, base, "dinov2", source="backbone")[0].backbone
-    config = vocabulary_model(words, base, {"layer": 9, "facet": facet})
+    config = vocabulary_model(len(words), base, {"layer": 9, "facet": facet})
     backbone = jax.tree.map(jnp.asarray, backbone)
     params = Crisalad(backbone, AnyLoc(jnp.asarray(words)), None)
     suffix = "" if facet == "value" else f"_{facet}"

@@ -1,7 +1,7 @@
 """The cache of published models: each is downloaded once, checked, and kept as a weight file.
 
 A model has a folder in `user_cache() / "models"`, with the published file, the file of weights
-that was made of it, and a record of the published file's size and SHA-256 after its first download.
+that was made of it, and a record of the published file's SHA-256 after its first download.
 """
 
 import contextlib
@@ -9,15 +9,14 @@ import importlib.util
 import os
 import pathlib
 import urllib.parse
-from collections.abc import Mapping
 from typing import Any
 
 import jax
 
-from crisalad_jax.checkpoints.layouts import LAYOUTS
+from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX
+from crisalad_jax.checkpoints.public import Checkpoint, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
-from crisalad_jax.checkpoints.torch_io import Checkpoint, read_checkpoint, read_vocabulary
-from crisalad_jax.checkpoints.weights import CACHE_RECORD, save_weights
+from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.nn.model import Model
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
@@ -30,6 +29,8 @@ from crisalad_jax.utils.version import VERSION
 OFFLINE, MIRROR = "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
 """Variables of the environment: whether to use no network, and where to look for files by their
 names before their published addresses."""
+_RECORD = "record.json"
+"""File with the weights of a published model in the cache."""
 
 
 def is_offline() -> bool:
@@ -45,9 +46,9 @@ def is_cached(model: Published) -> bool:
 def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
     """Return a published model's weights in the cache; download and convert them the first time.
 
-    Of two processes one downloads, and the other waits for it. Each time the published file's size
-    and time of change are compared with the record, and its SHA-256 where these differ. The weights
-    have a checksum of their own, which `load_weights` checks.
+    Of two processes one downloads, and the other waits for it. The weights have a checksum of their
+    own, which `load_weights` checks. Another version of this package converts them again, and
+    compares the SHA-256 of the published file with that of the first download.
 
     Args:
         model: the published model.
@@ -62,8 +63,16 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
             has no address of its own; torch is needed and not installed; or the cache cannot be
             written to.
     """
-    if _is_ready(model):
-        return _weights(model)
+    try:
+        if not _is_ready(model):
+            _make(model, quiet=quiet)
+    except InputError as error:
+        raise InputError(f"{model.name}: {error}") from error
+    return _weights(model)
+
+
+def _make(model: Published, *, quiet: bool) -> None:
+    """Download a published model if need be, and convert it."""
     published = _folder(model) / model.file
     if not published.is_file():
         _check_obtainable(model)
@@ -74,7 +83,6 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
             if not published.is_file():
                 address = _download(model, published, quiet=quiet)
             _convert(model, published, address, quiet=quiet)
-    return _weights(model)
 
 
 def _folder(model: Published) -> pathlib.Path:
@@ -86,61 +94,30 @@ def _weights(model: Published) -> pathlib.Path:
 
 
 def _is_ready(model: Published) -> bool:
-    """Return whether the weights are here, of the published file that the record is of.
-
-    Raises:
-        InputError: the published file was changed.
-    """
-    record, published = _record(model), _folder(model) / model.file
-    if record is None or not _weights(model).is_file():
+    """Return whether the weights are here, and this version of the package made them."""
+    if not _weights(model).is_file():
         return False
-    if not published.is_file():  # removed for the room
-        return True
-    if not record.items() >= _stamp(published).items():  # as after a copy of the folder
-        _check_same(model, record, sha256_of(published))
-        with contextlib.suppress(InputError):  # where the cache is for reading alone
-            write_json(_folder(model) / CACHE_RECORD, record | _stamp(published))
-    return record["version"] == VERSION
+    # Without the published file, as removed for the room, they cannot be made again.
+    published = _folder(model) / model.file
+    return not published.is_file() or _record(model).get("version") == VERSION
 
 
-def _record(model: Published) -> dict[str, Any] | None:
-    """Read what is known of the published file; None before its first download."""
-    path = _folder(model) / CACHE_RECORD
-    if not path.exists():
-        return None
-    record = read_json(path, "the record of a download")
-    if {"sha256", "version"} - record.keys():
-        raise InputError(f"{path}: found no record of a download, expected one, or no such file")
-    return record
-
-
-def _stamp(path: pathlib.Path) -> dict[str, int]:
-    """Return a file's size in bytes and time of change in nanoseconds."""
-    status = path.stat()
-    return {"size": status.st_size, "changed_ns": status.st_mtime_ns}
-
-
-def _check_same(model: Published, record: Mapping[str, Any], digest: str) -> None:
-    """Check that a published file is the one that was downloaded first."""
-    if digest != record["sha256"]:
-        folder = _folder(model)
-        raise InputError(
-            f"{folder / model.file}: found SHA-256 {digest[:12]}..., expected "
-            f"{str(record['sha256'])[:12]}... as at the first download: the file was changed "
-            f"(without {folder} it is downloaded anew)"
-        )
+def _record(model: Published) -> dict[str, Any]:
+    """Read what is known of the published file; nothing before its first download."""
+    path = _folder(model) / _RECORD
+    return read_json(path, "the record of a download") if path.exists() else {}
 
 
 def _check_obtainable(model: Published) -> None:
     """Check that a file may be downloaded, before a folder is made for it."""
     if is_offline():
         raise InputError(
-            f"{model.name}: found none in the cache {user_cache()}, expected it there: {OFFLINE} "
-            "forbids the network"
+            f"found none in the cache {user_cache()}, expected it there: {OFFLINE} forbids the "
+            "network"
         )
     if not _addresses(model):
         raise InputError(
-            f"{model.name}: found no address of its own for {model.file}, expected it as "
+            f"found no address of its own for {model.file}, expected it as "
             f"{_folder(model) / model.file} (download it by hand from {model.repository}: "
             f"{model.note})"
         )
@@ -149,11 +126,10 @@ def _check_obtainable(model: Published) -> None:
 
 def _check_torch(model: Published) -> None:
     """Check that what reads the file is installed, before it is downloaded."""
-    is_torch = LAYOUTS[model.layout].stored == "torch"
-    if is_torch and importlib.util.find_spec("torch") is None:
+    needs_none = pathlib.Path(model.file).suffix in (MATLAB_SUFFIX, ".safetensors")
+    if not needs_none and importlib.util.find_spec("torch") is None:
         raise InputError(
-            f"{model.name}: found no torch, expected it to read {model.file}: pip install "
-            "'crisalad-jax[convert]'"
+            f"found no torch, expected it to read {model.file}: pip install 'crisalad-jax[convert]'"
         )
 
 
@@ -172,27 +148,17 @@ def _addresses(model: Published) -> list[str]:
 
 def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> str:
     """Download the published file, from the mirror if that has it; return its address."""
-    addresses = _addresses(model)
-    for address in addresses:
-        try:
+    *mirrors, last = _addresses(model)
+    for address in mirrors:
+        with contextlib.suppress(MissingFileError):
             download(address, target, label=model.name, quiet=quiet)
             return address
-        except MissingFileError as error:
-            if address == addresses[-1]:
-                raise InputError(
-                    f"{model.name}: {error}; it may have moved: {model.repository}"
-                ) from error
-            tell(f"{address}: found no such file; looking at {model.url}")
-        except InputError as error:
-            raise InputError(f"{model.name}: {error}") from error
-    raise AssertionError("no address")  # `_check_obtainable` has seen one
-
-
-def _read(model: Published, published: pathlib.Path, *, quiet: bool) -> Checkpoint:
-    """Read the published file; a vocabulary beside its backbone, which is in the cache too."""
-    if not model.backbone:
-        return read_checkpoint(published)
-    return read_vocabulary(published, cached_weights(PUBLISHED[model.backbone], quiet=quiet))
+        tell(f"{address}: found no such file; looking at {last}")
+    try:
+        download(last, target, label=model.name, quiet=quiet)
+    except MissingFileError as error:
+        raise InputError(f"{error}; it may have moved: {model.repository}") from error
+    return last
 
 
 def _convert(
@@ -212,26 +178,33 @@ def _convert(
     """
     record, digest = _record(model), sha256_of(published)
     try:
-        if record is not None:
-            _check_same(model, record, digest)
+        if digest != record.get("sha256", digest):
+            raise InputError(
+                f"{published}: found SHA-256 {digest[:12]}..., expected "
+                f"{record['sha256'][:12]}... as at the first download: the file was changed "
+                f"(without {published.parent} it is downloaded again)"
+            )
         checkpoint = _read(model, published, quiet=quiet)
         parameters = sum(leaf.size for leaf in jax.tree.leaves(checkpoint.params))
         found = checkpoint.config.descriptor_dim, parameters
         if found != (model.descriptor, model.parameters):
             raise InputError(
                 f"{published}: found descriptors of {found[0]} numbers and {found[1]} parameters "
-                f"({checkpoint.layout}), expected {model.descriptor} and {model.parameters}"
+                f"({checkpoint.format}), expected {model.descriptor} and {model.parameters}"
             )
-    except InputError as error:
+    except InputError:
         if address is not None:
             published.unlink()
-        raise InputError(f"{model.name}: {error}") from error
+        raise
     converted = Model(checkpoint.params, checkpoint.config)
     save_weights(_weights(model), converted, extras=checkpoint.extras)
-    known = {
-        "url": address or (record or {}).get("url"),
-        "file": model.file,
-        "sha256": digest,
-        "version": VERSION,
-    }
-    write_json(_folder(model) / CACHE_RECORD, known | _stamp(published))
+    url = address or record.get("url")
+    known = {"url": url, "file": model.file, "sha256": digest, "version": VERSION}
+    write_json(_folder(model) / _RECORD, known)
+
+
+def _read(model: Published, published: pathlib.Path, *, quiet: bool) -> Checkpoint:
+    """Read the published file; a vocabulary with its backbone, which is in the cache too."""
+    if not model.backbone:
+        return read_checkpoint(published)
+    return read_vocabulary(published, cached_weights(PUBLISHED[model.backbone], quiet=quiet))

@@ -20,11 +20,7 @@ import numpy as np
 from jax import export
 from jaxtyping import Array, Bool, Float
 
-from crisalad_jax.checkpoints.engines import (
-    EngineName,
-    convert_to_openvino,
-    load_program,
-)
+from crisalad_jax.checkpoints.engines import EngineName, convert_to_openvino, load_program
 from crisalad_jax.checkpoints.runtime import (
     ATTEND,
     DESCRIBE,
@@ -34,7 +30,7 @@ from crisalad_jax.checkpoints.runtime import (
     TOKENS,
 )
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
-from crisalad_jax.config.checks import PATH, check_types, choose, takes
+from crisalad_jax.config.checks import PATH, check_count, check_types, takes
 from crisalad_jax.config.concise import concise
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
@@ -61,15 +57,9 @@ from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
 PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
-FORMATS = {
-    "stablehlo": "a program of JAX's, for several platforms",
-    "onnx": "a program of ONNX",
-    "openvino": "a program of OpenVINO",
-}
+FORMATS = ("stablehlo", "onnx", "openvino")
 TOLERANCE = 1e-5
 """Largest difference of an exported program's descriptors from those of `describe`, of length 1."""
-PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-"""Platforms that `jax.export` knows."""
 GROUPINGS = {
     "single": "every image is described alone",
     "batch": "the images of a call look at each other",
@@ -105,7 +95,7 @@ class ExportConfig:
     """Number of images in a call; None takes any number, by a symbolic dimension."""
     weights_inside: bool = False
     """Whether the program holds the weights as constants; else it takes them as an argument."""
-    platforms: tuple[str, ...] = ("cpu", "cuda")
+    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu", "cuda")
     """Platforms of StableHLO; the other formats are for any that their engines run on."""
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
     """StableHLO, which JAX runs; ONNX, which most engines read; or OpenVINO's own."""
@@ -116,26 +106,20 @@ class ExportConfig:
     def __post_init__(self) -> None:
         """Check the values."""
         check_types(self)
-        choose("format", self.format, FORMATS)
         if self.grouping == "any" and self.format == "stablehlo":
             raise InputError(
                 "grouping: found any with format stablehlo, expected single or batch, or format "
                 "onnx or openvino"
             )
-        if self.pixels is not None:
-            choose("pixels", self.pixels, dict.fromkeys(("bytes", "floats")))
         if self.format == "openvino" and self.weights_inside:
             raise InputError(
-                "weights inside: found with format openvino, which has them in a file beside its "
+                "weights inside: found with format openvino, which has them in a file next to its "
                 "program, expected format onnx or stablehlo"
             )
-        choose("grouping", self.grouping, GROUPINGS)
-        if self.batch_size is not None and self.batch_size < 1:
-            raise InputError(f"batch size: found {self.batch_size}, expected at least 1")
+        if self.batch_size is not None:
+            check_count("batch size", self.batch_size)
         if not self.platforms:
-            raise InputError(f"platforms: found none, expected some of {', '.join(PLATFORMS)}")
-        for name in self.platforms:
-            choose("platforms", name, dict.fromkeys(PLATFORMS))
+            raise InputError("platforms: found none, expected some of cpu, cuda, rocm, tpu")
 
 
 def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -> None:
@@ -274,15 +258,24 @@ def write_export(
         )
     with atomic_folder(out) as folder:
         if how.format == "stablehlo":
-            manifest = _write_stablehlo(folder, params, config, how)
+            own = _write_stablehlo(folder, params, config, how)
         else:
-            manifest = _write_onnx(folder, params, config, how, os.fspath(out), calibration)
+            own = _write_onnx(folder, params, config, how, os.fspath(out), calibration)
         digest = model_hash(params, config)
         if calibration is not None:  # its descriptors are its own
-            manifest |= {"quantised_from": digest}
-            parts = (digest, *(manifest[name]["sha256"] for name in ("program", "weights")))
+            own |= {"quantised_from": digest}
+            parts = (digest, *(own[name]["sha256"] for name in ("program", "weights")))
             digest = hashlib.sha256("".join(parts).encode()).hexdigest()
-        manifest |= {
+        manifest = {
+            "format": FORMAT,
+            "program_format": how.format,
+            **own,
+            "images": _images(config, how),
+            "descriptors": {
+                "shape": [how.batch_size or "batch", config.descriptor_dim],
+                "dtype": "float32",
+                "norm": "unit length (L2)" if config.unit_length else "any length",
+            },
             "grouping": how.grouping,
             "grouping_means": GROUPINGS[how.grouping],
             "jax_version": jax.__version__,
@@ -312,21 +305,16 @@ def _write_stablehlo(
     """Write the files of `jax.export`, and return what the manifest says of them."""
     exported = export_model(params, config, how)
     (folder / PROGRAM).write_bytes(exported.serialize(vjp_order=0))
-    if not how.weights_inside:
-        save_weights(folder / WEIGHTS, Model(params, config))
-    images, (descriptors,) = exported.in_avals[-1], exported.out_avals
-    called = "images" if how.weights_inside else "weights, images"
     weights = None
     if not how.weights_inside:
+        save_weights(folder / WEIGHTS, Model(params, config))
         words = {"argument": "a dictionary of all arrays in the file by their names"}
         weights = _file(folder / WEIGHTS) | words
+    called = "images" if how.weights_inside else "weights, images"
     return {
-        "format": FORMAT,
-        "program_format": how.format,
         "call": f"jax.export.deserialize(program).call({called})",
         "program": _file(folder / PROGRAM),
         "weights": weights,
-        **_inputs_and_outputs(images, descriptors, config, how),
         "platforms": list(exported.platforms),
         "calling_convention_version": exported.calling_convention_version,
     }
@@ -349,14 +337,13 @@ def _write_onnx(
     parts = {DESCRIBE: (run, weights, {"images": images}, "descriptors")}
     if how.grouping == "any":
         parts = _halves(params, config, images)
-    descriptors = jax.ShapeDtypeStruct((images.shape[0], config.descriptor_dim), jnp.float32)
     suffixes = SUFFIXES[how.format]
     files: dict[str, Any] = {}
     for name, (function, arrays, inputs, output) in parts.items():
         path = folder / f"{name}.onnx"
+        words = f"{', '.join(inputs)} to {output}; {GROUPINGS[how.grouping]}"
+        beside = not how.weights_inside
         with number_types([config]), lowering_for(STRAIGHT):
-            words = f"{', '.join(inputs)} to {output}; {GROUPINGS[how.grouping]}"
-            beside = not how.weights_inside
             products = write_onnx(
                 path, function, arrays, inputs, output, words=words, beside=beside
             )
@@ -367,8 +354,8 @@ def _write_onnx(
             convert_to_openvino(path, path.with_suffix(".xml"))
             for suffix in SUFFIXES["onnx"]:
                 path.with_name(name + suffix).unlink()
-        lying = [_file(folder / f"{name}{suffix}") for suffix in suffixes[: 1 + beside]]
-        files[name] = {"program": lying[0], "weights": lying[1] if beside else None}
+        program, data = (folder / f"{name}{suffix}" for suffix in suffixes)
+        files[name] = {"program": _file(program), "weights": _file(data) if beside else None}
     engine: EngineName = "onnxruntime" if how.format == "onnx" else "openvino"
     difference = _difference(folder, engine, params, config, how)
     if calibration is None and not difference <= TOLERANCE:
@@ -378,12 +365,9 @@ def _write_onnx(
         )
     first, *others = files
     return {
-        "format": FORMAT,
-        "program_format": how.format,
         "call": _CALLS[how.format].format(first + suffixes[0]),
         **files[first],
         **{name: files[name] for name in others},
-        **_inputs_and_outputs(images, descriptors, config, how),
         "side_multiple": config.side_multiple,
         "opset": OPSET,
         "products": "float32" if calibration is None else "int8",
@@ -399,11 +383,10 @@ def _quantise(
         from crisalad_jax.checkpoints.onnx_format.quantise import quantise
     except ModuleNotFoundError as error:
         raise InputError(missing_extra(error, "int8")) from error
-    data = program.with_name(f"{program.name}.data")
     # It finds its weights by their name, so they keep it.
     whole = program.parent / "float32"
     whole.mkdir()
-    for each in (program, data):
+    for each in (program, program.with_name(f"{program.name}.data")):
         each.rename(whole / each.name)
     quantise(whole / program.name, program, calibration, products, per_channel=per_channel)
     shutil.rmtree(whole)
@@ -479,37 +462,24 @@ def _difference(
     return worst
 
 
-def _inputs_and_outputs(
-    images: Any, descriptors: Any, config: ModelConfig, how: ExportConfig
-) -> dict[str, Any]:
-    return {
-        "images": {"shape": _shape(images), "dtype": str(images.dtype), **_chain(config, how)},
-        "descriptors": {
-            "shape": _shape(descriptors),
-            "dtype": str(descriptors.dtype),
-            "norm": "unit length (L2)" if config.unit_length else "any length",
-        },
-    }
-
-
-def _chain(config: ModelConfig, how_exported: ExportConfig) -> dict[str, Any]:
-    """Tell how images are prepared for the program, which has one size, whatever the rule."""
-    how = config.preprocessing
-    values: dict[str, Any] = {
+def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
+    """Say how images are prepared for the program, which has one size, whatever the rule."""
+    chain, size = config.preprocessing, config.input_size
+    fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
+    words = fixed.in_words(size)
+    if words == PreprocessingConfig().in_words(size):
+        words = "Pillow's BILINEAR to (height, width)"
+    values = {
+        "shape": [how.batch_size or "batch", *size, 3],
+        "dtype": "uint8",
         "layout": "RGB, rows from the top, not normalised",
-        "resize": "Pillow's BILINEAR to (height, width), aspect ratio not kept",
+        "resize": f"{words}, aspect ratio not kept",
     }
-    fixed = dataclasses.replace(how, size_rule="fixed", round_to_patch=False)
-    if fixed.in_words(config.input_size) != PreprocessingConfig().in_words(config.input_size):
-        values["resize"] = f"{fixed.in_words(config.input_size)}, aspect ratio not kept"
-    if not _takes_bytes(config, how_exported):
+    if not _takes_bytes(config, how):
+        values["dtype"] = "float32"
         values["layout"] = "RGB, rows from the top, (pixels / 255 - mean) / deviation"
-        values |= {"mean": list(how.mean), "deviation": list(how.deviation)}
+        values |= {"mean": list(chain.mean), "deviation": list(chain.deviation)}
     return values
-
-
-def _shape(array: Any) -> list[int | str]:
-    return [size if isinstance(size, int) else str(size) for size in array.shape]
 
 
 def _file(path: pathlib.Path) -> dict[str, Any]:

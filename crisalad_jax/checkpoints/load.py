@@ -20,7 +20,7 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> "Model":
 
     Args:
         path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
-            DINO-SALAD, CricaVPR or another layout in `docs/methods.md`; torch files need torch. Or
+            DINO-SALAD, CricaVPR or another format in `docs/methods.md`; torch files need torch. Or
             the name of a published model, as `crisalad models` lists them: it is downloaded once
             into the cache. Or "starter", the small model in this package, or "hog", a baseline.
         verify: whether to check the bytes of a file of this package against its checksum.
@@ -40,8 +40,8 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> "Model":
         >>> load(folder / "weights.safetensors").config == config
         True
     """
-    # Imported here: the layouts of public checkpoints take a tenth of a second, and few need them.
-    from crisalad_jax.checkpoints.torch_io import read_checkpoint
+    # Imported here: the formats of public checkpoints take a tenth of a second, and few need them.
+    from crisalad_jax.checkpoints.public import read_checkpoint
     from crisalad_jax.nn.model import Model
 
     checkpoint = read_checkpoint(find_weights(path), verify=verify)
@@ -77,19 +77,18 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
         return starter.default_weights()
     path = pathlib.Path(weights)
     name = os.fspath(weights)
-    is_there = os.path.isfile(path)
-    if is_there and path.suffix:
+    if path.suffix and os.path.isfile(path):
         return path
-    if name in starter.FILES and not is_there:
-        return starter.FILES[name]
-    # Imported here: the published models, whose names have no suffix, need JAX.
+    # Imported here: a file needs no table of published models.
     from crisalad_jax.checkpoints.published import PUBLISHED, nearest_names
 
     model = PUBLISHED.get(name)
-    if is_there:
+    if os.path.isfile(path):
         if model is not None or name in starter.FILES:
             tell(f"{name}: found a file of this name here, and took that, not the model so named")
         return path
+    if name in starter.FILES:
+        return starter.FILES[name]
     if model is not None:
         from crisalad_jax.checkpoints.cache import cached_weights
 

@@ -40,14 +40,14 @@ class Published:
 
     name: str
     """Name for `--weights` and `load`, of small letters, digits and hyphens."""
-    layout: str
-    """Layout of the file."""
+    format: str
+    """Format of the file."""
     descriptor: int
     """Numbers in a descriptor."""
     parameters: int
     """Number of parameters, as `crisalad info` counts them."""
     images: str
-    """How images are resized, in words: those of the configuration of its layout."""
+    """How images are resized, in words: those of the configuration of its format."""
     licence: Licence
     repository: str
     """Address of the page that publishes the file."""
@@ -88,7 +88,7 @@ def published_model(name: str) -> Published:
         InputError: there is no such model; the message has the nearest names.
 
     Example:
-        >>> published_model("megaloc").layout
+        >>> published_model("megaloc").format
         'megaloc'
     """
     if name not in PUBLISHED:
@@ -101,22 +101,23 @@ def published_model(name: str) -> Published:
 
 def nearest_names(name: str) -> str:
     """Return the published names most like this one, as the end of a message."""
-    plain = re.sub(r"[^a-z0-9]+", "-", name.lower())
+    plain = _plain(name)
     near = [plain] if plain in PUBLISHED else []
     # No published one, but --weights takes its name, too.
     near += difflib.get_close_matches(plain, starter.FILES, n=1, cutoff=0.75)
     # Of a family that is named alone the longest descriptors, which recall the most.
-    near += sorted(
-        (each for each in PUBLISHED if each.startswith(f"{plain}-")),
-        key=lambda each: -PUBLISHED[each].descriptor,
-    )
+    family = [each for each in PUBLISHED if each.startswith(f"{plain}-")]
+    near += sorted(family, key=lambda each: -PUBLISHED[each].descriptor)
     near += difflib.get_close_matches(plain, PUBLISHED, n=3, cutoff=0.6)
     # The first part of a name is its family, which is what a user is most likely to know.
-    family = plain.partition("-")[0]
-    near += [each for each in PUBLISHED if each.startswith(family)]
+    near += [each for each in PUBLISHED if each.startswith(plain.partition("-")[0])]
     for model in PUBLISHED.values():
-        known = re.sub(r"[^a-z0-9]+", "-", f"{model.name} {model.file} {model.repository}".lower())
+        known = _plain(f"{model.name} {model.file} {model.repository}")
         if plain in known or plain.replace("-", "") in known:
             near.append(model.name)
     near = list(dict.fromkeys(near))[:3]
     return f"; nearest: {', '.join(near)}" if near else ""
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", name.lower())

@@ -1,28 +1,34 @@
-"""Read and write safetensors files: arrays by name, and one object of JSON with a checksum."""
+"""Read and write safetensors files: arrays by name, and one object of JSON with a checksum.
 
+The checksum is the SHA-256 of the object and of every array's name, type, shape and bytes.
+"""
+
+import hashlib
 import json
-import mmap
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors
 import safetensors.numpy
 
-from crisalad_jax.utils.checksums import CHECKSUM, seal_safetensors, with_blank
+from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_source, parse_json
+from crisalad_jax.utils.files import atomic_path, check_source, is_html, parse_json
+
+_OTHERS = {b"PK\3\4": "a torch file", b"\x80\2": "a torch file", b"MATLAB": "a MATLAB file"}
+"""What files of other kinds begin with; torch's are archives, older ones pickles."""
 
 
 class Contents(NamedTuple):
     """What a file holds."""
 
     value: Any
-    """The object beside the arrays, without its checksum."""
+    """The object next to the arrays, without its checksum."""
     arrays: dict[str, np.ndarray]
-    """Read-only views of the file, by name: what writes into the file would change them."""
 
 
 def write_safetensors(
@@ -33,8 +39,15 @@ def write_safetensors(
     Raises:
         InputError: the file cannot be written.
     """
+    # The library writes the memory as it lies, whatever the order of the axes.
+    arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     with atomic_path(path) as temporary:
-        _write(pathlib.Path(path), temporary, arrays, metadata)
+        try:
+            safetensors.numpy.save_file(arrays, temporary, metadata=dict(metadata))
+        except safetensors.SafetensorError as error:  # a full disk too
+            raise InputError(f"{path}: cannot be written: {error}") from error
+        # The library creates files that only their owner can read: widen their mode.
+        temporary.chmod(0o644)
 
 
 def write_sealed(
@@ -43,7 +56,7 @@ def write_sealed(
     form: str,
     value: Mapping[str, Any],
 ) -> None:
-    """Write arrays and an object with the file's checksum, whole or not at all.
+    """Write arrays and an object with the checksum of both, whole or not at all.
 
     Args:
         path: the file.
@@ -55,89 +68,93 @@ def write_sealed(
     Raises:
         InputError: the file cannot be written.
     """
-    metadata = {form: json.dumps(with_blank(value))}
-    with atomic_path(path) as temporary:
-        _write(pathlib.Path(path), temporary, arrays, metadata)
-        seal_safetensors(temporary)
+    sealed = {CHECKSUM: _checksum(value, arrays), **value}
+    write_safetensors(path, arrays, {form: json.dumps(sealed)})
 
 
-def _write(
-    path: pathlib.Path,
-    temporary: pathlib.Path,
-    arrays: Mapping[str, np.ndarray],
-    metadata: Mapping[str, str],
-) -> None:
-    # The library writes the memory as it lies, whatever the order of the axes.
-    arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+def _checksum(value: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+    names = sorted(arrays)
+    contiguous = [np.asarray(arrays[name], order="C") for name in names]
+    digest = hashlib.sha256(json.dumps(value).encode())
+    with ThreadPoolExecutor() as pool:
+        parts = pool.map(lambda array: hashlib.sha256(array.data).digest(), contiguous)
+        for name, array, part in zip(names, contiguous, parts, strict=True):
+            digest.update(f"{name} {array.dtype} {array.shape}".encode() + part)
+    return digest.hexdigest()
+
+
+def read_safetensors(
+    path: str | os.PathLike[str], expected: str
+) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Read the metadata and the arrays of any safetensors file.
+
+    Args:
+        path: the file.
+        expected: what kind of file, for messages.
+
+    Raises:
+        InputError: the file is missing, not whole, of another kind, or has a type that NumPy lacks.
+    """
+    check_source(path, expected)
     try:
-        safetensors.numpy.save_file(arrays, temporary, metadata=dict(metadata))
-    except safetensors.SafetensorError as error:  # a full disk too
-        raise InputError(f"{path}: cannot be written: {error}") from error
-    # The library creates files that only their owner can read: widen their mode.
-    temporary.chmod(0o644)
+        with safetensors.safe_open(path, framework="numpy") as file:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return file.metadata() or {}, arrays
+    except AttributeError as error:  # safetensors' error for a type that numpy lacks
+        raise InputError(f"{path}: found a type that numpy does not know: {error}") from error
+    except (safetensors.SafetensorError, OSError) as error:
+        found = _other_kind(pathlib.Path(path))
+        problem = f"found {found}" if found else f"not a whole safetensors file ({error})"
+        raise InputError(f"{path}: {problem}, expected {expected}") from error
 
 
-def read_sealed(path: pathlib.Path, form: str, expected: str, *, but: str = "\0") -> Contents:
-    """Read a file that `write_sealed` wrote; `checksums.checked_safetensors` checks its bytes.
+def _other_kind(path: pathlib.Path) -> str | None:
+    """Return what a file is that is plainly not of safetensors."""
+    with path.open("rb") as file:
+        start = file.read(512)
+    if is_html(start):
+        return "a page of HTML"
+    return next((kind for mark, kind in _OTHERS.items() if start.startswith(mark)), None)
+
+
+def read_sealed(
+    path: str | os.PathLike[str], form: str, expected: str, *, verify: bool = True
+) -> Contents:
+    """Read a file that `write_sealed` wrote.
 
     Args:
         path: the file.
         form: its format.
         expected: what kind of file, for messages.
-        but: beginning of the names of arrays that are not read.
+        verify: whether to check that its contents are those that were written.
 
     Raises:
-        InputError: the file is missing, not whole, of another format, or lacks its checksum.
+        InputError: the file is missing, not whole, changed or of another format.
     """
-    check_source(path, expected)
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            if form not in metadata:
-                raise InputError(f"{path}: found metadata {sorted(metadata)}, expected {expected}")
-            names = [name for name in file.keys() if not name.startswith(but)]  # noqa: SIM118
-        arrays = _views(path, names)
-    except (safetensors.SafetensorError, OSError) as error:
-        raise InputError(
-            f"{path}: not a whole safetensors file ({error}), expected {expected}"
-        ) from error
+    metadata, arrays = read_safetensors(path, expected)
+    return unseal(path, metadata, arrays, form, expected, verify=verify)
+
+
+def unseal(
+    path: str | os.PathLike[str],
+    metadata: Mapping[str, str],
+    arrays: dict[str, np.ndarray],
+    form: str,
+    expected: str,
+    *,
+    verify: bool = True,
+) -> Contents:
+    """Check what `read_safetensors` read; see `read_sealed`.
+
+    Raises:
+        InputError: it is of another format, or changed.
+    """
+    if form not in metadata:
+        raise InputError(f"{path}: found metadata {sorted(metadata)}, expected {expected}")
     value = parse_json(metadata[form], f"{path} (metadata)", expected)
     if not isinstance(value, dict) or CHECKSUM not in value:
         raise InputError(f"{path} (metadata): found no {CHECKSUM}, expected one in {form!r}")
-    del value[CHECKSUM]
+    checksum = value.pop(CHECKSUM)
+    if verify and checksum != _checksum(value, arrays):
+        raise ChangedFileError(path)
     return Contents(value, arrays)
-
-
-_TYPES = {
-    "BOOL": "?",
-    "U8": "u1",
-    "I8": "i1",
-    "U16": "<u2",
-    "I16": "<i2",
-    "F16": "<f2",
-    "U32": "<u4",
-    "I32": "<i4",
-    "F32": "<f4",
-    "U64": "<u8",
-    "I64": "<i8",
-    "F64": "<f8",
-}
-"""numpy's types by the format's names, without those that numpy lacks."""
-
-
-def _views(path: pathlib.Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Map arrays of a file that `safetensors` found whole into memory: nothing is copied."""
-    with path.open("rb") as file:
-        count = int.from_bytes(file.read(8), "little")
-        header = json.loads(file.read(count))
-        data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))[8 + count :]
-    arrays = {}
-    for name in names:
-        entry = header[name]
-        start, end = entry["data_offsets"]
-        if entry["dtype"] not in _TYPES:
-            known = ", ".join(_TYPES)
-            raise InputError(f"{path}: found {name} of {entry['dtype']}, expected one of {known}")
-        values = np.frombuffer(data[start:end], _TYPES[entry["dtype"]])
-        arrays[name] = values.reshape(entry["shape"])
-    return arrays

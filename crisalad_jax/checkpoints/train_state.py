@@ -20,8 +20,9 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
+from crisalad_jax.nn.misfits import misfits
 from crisalad_jax.utils.checksums import sha256_of
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import read_json, write_json
 from crisalad_jax.utils.pytree import named_leaves
 
@@ -132,11 +133,12 @@ class StateStore:
             # Check before orbax reads any array: it reads all at once, and raises for a misfit in
             # another thread.
             self._check_seal(step)
-            stored = self._manager.item_metadata(step)["state"].tree
-            _check_arrays(arrays, stored)
+            problems = misfits(self._manager.item_metadata(step)["state"].tree, arrays)
+            if problems:
+                raise ValueError(few(problems))
         except (OSError, ValueError) as error:
             older = [other for other in self._manager.all_steps() if other != step]
-            advice = f"; delete it to go on from step {max(older)}" if older else ""
+            advice = f"; delete it to resume from step {max(older)}" if older else ""
             raise InputError(
                 f"{self._folder / str(step)}: this state is damaged or not of this run{advice} "
                 f"({error})"
@@ -164,14 +166,9 @@ class StateStore:
     def _check_seal(self, step: int) -> None:
         folder = self._folder / str(step)
         found, saved = _hashes(folder), read_json(folder / _SEAL, "the digests of a state's files")
-        if not saved:
-            raise ValueError(f"{_SEAL}: found no digests, expected those of {len(found)} files")
         for name in found.keys() | saved.keys():
             if found.get(name) != saved.get(name):
-                both = name in found and name in saved
-                what = "other bytes than were saved" if both else "no file"
-                if name not in saved:
-                    what = "a file that was not saved"
+                what = "other bytes than were saved" if name in found else "no file"
                 raise ValueError(f"{name}: found {what}")
 
     def wait(self) -> None:
@@ -216,18 +213,3 @@ def _hashes(folder: pathlib.Path) -> dict[str, str]:
 def _stored(state: PyTree) -> dict[str, Any]:
     """Return the leaves by name, without empty ones, which orbax refuses."""
     return {name: leaf for name, leaf in named_leaves(state).items() if leaf.size}
-
-
-def _check_arrays(expected: dict[str, jax.ShapeDtypeStruct], stored: dict[str, Any]) -> None:
-    """Check names and shapes of the stored arrays; raise ValueError."""
-    differing = sorted(
-        name
-        for name in expected.keys() | stored.keys()
-        if name not in expected or name not in stored or expected[name].shape != stored[name].shape
-    )
-    if differing:
-        first = differing[0]
-        shapes = [tree[first].shape if first in tree else "none" for tree in (stored, expected)]
-        raise ValueError(
-            f"{len(differing)} arrays differ, as {first}: found {shapes[0]}, expected {shapes[1]}"
-        )

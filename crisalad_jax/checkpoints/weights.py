@@ -5,39 +5,62 @@ import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import safetensors
 
-from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
+from crisalad_jax.checkpoints.safetensors_io import read_safetensors, unseal, write_sealed
 from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.misfits import misfits, not_finite
 from crisalad_jax.nn.model import Crisalad, Model, check_params, parameter_shapes
-from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
+from crisalad_jax.utils.checksums import ChangedFileError
 from crisalad_jax.utils.errors import InputError, few
-from crisalad_jax.utils.files import check_source, is_html
+from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.notes import tell
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
 
-FORMAT = "crisalad-jax 3"
-"""Only key of a weight file's metadata. Its value is JSON: the file's checksum, the configuration,
-the version of this package, and the name and source's digest of every part."""
-_DIGEST = "model_sha256"
-"""Key of the `model_hash` in the metadata."""
-_KINDS = {
-    **dict.fromkeys(("config", "parts", "source_bytes", "aggregator"), dict),
-    **dict.fromkeys(("version", _DIGEST), str),
-}
-"""Types of the metadata's values."""
+FORMAT = "crisalad-jax 4"
+"""Only key of a weight file's metadata. Its value is JSON: the file's checksum, and a `Header`."""
 EXTRA = "extra."
 """Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
+EXPECTED = (
+    f"a .safetensors file of weights ({FORMAT!r}), as this package writes it; `crisalad convert` "
+    "reads public checkpoints"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Header:
+    """What a file says of its parameters."""
+
+    config: ModelConfig
+    version: str
+    """Version of this package that wrote it."""
+    parts: dict
+    """Name and source's digest of every part."""
+    source_bytes: dict
+    """Digest of the bytes of every part's source."""
+    aggregator: dict
+    """What the aggregator keeps besides arrays."""
+    model_sha256: str
+    """The `model_hash` of the parameters."""
+
+
+class Weights(NamedTuple):
+    """A model from a file of this package."""
+
+    params: Crisalad
+    config: ModelConfig
+    digest: str
+    """The `model_hash` of the parameters."""
+    extras: dict[str, np.ndarray]
+    """Arrays of a public checkpoint that no descriptor needs."""
 
 
 def save_weights(
@@ -83,15 +106,15 @@ def save_weights(
     config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(stored).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
-    metadata = {
+    header = {
         "config": to_plain(config),
         "version": VERSION,
         "parts": sources_of(config),
         "source_bytes": source_bytes_of(config),
         "aggregator": config.aggregator.metadata(params.aggregator),
-        _DIGEST: model_hash(params, config),
+        "model_sha256": model_hash(params, config),
     }
-    write_sealed(path, arrays, FORMAT, metadata)
+    write_sealed(path, arrays, FORMAT, header)
 
 
 def _halved(leaf: Any) -> np.ndarray:
@@ -101,26 +124,6 @@ def _halved(leaf: Any) -> np.ndarray:
         return array
     with np.errstate(over="ignore"):  # infinity is told of as such
         return array.astype(np.float16)
-
-
-def is_ours(path: str | os.PathLike[str]) -> bool:
-    """Return whether this is a whole safetensors file that `save_weights` wrote."""
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            return FORMAT in (file.metadata() or {})
-    except (safetensors.SafetensorError, OSError):
-        return False
-
-
-CACHE_RECORD = "record.json"
-"""File beside the weights of a published model in the cache (`checkpoints.cache`)."""
-
-
-def load_extras(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the `extras` that `save_weights` wrote."""
-    with safetensors.safe_open(path, framework="numpy") as file:
-        names = [name for name in file.keys() if name.startswith(EXTRA)]  # noqa: SIM118
-        return {name.removeprefix(EXTRA): file.get_tensor(name) for name in names}
 
 
 def load_weights(
@@ -151,121 +154,61 @@ def load_weights(
         ...
         crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
     """
-    params, config, _ = _loaded(path, expected, verify=verify)
-    return Model(params, config)
+    found = read_weights(path, verify=verify)
+    if expected is not None:
+        wrong = differences(_as_free_as(expected, found.config), expected)
+        if wrong:
+            raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
+    return Model(found.params, found.config)
 
 
-def load_with_hash(path: str | os.PathLike[str]) -> tuple[Crisalad, ModelConfig, str]:
-    """Read what `load_weights` reads, and the `model_hash` of the parameters as they were written.
-
-    The file's checksum covers both.
+def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Weights:
+    """Read all that `save_weights` wrote; see `load_weights`.
 
     Raises:
         InputError: what `load_weights` raises.
     """
-    params, config, metadata = _loaded(path, None, verify=True)
-    return params, config, metadata[_DIGEST]
+    metadata, arrays = read_safetensors(path, EXPECTED)
+    return unpack_weights(path, metadata, arrays, verify=verify)
 
 
-def _loaded(
-    path: str | os.PathLike[str], expected: ModelConfig | None, *, verify: bool
-) -> tuple[Crisalad, ModelConfig, dict[str, Any]]:
-    """Read parameters, configuration and the rest of the metadata, and tell of changed sources."""
-    path = pathlib.Path(path)
+def unpack_weights(
+    path: str | os.PathLike[str],
+    metadata: Mapping[str, str],
+    arrays: dict[str, np.ndarray],
+    *,
+    verify: bool = True,
+) -> Weights:
+    """Make a model of what `read_safetensors` read; the arrays are used up.
+
+    Raises:
+        InputError: what `load_weights` raises.
+    """
     try:
-        with checked_safetensors(path, verify=verify):
-            params, config, metadata = _load(path, expected)
+        value, arrays = unseal(path, metadata, arrays, FORMAT, EXPECTED, verify=verify)
     except ChangedFileError as error:
-        if not path.with_name(CACHE_RECORD).is_file():
-            raise
-        raise InputError(
-            f"{error}; it is in the cache: once it is removed, the same command makes it anew"
-        ) from error
-    same_version = metadata["version"] == VERSION
-    changed = changed_sources(config, metadata["parts"], same_version, metadata["source_bytes"])
+        if user_cache() in pathlib.Path(path).parents:
+            raise InputError(f"{error}; remove it, and the same command makes it again") from error
+        raise
+    header = from_plain(Header, value, source=f"{path} (metadata)")
+    extras = {name: arrays.pop(name) for name in list(arrays) if name.startswith(EXTRA)}
+    config = header.config
+    params = _fill(config, arrays, path)
+    own = config.aggregator.with_metadata(params.aggregator, header.aggregator)
+    config.aggregator.check_backbone(own, params.backbone, str(path))
+    same_version = header.version == VERSION
+    changed = changed_sources(config, header.parts, same_version, header.source_bytes)
     if changed:
         tell(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
             "with; descriptors may differ"
         )
-    return params, config, metadata
-
-
-def _load(
-    path: pathlib.Path, expected: ModelConfig | None
-) -> tuple[Crisalad, ModelConfig, dict[str, Any]]:
-    """Read parameters, configuration and the rest of the metadata; see `load_weights`."""
-    arrays, metadata = _read(path)
-    config = from_plain(ModelConfig, metadata["config"], source=f"{path} (metadata)")
-    if expected is not None:
-        wrong = differences(_as_free_as(expected, config), expected)
-        if wrong:
-            raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
-    params = _fill(config, arrays, path)
-    own = config.aggregator.with_metadata(params.aggregator, metadata["aggregator"])
-    params = dataclasses.replace(params, aggregator=own)
-    config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
-    return params, config, metadata
-
-
-def _read(path: pathlib.Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays by name, and the metadata."""
-    expected = (
-        f"a .safetensors file of weights ({FORMAT!r}), as this package writes it; `crisalad "
-        "convert` reads public checkpoints"
+    return Weights(
+        dataclasses.replace(params, aggregator=own),
+        config,
+        header.model_sha256,
+        {name.removeprefix(EXTRA): array for name, array in extras.items()},
     )
-    _check_not_public(path, expected)
-    plain, arrays = read_sealed(path, FORMAT, expected, but=EXTRA)
-    for name, kind in _KINDS.items():
-        if not isinstance(value := plain.get(name), kind):
-            raise InputError(
-                f"{path} (metadata): found {name} of {type(value).__name__}, expected "
-                f"{kind.__name__}"
-            )
-    pairs = {field: pair for field, pair in plain["parts"].items() if _is_pair(pair)}
-    return arrays, plain | {"parts": pairs}
-
-
-_BEGINNINGS = {b"PK\3\4": "a torch file", b"\x80\2": "a torch file", b"MATLAB": "a MATLAB file"}
-"""What files of public checkpoints begin with; torch's are archives, older ones pickles."""
-
-
-def _check_not_public(path: pathlib.Path, expected: str) -> None:
-    """Check that a file is not plainly one that `crisalad convert` reads.
-
-    Raises:
-        InputError: it is.
-    """
-    check_source(path, expected)
-    try:
-        with path.open("rb") as file:
-            start = file.read(512)
-    except OSError:
-        return  # the reader tells
-    if is_html(start):
-        raise InputError(f"{path}: found a page of HTML, expected {expected}")
-    kind = next((what for mark, what in _BEGINNINGS.items() if start.startswith(mark)), None)
-    ours = path.with_suffix(".safetensors")
-    if kind is None and _is_of_another_program(path):
-        kind, ours = "a .safetensors file of another program", path.with_stem(f"{path.stem}-ours")
-    if kind is not None:
-        raise InputError(
-            f"{path}: found {kind}, expected {expected}: crisalad convert {path} {ours}"
-        )
-
-
-def _is_of_another_program(path: pathlib.Path) -> bool:
-    """Return whether a file is a whole one of safetensors, and of no format of this package."""
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            return not any(key.startswith("crisalad-jax ") for key in file.metadata() or {})
-    except (safetensors.SafetensorError, OSError):
-        return False
-
-
-def _is_pair(value: Any) -> bool:
-    """Return whether this is a part's name and its source's digest."""
-    return isinstance(value, list) and len(value) == 2
 
 
 def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
@@ -275,17 +218,10 @@ def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
     return free
 
 
-def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path) -> Crisalad:
-    # Check before making a template: the file may claim any sizes. Small misfits are listed below.
-    largest = max(number for _, number in _whole_numbers(to_plain(config)))
-    layers = count_layers(config) - config.backbone.depth
-    if largest > max(2**20, sum(array.size for array in arrays.values())) or (
-        layers > max(64, len(arrays))
-    ):
-        raise InputError(
-            f"{path}: found {len(arrays)} arrays, far from the sizes that its configuration says, "
-            f"of up to {largest}"
-        )
+def _fill(
+    config: ModelConfig, arrays: dict[str, np.ndarray], path: str | os.PathLike[str]
+) -> Crisalad:
+    check_sizes(config, arrays.values(), str(path))
     template = parameter_shapes(config)
     wanted = named_leaves(template)
     halves = {name: array for name, array in arrays.items() if array.dtype == np.float16}
@@ -293,16 +229,29 @@ def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path
     problems = misfits(arrays, wanted) or not_finite(arrays)
     if problems:
         raise InputError(f"{path}: weights do not fit: {few(problems)}")
-    # Not the file's own memory, which another program may change, and copied when this returns.
-    leaves = [jax.device_put(arrays[name], may_alias=False) for name in wanted]
-    jax.block_until_ready(leaves)
+    leaves = jax.device_put([arrays.pop(name) for name in wanted])
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def count_layers(config: ModelConfig) -> int:
-    """Count the layers with parameters that a configuration asks for."""
-    numbers = _whole_numbers(to_plain(config))
-    return sum(number for name, number in numbers if name.endswith((".layers", ".depth")))
+def check_sizes(config: ModelConfig, arrays: Collection[np.ndarray], source: str) -> None:
+    """Check that a configuration may be that of some arrays.
+
+    Before a template is made of it: a file may claim any sizes.
+
+    Raises:
+        InputError: it has many more layers, or far larger ones, naming `source`.
+    """
+    sizes = dict(_whole_numbers(to_plain(config)))
+    layers = sum(size for name, size in sizes.items() if name.endswith((".layers", ".depth")))
+    largest = max(sizes.values())
+    # Blocks of a backbone may be stacked.
+    if layers > len(arrays) + config.backbone.depth or largest > max(
+        2**20, sum(array.size for array in arrays)
+    ):
+        raise InputError(
+            f"{source}: found {len(arrays)} arrays, far from the sizes that its configuration "
+            f"says: {layers} layers, and up to {largest}"
+        )
 
 
 def _whole_numbers(plain: Any, name: str = "") -> Iterator[tuple[str, int]]:

@@ -6,28 +6,28 @@ from typing import Annotated
 
 import tyro
 
-from crisalad_jax.checkpoints.layouts import LAYOUTS
+from crisalad_jax.checkpoints.formats import FORMATS
 from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.public import convert
 from crisalad_jax.checkpoints.published import PUBLISHED
-from crisalad_jax.checkpoints.torch_io import convert
 from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.training.summary import model_words
 from crisalad_jax.utils.errors import InputError
 
 
 def _sources() -> str:
-    files = ", ".join(layout.holds for layout in LAYOUTS.values())
+    files = ", ".join(each.holds for each in FORMATS.values())
     return f"{files}, or a file of this package."
 
 
-def _layouts() -> str:
+def _formats() -> str:
     return (
-        f"{', '.join(LAYOUTS)}, for a source of this package; by default the one its parts came "
+        f"{', '.join(FORMATS)}, for a source of this package; by default the one its parts came "
         "from (huggingface if the target is a .safetensors)."
     )
 
 
-COMMON = ("source", "target", "layout", "backbone", "json")
+COMMON = ("source", "target", "format", "backbone", "json")
 EXAMPLE = "crisalad convert dino_salad.ckpt salad.safetensors"
 
 
@@ -40,7 +40,7 @@ class Convert:
     ]
     target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST")]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
-    layout: Annotated[str | None, tyro.conf.arg(help=_layouts())] = None
+    format: Annotated[str | None, tyro.conf.arg(help=_formats())] = None
     backbone: pathlib.Path | None = None
     """The backbone's checkpoint, or a published model's name, as in dinov2-vitg14: for a vocabulary
     of AnyLoc, which is one tensor by itself."""
@@ -61,7 +61,7 @@ class Convert:
 
 
 def run(arguments: Convert) -> None:
-    """Convert the file, and print both layouts and the model."""
+    """Convert the file, and print both formats and the model."""
     prepare_json(arguments.json)
     given = {name: getattr(arguments, name) for name in ("layer", "facet", "assignment")}
     fields = {name: value for name, value in given.items() if value is not None}
@@ -76,12 +76,12 @@ def run(arguments: Convert) -> None:
     done = convert(
         arguments.source,
         arguments.target,
-        arguments.layout,
+        arguments.format,
         backbone=backbone,
         fields=fields,
         half=arguments.half,
     )
-    source, target = map(_layout_words, (done.source, done.target))
+    source, target = map(_format_words, (done.source, done.target))
     say(
         f"{arguments.source} ({source}) -> {arguments.target} ({target}): "
         + model_words(done.config)
@@ -89,12 +89,12 @@ def run(arguments: Convert) -> None:
     give_json(
         arguments.json,
         {
-            "source": {"file": str(arguments.source), "layout": source},
-            "target": {"file": str(arguments.target), "layout": target},
+            "source": {"file": str(arguments.source), "format": source},
+            "target": {"file": str(arguments.target), "format": target},
             "model": model_words(done.config),
         },
     )
 
 
-def _layout_words(layout: str | None) -> str:
-    return "crisalad-jax" if layout is None else LAYOUTS[layout].holds
+def _format_words(name: str | None) -> str:
+    return "crisalad-jax" if name is None else FORMATS[name].holds

@@ -15,7 +15,6 @@ from crisalad_jax.config.checks import PATH, check_seed, check_types, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, sample
-from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Float32, Float64
@@ -288,10 +287,7 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
     """
     path = pathlib.Path(path)
     expected = f"a file of principal components ({FORMAT!r}), as `crisalad pca` writes it"
-    with checked_safetensors(path, verify=verify):
-        value, stored = read_sealed(path, FORMAT, expected)
-        # In memory of its own: the file may be replaced while a map uses them.
-        arrays = {name: array.copy() for name, array in stored.items()}
+    value, arrays = read_sealed(path, FORMAT, expected, verify=verify)
     if not _fits(arrays):
         shapes = {name: array.shape for name, array in arrays.items()}
         raise InputError(

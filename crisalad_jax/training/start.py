@@ -6,7 +6,7 @@ import os
 import jax
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.torch_io import with_backbone_of
+from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.places import Places

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32
 
-from crisalad_jax.checkpoints.torch_io import with_backbone_of
+from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_count, check_seed
 from crisalad_jax.config.concise import brief
@@ -112,7 +112,7 @@ def with_vocabulary(
         reduced = np.asarray(config.aggregator.centroid_features(there))
         centroids = jnp.asarray(_k_means(reduced, clusters, seed, spherical=spherical))
         aggregator = config.aggregator.from_centroids(centroids, there)
-    aggregator = config.aggregator.bind(aggregator, params.backbone)
+    aggregator = config.aggregator.attach_backbone_hash(aggregator, params.backbone)
     return dataclasses.replace(params, aggregator=aggregator)
 
 

@@ -1,17 +1,14 @@
 """Checksums: a file that this package writes holds the SHA-256 of its own bytes.
 
 The digest stands in the file's text, and is computed as if its digits were zeros there. So every
-byte of the file counts, and one rule serves JSON and the metadata of safetensors.
+byte of the file counts.
 """
 
-import contextlib
 import hashlib
 import json
-import mmap
 import os
 import pathlib
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from typing import Any
 
 from crisalad_jax.utils.errors import InputError
@@ -20,8 +17,6 @@ from crisalad_jax.utils.notes import tell
 CHECKSUM = "checksum"
 """Key of the digest, the first of its object."""
 BLANK = "0" * 64
-_HEADER_LIMIT = 2**27
-"""Largest header of a safetensors file in bytes; the library allows 100 MB."""
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:
@@ -120,69 +115,3 @@ def check_appended(path: pathlib.Path) -> None:
             size -= len(data)
     if line != _APPENDED + digester.hexdigest().encode() + b"\n":
         raise ChangedFileError(path)
-
-
-def seal_safetensors(path: pathlib.Path) -> None:
-    """Replace the zeros in the metadata of a safetensors file by the checksum of the file."""
-    header = _header_of(path)
-    place = header.index(BLANK.encode())
-    digest = sha256_of(path)
-    with path.open("r+b") as file:
-        file.seek(place)
-        file.write(digest.encode())
-
-
-@contextlib.contextmanager
-def checked_safetensors(path: pathlib.Path, *, verify: bool) -> Iterator[None]:
-    """Check a safetensors file's checksum in a thread, while the block reads the file.
-
-    A file without a checksum passes: the block knows which formats have one.
-
-    Raises:
-        InputError: the file has other bytes than its checksum says; also in place of any other
-            `InputError` of the block.
-    """
-    if not verify or not path.is_file():  # opening a pipe would wait, before the block refuses it
-        yield
-        return
-    with ThreadPoolExecutor(1) as thread:
-        right = thread.submit(_safetensors_are_right, path)
-        try:
-            yield
-        except InputError as error:
-            if not right.result():
-                raise ChangedFileError(path) from error
-            raise
-        if not right.result():
-            raise ChangedFileError(path)
-
-
-def _safetensors_are_right(path: pathlib.Path) -> bool:
-    """Return whether a file has its checksum; True where it holds none that can be read."""
-    try:
-        header = _header_of(path)
-        metadata = json.loads(header[8:])["__metadata__"]
-        (digest,) = (json.loads(text)[CHECKSUM] for text in metadata.values())
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return True
-    if not _is_digest(digest) or digest.encode() not in header:
-        return False
-    digester = hashlib.sha256(header.replace(digest.encode(), BLANK.encode(), 1))
-    # One call for all: between calls this thread waits for Python's lock, which the block holds.
-    with (
-        path.open("rb") as file,
-        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
-        memoryview(data)[len(header) :] as rest,
-    ):
-        digester.update(rest)
-    return digester.hexdigest() == digest
-
-
-def _header_of(path: pathlib.Path) -> bytes:
-    """Read the length and the JSON at the beginning of a safetensors file."""
-    with path.open("rb") as file:
-        length = file.read(8)
-        count = int.from_bytes(length, "little")
-        if count > _HEADER_LIMIT:
-            raise ValueError("no header of a safetensors file")
-        return length + file.read(count)

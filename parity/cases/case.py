@@ -15,7 +15,7 @@ import numpy as np
 import optax
 import torch
 
-from crisalad_jax.checkpoints.layouts import to_params, to_state
+from crisalad_jax.checkpoints.formats import to_params, to_state
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import OptimiserConfig

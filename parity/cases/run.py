@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from crisalad_jax.checkpoints.layouts import to_state
+from crisalad_jax.checkpoints.formats import to_state
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import STATISTICS
 from crisalad_jax.nn.model import Crisalad

@@ -432,7 +432,7 @@ VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("export", "--grouping", ("x",)),
     ("info", "--preset", ("x",)),
     ("info", "--trainable", ("x", "last-99-blocks+head")),
-    ("convert", "--layout", ("x", "huggingface", "cricavpr")),
+    ("convert", "--format", ("x", "huggingface", "cricavpr")),
     ("vocabulary", "--clusters", ("0", "-1", HUGE, "1000000000")),
     ("vocabulary", "--max-images", ("0", "-1")),
     ("vocabulary", "--aggregator", ("x", "gem")),
@@ -780,19 +780,12 @@ def _weights_of(config: Any) -> Make:
     """Make weights whose checksum is right and whose configuration is not."""
 
     def make(world: World, bad: pathlib.Path) -> list[str]:
-        from crisalad_jax.utils.checksums import BLANK, CHECKSUM, seal_safetensors
+        from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
+        from crisalad_jax.checkpoints.weights import FORMAT
 
-        data = world.weights.read_bytes()
-        length = int.from_bytes(data[:8], "little")
-        header = json.loads(data[8 : 8 + length])
-        ((form, text),) = header["__metadata__"].items()
-        value = json.loads(text) | {CHECKSUM: BLANK}
-        value["config"] = config
-        header["__metadata__"] = {form: json.dumps(value)}
-        new = json.dumps(header).encode()
+        value, arrays = read_sealed(world.weights, FORMAT, "weights")
         path = bad / "bad.safetensors"
-        path.write_bytes(len(new).to_bytes(8, "little") + new + data[8 + length :])
-        seal_safetensors(path)
+        write_sealed(path, arrays, FORMAT, value | {"config": config})
         return with_flag(base("info", world, bad), "--weights", str(path))
 
     return make

@@ -145,7 +145,7 @@ VERBS: Mapping[str, Callable[[World, pathlib.Path], Arguments]] = {
         *("export", "--weights", f"{world.weights}", "--out", f"{out / 'program'}"),
     ],
     "convert": lambda world, out: [
-        *("convert", f"{world.weights}", f"{out / 'public.pth'}", "--layout", "reference"),
+        *("convert", f"{world.weights}", f"{out / 'public.pth'}", "--format", "reference"),
     ],
     "info": lambda world, out: [
         *("info", "--weights", f"{world.weights}", "--json", f"{out / 'info.json'}"),

@@ -13,10 +13,8 @@ import jax
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.layouts import LAYOUTS, infer
-from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY, vocabulary_model
-from crisalad_jax.checkpoints.layouts.table import public_shapes
-from crisalad_jax.checkpoints.matlab_io import AVERAGE
+from crisalad_jax.checkpoints.formats import FORMATS, VOCABULARY, infer, public_shapes
+from crisalad_jax.checkpoints.public import vocabulary_model
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
@@ -51,8 +49,8 @@ STORED = {
     "mixvpr-4096": "zoo/layouts/mixvpr_resnet50_4096",
     "conv-ap-4096": "zoo/layouts/convap_resnet50_4096",
     "netvlad-nanne": "zoo/layouts/netvlad_vgg16_nanne",
-    "netvlad-hloc": "zoo/layouts/netvlad_vgg16_hloc_mat",
-    "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc_mat",
+    "netvlad-hloc": "zoo/layouts/netvlad_vgg16_hloc",
+    "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
     "transvpr-msls": "zoo/layouts/transvpr",
@@ -153,7 +151,6 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     "patch-netvlad": ((480, 640), "fixed", *_BYTES),
     # gmberton/CosPlace and EigenPlaces, Indoor-VPR, Nanne/pytorch-NetVlad: not resized.
     "cosplace": ((512, 512), "native", *_BYTES),
-    "eigenplaces-indoor": ((512, 512), "native", *_BYTES),
     "netvlad": ((480, 640), "native", *_BYTES),
     # amaralibey/Bag-of-Queries: the tensor is resized, bicubic and antialiased.
     "boq-dinov2": ((322, 322), "fixed", *_BICUBIC),
@@ -175,7 +172,7 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     "dino-mix": ((224, 224), "fixed", *_PLAIN),
     "transvpr": ((480, 640), "fixed", *_PLAIN),
     # cvg/Hierarchical-Localization: OpenCV's INTER_AREA; pixels of 0 to 255 less a mean.
-    "netvlad-matlab": ((768, 1024), "longer-side", "area", True, "floats", False, FROM_255),
+    "netvlad-hloc": ((768, 1024), "longer-side", "area", True, "floats", False, FROM_255),
     # Ours: the demo of AnyLoc crops to multiples of 14 where we resize (docs/resizing.md).
     VOCABULARY: ((224, 224), "native", "bilinear", True, "floats", False, IMAGENET),
 }
@@ -194,11 +191,8 @@ def stored(name: str) -> tuple[str, ModelConfig]:
 
 
 def blank(shapes: dict[str, Any]) -> dict[str, np.ndarray]:
-    """A state of these shapes; its average image, if there is one, is VGG-16's."""
-    state = {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in shapes.items()}
-    if AVERAGE in state:
-        state[AVERAGE] = np.broadcast_to(np.float32(VGG_MEAN), state[AVERAGE].shape)
-    return state
+    """A state of these shapes, which takes no memory."""
+    return {key: np.broadcast_to(np.float32(0), tuple(shape)) for key, shape in shapes.items()}
 
 
 def parameters(config: ModelConfig) -> int:
@@ -209,7 +203,7 @@ def parameters(config: ModelConfig) -> int:
 def test_a_models_facts_are_those_of_its_file(name):
     model = published_model(name)
     layout, config = stored(name)
-    found = (model.layout, model.descriptor, model.parameters)
+    found = (model.format, model.descriptor, model.parameters)
     assert found == (layout, config.descriptor_dim, parameters(config))
 
 
@@ -221,7 +215,7 @@ def test_another_size_has_its_own_facts(name):
     config = dataclasses.replace(
         config, aggregator=dataclasses.replace(config.aggregator, **settings)
     )
-    found = (model.layout, model.descriptor, model.parameters)
+    found = (model.format, model.descriptor, model.parameters)
     assert found == (layout, config.descriptor_dim, parameters(config))
 
 
@@ -275,12 +269,12 @@ def test_patch_netvlads_sizes_differ_in_their_projection():
 def test_anylocs_vocabularies_have_their_backbone():
     words = np.broadcast_to(np.float32(0), (32, 1536))
     for name, model in PUBLISHED.items():
-        if model.layout != VOCABULARY:
+        if model.format != VOCABULARY:
             assert not model.backbone
             continue
         assert name.startswith("anyloc-")
         _, base = stored(model.backbone)
-        config = vocabulary_model(words, base, {})
+        config = vocabulary_model(len(words), base, {})
         assert (model.descriptor, model.parameters) == (config.descriptor_dim, parameters(config))
         assert config.aggregator.block(base.backbone.depth) == 31  # as the file's name says
 
@@ -302,24 +296,24 @@ def inferred(name: str) -> ModelConfig:
         like, settings = SIZED[name]
         head = stored(like)[1].aggregator
         return resized(like, aggregator=dataclasses.replace(head, **settings))
-    if model.layout == "patch-netvlad":
+    if model.format == "patch-netvlad":
         like = "mapillary-4096" if "mapillary" in name else "pittsburgh-512"
         whitening = stored(f"patch-netvlad-{like}")[1].projection
         return resized(
             f"patch-netvlad-{like}",
             projection=dataclasses.replace(whitening, dim=model.descriptor),
         )
-    if model.layout == "cosplace":
+    if model.format == "cosplace":
         layers = re.search(r"resnet(\d+)", name)
         backbone = ResNetConfig(layers=int(layers[1])) if layers else VggConfig()
         head = dataclasses.replace(
             stored("cosplace-resnet50-2048")[1].aggregator, dim=model.descriptor
         )
         return resized("cosplace-resnet50-2048", backbone=backbone, aggregator=head)
-    if model.layout == VOCABULARY:
+    if model.format == VOCABULARY:
         words = np.broadcast_to(np.float32(0), (32, 1536))
-        return vocabulary_model(words, stored(model.backbone)[1], {})
-    assert model.layout == "dinov3"
+        return vocabulary_model(len(words), stored(model.backbone)[1], {})
+    assert model.format == "dinov3"
     # The chain is the same for all sizes.
     alone = ModelConfig(
         backbone=DinoV3Config(adapter=AdapterConfig(kind="none")),
@@ -344,7 +338,7 @@ def test_images_are_prepared_as_the_authors_do(name):
         chain.round_to_patch,
         (chain.mean, chain.deviation),
     )
-    assert found == PREPROCESSING.get(name, PREPROCESSING[published_model(name).layout])
+    assert found == PREPROCESSING.get(name, PREPROCESSING[published_model(name).format])
     assert chain.normalisation == "mean-deviation"
 
 
@@ -375,7 +369,7 @@ def test_the_table_is_sound():
     for name, model in PUBLISHED.items():
         assert model.name == name
         assert re.fullmatch("[a-z0-9][a-z0-9-]*", name)
-        assert model.layout in LAYOUTS
+        assert model.format in FORMATS
         assert urlsplit(model.repository).scheme == "https"
         assert model.url is None or urlsplit(model.url).scheme == "https"
         assert model.url is not None or model.note

@@ -18,7 +18,7 @@ import pytest
 import torch
 from torch import nn
 
-from crisalad_jax.checkpoints.torch_io import Checkpoint, convert, read_backbone, read_checkpoint
+from crisalad_jax.checkpoints.public import Checkpoint, convert, read_backbone, read_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.base import FeatureRequest
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -82,7 +82,7 @@ def test_what_wraps_a_network_leaves_no_name(tmp_path: pathlib.Path, kind: str) 
     assert state.keys().isdisjoint(net.state_dict())
     for name, content in (("bare.pth", state), ("under.ckpt", {"state_dict": state, "epoch": 3})):
         found = read_quietly(save(tmp_path / name, content))
-        assert (found.layout, found.config) == ("dinov2", plain.config)
+        assert (found.format, found.config) == ("dinov2", plain.config)
         assert_equal(found.params, plain.params)
     assert_same_outputs(found, net)
 
@@ -108,13 +108,13 @@ def test_other_layouts_are_read_so(tmp_path: pathlib.Path, name: str, put: str) 
     content = nested(random_state(fewer_blocks(narrow(public_layout(PUBLIC[name]), by), 2)))
     state = content.get("model_state_dict", content)
     plain = read_quietly(save(tmp_path / "plain.pth", content))
-    assert plain.layout == name
+    assert plain.format == name
     front = {put + key: array for key, array in state.items()}
     within = {key.replace(".", "._orig_mod.", 1): array for key, array in state.items()}
     for number, each in enumerate((front, within)):
         found = read_quietly(save(tmp_path / f"{number}.pth", each))
         # Indoor-VPR publishes SALAD within `model`, for another image size: its layout comes first.
-        assert found.layout in (name, "salad-indoor")
+        assert found.format in (name, "salad-indoor")
         assert_equal(found.params, plain.params)
 
 
@@ -287,7 +287,7 @@ def test_the_teacher_of_a_training_is_a_backbone(tmp_path: pathlib.Path, kind: s
         found = read_checkpoint(path)
     assert len(notes) == 1
     plain = read_quietly(save(tmp_path / "plain.pth", net.state_dict()))
-    assert (found.layout, found.config) == ("dinov2", plain.config)
+    assert (found.format, found.config) == ("dinov2", plain.config)
     assert_equal(found.params, plain.params)
     assert_same_outputs(found, net)
     with pytest.warns(Note):

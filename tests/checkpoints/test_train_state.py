@@ -44,7 +44,7 @@ def test_a_state_of_another_model_is_refused(tmp_path, state):
     largest = max(range(len(leaves)), key=lambda i: leaves[i].size)
     shape = leaves[largest].shape
     leaves[largest] = jnp.zeros((*shape, 2))
-    words = re.escape(f"found {shape}, expected {(*shape, 2)}")
+    words = re.escape(f"found float32 {shape}, expected float32 {(*shape, 2)}")
     with pytest.raises(
         InputError,
         match=f"^{tmp_path}/state/1: this state is damaged or not of this run .*{words}",
@@ -76,7 +76,7 @@ def test_a_damaged_state_is_refused_and_the_older_one_named(tmp_path, state, cap
     words = f"{largest.relative_to(tmp_path / 'state' / '2')}: found other bytes than were saved"
     with pytest.raises(
         InputError,
-        match=f"^{tmp_path}/state/2: this state is damaged .*; delete it to go on from step 1 .*"
+        match=f"^{tmp_path}/state/2: this state is damaged .*; delete it to resume from step 1 .*"
         f"{re.escape(words)}",
     ):
         store.load(state)

@@ -1,7 +1,6 @@
 """Weights there and back bit for bit, and files that are none of ours."""
 
 import dataclasses
-import hashlib
 import json
 import os
 import pathlib
@@ -10,7 +9,7 @@ import struct
 import typing
 import warnings
 from collections.abc import Iterator
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -19,24 +18,16 @@ import safetensors.numpy
 
 import crisalad_jax
 from crisalad_jax.checkpoints import weights
-from crisalad_jax.checkpoints.safetensors_io import write_safetensors, write_sealed
-from crisalad_jax.checkpoints.weights import (
-    is_ours,
-    load_weights,
-    model_hash,
-    save_weights,
-)
+from crisalad_jax.checkpoints.safetensors_io import write_sealed
+from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.config import source
-from crisalad_jax.config.fields import free_field
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.parts import Part
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Model, parameter_shapes
-from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
 from crisalad_jax.utils.pytree import named_leaves
@@ -73,13 +64,11 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
     (length,) = struct.unpack("<Q", data[:8])
     header = json.loads(data[8 : 8 + length])
     metadata = header.pop("__metadata__")
-    assert metadata.keys() == {"crisalad-jax 3"}
-    told = json.loads(metadata["crisalad-jax 3"])
+    assert metadata.keys() == {"crisalad-jax 4"}
+    told = json.loads(metadata["crisalad-jax 4"])
     assert list(told) == [
         *("checksum", "config", "version", "parts", "source_bytes", "aggregator", "model_sha256")
     ]
-    blank = data.replace(told["checksum"].encode(), b"0" * 64)
-    assert hashlib.sha256(blank).hexdigest() == told["checksum"]
     assert told["config"] == to_plain(MODEL)
     assert told["version"] == crisalad_jax.__version__
     assert {field: name for field, (name, _) in told["parts"].items()} == {
@@ -112,7 +101,7 @@ def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shar
     with safetensors.safe_open(tmp_path / "half.safetensors", framework="numpy") as file:
         stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     assert {array.dtype for array in stored.values()} == {np.dtype(np.float16)}
-    found, config, digest = weights.load_with_hash(tmp_path / "half.safetensors")
+    found, config, digest, _ = weights.read_weights(tmp_path / "half.safetensors")
     assert config == MODEL
     for name, leaf in named_leaves(found).items():
         expected = np.asarray(named_leaves(params)[name])
@@ -120,7 +109,7 @@ def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shar
         np.testing.assert_array_equal(leaf, expected.astype(np.float16).astype(np.float32))
     assert digest == model_hash(found, MODEL) != model_hash(params, MODEL)
     save_weights(tmp_path / "again.safetensors", Model(found, MODEL), half=True)
-    assert weights.load_with_hash(tmp_path / "again.safetensors")[2] == digest
+    assert weights.read_weights(tmp_path / "again.safetensors").digest == digest
     assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * (
         shared / "weights.safetensors"
     ).stat().st_size
@@ -170,12 +159,6 @@ def test_parameters_of_one_image_size_keep_it(tmp_path):
     assert model_hash(params, turned) != model_hash(params, config)
 
 
-def rewrite(shared: pathlib.Path, path: pathlib.Path, metadata: dict[str, str]) -> None:
-    """The shared weights with other metadata, without a checksum."""
-    arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
-    safetensors.numpy.save_file(arrays, path, metadata=metadata)
-
-
 def reseal(shared: pathlib.Path, path: pathlib.Path, value, change=lambda arrays: None) -> None:
     """The shared weights with other values in the metadata, where None leaves one out, and with
     changed arrays, and the checksum of all."""
@@ -188,34 +171,25 @@ def reseal(shared: pathlib.Path, path: pathlib.Path, value, change=lambda arrays
 
 def told_of(path: pathlib.Path, key: str) -> dict[str, Any]:
     with safetensors.safe_open(path, framework="numpy") as file:
-        return json.loads(file.metadata()[key])
+        told = json.loads(file.metadata()[key])
+    del told["checksum"]
+    return told
 
 
 def test_a_file_of_another_format_is_refused(tmp_path, shared):
     """With a right checksum, too, and whatever has no array of its own."""
     path = tmp_path / "w.safetensors"
     arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
-    for form in ("crisalad-jax 2", "crisalad-jax 4", "crisalad-jax pca 2"):
-        told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
+    for form in ("crisalad-jax 3", "crisalad-jax 5", "crisalad-jax pca 2"):
+        told = told_of(shared / "weights.safetensors", "crisalad-jax 4")
         write_sealed(path, arrays, form, told)
-        assert not is_ours(path)
         with pytest.raises(InputError) as error:
             load_weights(path)
         assert str(error.value) == (
             f"{path}: found metadata [{form!r}], expected a .safetensors file of weights "
-            "('crisalad-jax 3'), as this package writes it; `crisalad convert` reads public "
+            "('crisalad-jax 4'), as this package writes it; `crisalad convert` reads public "
             "checkpoints"
         )
-
-
-def test_a_file_without_a_checksum_is_refused(tmp_path, shared):
-    path = tmp_path / "w.safetensors"
-    told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
-    del told["checksum"]
-    rewrite(shared, path, {"crisalad-jax 3": json.dumps(told)})
-    for verify in (True, False):
-        with pytest.raises(InputError, match=rf"^{path} \(metadata\): found no checksum, expected"):
-            load_weights(path, verify=verify)
 
 
 @pytest.mark.parametrize("inside", [True, False])
@@ -260,7 +234,10 @@ SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
         (lambda a: a.update({SCORE: a[SCORE].astype("f8")}), ["float64", "expected float32"]),
         (lambda a: a.update({DUST: np.float32(np.nan)[...]}), [f"{DUST} holds NaN or infinity"]),
         (lambda a: (a.pop(SCORE), a.pop(DUST)), [f"{SCORE} missing", f"{DUST} missing"]),
-        (lambda a: a.clear(), ["aggregator.cluster_features.fc1.bias missing; ", " more"]),
+        (
+            lambda a: [a.pop(name) for name in list(a) if name.startswith("aggregator.")],
+            ["aggregator.cluster_features.fc1.bias missing; ", " more"],
+        ),
     ],
 )
 def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
@@ -274,43 +251,18 @@ def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
 
 
 @pytest.mark.parametrize(
-    ("metadata", "words"),
-    [
-        ({}, "found a .safetensors file of another program"),
-        ({"format": "pt"}, "found a .safetensors file of another program"),
-        ({"crisalad-jax 3": '{"a": 1, "a": 2}'}, r"found no JSON \(the key 'a' twice\)"),
-        ({"crisalad-jax 3": ""}, r"\(metadata\): found no JSON \(Expecting value"),
-        ({"crisalad-jax 3": "{"}, r"\(metadata\): found no JSON \(Expecting property name"),
-        ({"crisalad-jax 3": "[" * 10**5}, r"\(metadata\): found no JSON \(nested too deep\)"),
-        ({"crisalad-jax 3": "[]"}, r"\(metadata\): found no checksum, expected one in 'crisalad-j"),
-        ({"crisalad-jax 3": "{}"}, r"\(metadata\): found no checksum, expected one in 'crisalad-j"),
-        ({"crisalad-jax 3": '{"checksum": 3}'}, "found other bytes than were written"),
-    ],
-)
-def test_foreign_metadata_are_refused(tmp_path, shared, metadata, words):
-    path = tmp_path / "w.safetensors"
-    rewrite(shared, path, metadata)
-    with pytest.raises(InputError, match=words) as error:
-        load_weights(path)
-    assert str(error.value).startswith(str(path))
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("value", "words"),
     [
-        ({"config": None}, "found config of NoneType, expected dict"),
-        ({"config": []}, "found config of list, expected dict"),
+        ({"config": None}, "config missing @ config"),
+        ({"config": []}, r"found \[\], expected an object of fields @ config"),
         ({"config": {"clusters": 3}}, "clusters"),
-        ({"parts": []}, "found parts of list, expected dict"),
-        ({"source_bytes": None}, "found source_bytes of NoneType, expected dict"),
-        ({"aggregator": 3}, "found aggregator of int, expected dict"),
-        ({"version": None}, "found version of NoneType, expected str"),
-        ({"model_sha256": 7}, "found model_sha256 of int, expected str"),
+        ({"parts": []}, r"found \[\], expected dict @ config.parts"),
+        ({"version": None}, "version missing @ config"),
+        ({"model_sha256": 7}, "found 7, expected str @ config.model_sha256"),
         ({"config": {"cross_image": {"layers": 900}}}, "far from the sizes"),
-        ({"config": {"cross_image": {"layers": 99999999999}}}, "of up to 99999999999"),
+        ({"config": {"cross_image": {"layers": 99999999999}}}, "up to 99999999999"),
         ({"config": {"aggregator": {"name": "boq", "layers": 900}}}, "far from the sizes"),
-        ({"config": {"backbone": {"name": "vit", "dim": 9 * 10**12}}}, "of up to 9000000000000"),
+        ({"config": {"backbone": {"name": "vit", "dim": 9 * 10**12}}}, "up to 9000000000000"),
     ],
 )
 def test_foreign_metadata_with_a_right_checksum_are_refused(tmp_path, shared, value, words):
@@ -325,9 +277,7 @@ def test_foreign_metadata_with_a_right_checksum_are_refused(tmp_path, shared, va
 @pytest.mark.parametrize(
     ("length", "words"),
     [
-        *((length, "not a whole safetensors file") for length in (0, 5, 40, 5000)),
-        # The header is there, with the checksum.
-        (-1, "found other bytes than were written"),
+        *((length, "not a whole safetensors file") for length in (0, 5, 40, 5000, -1)),
     ],
 )
 def test_a_file_cut_short_is_refused(tmp_path, shared, length, words):
@@ -412,7 +362,7 @@ def test_the_hash_is_read_with_the_weights(shared, monkeypatch):
     path = shared / "weights.safetensors"
     expected = model_hash(*load_weights(path))
     monkeypatch.setattr(weights, "model_hash", None)
-    assert weights.load_with_hash(path)[2] == expected
+    assert weights.read_weights(path).digest == expected
 
 
 @pytest.mark.parametrize("name", [name for name, _, _ in fields_of(CONVERGING)])
@@ -450,54 +400,6 @@ def test_digests_do_not_change_by_accident(preset, digest):
     shapes = parameter_shapes(PRESETS[preset])
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     assert model_hash(zeros, PRESETS[preset]) == digest
-
-
-@dataclasses.dataclass(frozen=True)
-class LaterSinkhorn(SinkhornConfig):
-    """Of a later version."""
-
-    patience: int | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class LaterSalad(SaladConfig):
-    """Of a later version."""
-
-    part_name: ClassVar[str] = "salad"
-    sinkhorn: SinkhornConfig = LaterSinkhorn()
-    flavour: str = "plain"
-
-
-@dataclasses.dataclass(frozen=True)
-class LaterModel(ModelConfig):
-    """Of a later version."""
-
-    whitening: bool = False
-    seed: int = free_field(0)
-
-
-def as_later(kind: type, config: Any, **fields: Any) -> Any:
-    theirs = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return kind(**theirs, **fields)
-
-
-def test_a_field_that_a_later_version_adds_leaves_the_hash_at_its_default(params):
-    def later_hash(sinkhorn: dict[str, Any], salad: dict[str, Any], model: dict[str, Any]) -> str:
-        inner = as_later(LaterSinkhorn, MODEL.aggregator.sinkhorn, **sinkhorn)
-        plain = dataclasses.replace(MODEL.aggregator, sinkhorn=inner)
-        aggregator = as_later(LaterSalad, plain, **salad)
-        whole = dataclasses.replace(MODEL, aggregator=aggregator)
-        return model_hash(params, as_later(LaterModel, whole, **model))
-
-    found = model_hash(params, MODEL)
-    assert later_hash({}, {}, {}) == found
-    assert later_hash({}, {}, {"seed": 7}) == found
-    others = {
-        later_hash({"patience": 3}, {}, {}),
-        later_hash({}, {"flavour": "mint"}, {}),
-        later_hash({}, {}, {"whitening": True}),
-    }
-    assert len(others | {found}) == 4
 
 
 # Parts of plug-ins
@@ -594,7 +496,7 @@ def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
 
 def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypatch):
     path = tmp_path / "w.safetensors"
-    told = told_of(shared / "weights.safetensors", "crisalad-jax 3")
+    told = told_of(shared / "weights.safetensors", "crisalad-jax 4")
     told["parts"]["aggregator.dustbin"][1] = "0" * 64  # as the checksum is before it is known
     reseal(shared, path, told)
     assert notes_of(path) == []  # the same bytes are the same source
@@ -606,19 +508,3 @@ def test_a_built_in_part_whose_source_changed_is_told(tmp_path, shared, monkeypa
     # Those of another version are held by this package's tests to do the same.
     monkeypatch.setattr(weights, "VERSION", "99.0")
     assert notes_of(path) == []
-
-
-@pytest.mark.parametrize("parts", [{"aggregator": 3}, {"aggregator": ["salad"]}, {"x": []}])
-def test_sources_that_are_none_are_passed_over(tmp_path, shared, parts):
-    path = tmp_path / "w.safetensors"
-    reseal(shared, path, {"parts": parts})
-    assert notes_of(path) == []
-
-
-def test_an_array_in_another_order_is_written_as_it_reads(tmp_path) -> None:
-    """The library writes memory: columns first, it would be another array."""
-    array = np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3))
-    write_safetensors(tmp_path / "a.safetensors", {"a": array, "b": np.float32(3)}, {})
-    found = safetensors.numpy.load_file(tmp_path / "a.safetensors")
-    np.testing.assert_array_equal(found["a"], array)
-    assert found["b"].shape == ()

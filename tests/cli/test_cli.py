@@ -22,9 +22,9 @@ import safetensors.numpy
 import torch
 
 import crisalad_jax.cli
-from crisalad_jax.checkpoints.layouts import public_shapes
-from crisalad_jax.checkpoints.safetensors_io import write_sealed
-from crisalad_jax.checkpoints.torch_io import read_checkpoint
+from crisalad_jax.checkpoints.formats import public_shapes
+from crisalad_jax.checkpoints.public import read_checkpoint
+from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.checkpoints.weights import FORMAT, load_weights, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.config.io import read_config, to_plain
@@ -546,8 +546,8 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
         arrays["aggregator.dust_bin"] = (
             np.zeros(2, np.float32) if kind == "shape" else np.array(np.nan, np.float32)
         )
-        with safetensors.safe_open(whole, framework="numpy") as file:
-            write_sealed(weights, arrays, FORMAT, json.loads(file.metadata()[FORMAT]))
+        value, _ = read_sealed(whole, FORMAT, "weights")
+        write_sealed(weights, arrays, FORMAT, value)
     before = files_in(tmp_path)
     start = ("--weights", weights)
     town = shared / "town"
@@ -596,15 +596,15 @@ def test_convert_says_what_it_found(capfd, tmp_path, public):
     out = succeeds(capfd, "convert", ours, back)
     assert f"(crisalad-jax) -> {back} (DINOv2 .pth)" in out
     assert back.read_bytes() == public.read_bytes()
-    succeeds(capfd, "convert", ours, back, "--layout", "reference")
-    assert torch.load(back).keys() == {"state_dict", "config"}
+    succeeds(capfd, "convert", ours, back, "--format", "reference")
+    assert torch.load(back).keys() == {"state_dict"}
 
 
 def test_convert_refuses_in_one_line(capfd, tmp_path, public):
     for arguments, words in (
-        ((public, tmp_path / "x.pth"), ("x.pth: found suffix '.pth', expected .safetensors",)),
+        ((public, tmp_path / "x.pth"), ("x.pth: found the suffix '.pth', expected .safetensors",)),
         ((tmp_path / "none", tmp_path / "x.safetensors"), ("none: found no such file",)),
-        ((public, tmp_path / "x.safetensors", "--layout", "timm"), ("layout: found 'timm'",)),
+        ((public, tmp_path / "x.safetensors", "--format", "timm"), ("format: found 'timm'",)),
         ((public,), ("DST",)),
     ):
         fails(capfd, "convert", *arguments, words=words)

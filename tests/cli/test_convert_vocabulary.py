@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.checkpoints.layouts import public_shapes
-from crisalad_jax.checkpoints.layouts.anyloc import VOCABULARY
-from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint, read_vocabulary
+from crisalad_jax.checkpoints.formats import VOCABULARY, public_shapes
+from crisalad_jax.checkpoints.public import convert, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
@@ -53,7 +52,7 @@ def test_there_and_back_are_the_same_bytes(files, capfd, tmp_path: pathlib.Path)
     for name, leaf in named_leaves(params.backbone).items():
         np.testing.assert_array_equal(leaf, expected[name])
 
-    succeeds(capfd, "convert", ours, back, "--layout", VOCABULARY)
+    succeeds(capfd, "convert", ours, back, "--format", VOCABULARY)
     assert back.read_bytes() == words.read_bytes()
     # Unless asked for the words alone, the whole model goes.
     assert convert(ours, tmp_path / "whole.pth").target == "reference"
@@ -65,7 +64,7 @@ def test_what_does_not_belong_together(files, capfd, tmp_path: pathlib.Path) -> 
     torch.save(torch.ones(3, 96), wide)
     with pytest.raises(InputError, match=r"wide.pt: found a tensor of shape .3, 96., .* 64 num"):
         read_vocabulary(wide, backbone)
-    with pytest.raises(InputError, match=r"c_centers.pt: .*layer: found 5, expected -2 to 1"):
+    with pytest.raises(InputError, match=r"AnyLocConfig.layer: found 5, expected -2 to 1"):
         read_vocabulary(words, backbone, {"layer": 5})
     with pytest.raises(InputError, match=r"dinov2.pth: found dict, expected one tensor"):
         read_vocabulary(backbone, backbone)

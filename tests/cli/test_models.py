@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.cache import cached_weights
-from crisalad_jax.checkpoints.layouts import LAYOUTS
+from crisalad_jax.checkpoints.formats import FORMATS
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli import main
@@ -28,7 +28,7 @@ def _mirror(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CRISALAD_OFFLINE", raising=False)
     model = Published(
         name="tiny-model",
-        layout="huggingface",
+        format="huggingface",
         descriptor=64,
         parameters=88_640,
         images="56 x 56",
@@ -67,7 +67,7 @@ def test_one_model_is_told_with_all_that_is_known(capfd):
     facts = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert facts == {
         "name": "tiny-model",
-        "layout": "huggingface",
+        "format": "huggingface",
         "descriptor": "64",
         "parameters": "88,640",
         "images": "56 x 56",
@@ -152,9 +152,9 @@ def test_a_run_starts_from_a_backbone_by_name():
     assert_equal(start.backbone, expected.backbone)
 
 
-def test_the_help_of_convert_names_every_layout(capfd):
+def test_the_help_of_convert_names_every_format(capfd):
     out, _ = runs(capfd, "convert", "--help-all")
     words = " ".join(out.replace("│", " ").split())
-    for name, layout in LAYOUTS.items():
+    for name, each in FORMATS.items():
         assert f"{name}," in words
-        assert f"{layout.holds}," in words
+        assert f"{each.holds}," in words

@@ -621,7 +621,7 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
         (TrainConfig, {"cities": ("Bath", 3)}, "('Bath', 3)", "a tuple, each text, or None"),
         (LightAugmentConfig, {"blur": "1"}, "'1'", "a number"),
         (ExportConfig, {"batch_size": 1.5}, "1.5", "a whole number, or None"),
-        (ExportConfig, {"platforms": "cpu"}, "'cpu'", "a tuple, each text"),
+        (ExportConfig, {"platforms": "cpu"}, "'cpu'", "a tuple, each one of cpu"),
         (PcaConfig, {"whiten": "no"}, "'no'", "True or False"),
         (DemoConfig, {"epochs": 1.5}, "1.5", "a whole number"),
         (SyntheticCityConfig, {"test_places": "150"}, "'150'", "a whole number"),

@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional as F
 
 from crisalad_jax import describe, init_crisalad, load, save_weights
-from crisalad_jax.checkpoints.layouts import check_holds
+from crisalad_jax.checkpoints.formats import check_holds
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.nn.model import Model

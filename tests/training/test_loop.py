@@ -606,7 +606,7 @@ def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, pl
     for path in (tmp_path / "state" / "2" / "state").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[:3])
-    with pytest.raises(InputError, match=r"damaged.*delete it to go on from step 0") as error:
+    with pytest.raises(InputError, match=r"damaged.*delete it to resume from step 0") as error:
         fit(RECIPE, places, tmp_path, initial=params)
     assert str(error.value).startswith(str(tmp_path / "state" / "2"))
     assert "\n" not in str(error.value)

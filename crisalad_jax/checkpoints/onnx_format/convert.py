@@ -7,12 +7,9 @@ from typing import Any
 import numpy as np
 from jax.extend.core import Jaxpr, Literal
 
-from crisalad_jax.checkpoints.onnx_format import elementwise, products, reductions, shapes
 from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known
-from crisalad_jax.checkpoints.onnx_format.registry import CONVERTERS, Unsupported
+from crisalad_jax.checkpoints.onnx_format.operators import CONVERTERS, Unsupported, stacked
 
-MODULES = elementwise, products, reductions, shapes
-"""Modules whose import registers converters."""
 _CALLED = ("jaxpr", "call_jaxpr")
 """Parameters of primitives that call a program once: `jax.jit`, rematerialisation, own gradients"""
 
@@ -142,4 +139,4 @@ def _row(graph: Graph, x: Value, number: int) -> Value:
 
 def _stack(graph: Graph, values: Sequence[Value]) -> Value:
     broken = next((value for value in values if value.missing), None)
-    return broken or shapes.stacked(graph, values, 0)
+    return broken or stacked(graph, values, 0)

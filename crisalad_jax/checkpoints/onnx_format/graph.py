@@ -1,13 +1,12 @@
 """The nodes of an ONNX graph as they are made, and the values that run between them."""
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper
 
 from crisalad_jax.utils.version import VERSION
 
@@ -248,42 +247,3 @@ def tensor_type(dtype: Any) -> int:
 def _info(name: str, value: Value) -> onnx.ValueInfoProto:
     shape = [int(size) if is_known(size) else str(size) for size in value.shape]
     return helper.make_tensor_value_info(name, tensor_type(value.dtype), shape)
-
-
-_PAGE = 4096
-"""Bytes that arrays beside a program begin at multiples of, so that they can be mapped."""
-
-
-def place_constants(
-    model: onnx.ModelProto, constants: Mapping[str, np.ndarray], beside: str | None
-) -> list[tuple[int, np.ndarray]]:
-    """Put constants into a program, or tell it where they lie in a file beside it.
-
-    Args:
-        model: the program, which is changed.
-        constants: the arrays by name.
-        beside: name of the file for those of a page or more; None puts all into the program.
-
-    Returns:
-        Where each array begins in the file, in order.
-    """
-    places, end = [], 0
-    for name, array in constants.items():
-        if beside is None or array.nbytes < _PAGE:
-            # A view of transposed numbers is written in the order of its axes.
-            tensor = numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
-        else:
-            tensor = TensorProto(
-                name=name,
-                data_type=tensor_type(array.dtype),
-                dims=array.shape,
-                data_location=TensorProto.EXTERNAL,
-            )
-            start = math.ceil(end / _PAGE) * _PAGE
-            where = {"location": beside, "offset": str(start), "length": str(array.nbytes)}
-            for key, value in where.items():
-                tensor.external_data.add(key=key, value=value)
-            places.append((start, array))
-            end = start + array.nbytes
-        model.graph.initializer.append(tensor)
-    return places

@@ -1,5 +1,6 @@
 """Write a function of weights and images as an ONNX program."""
 
+import math
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -7,12 +8,16 @@ from typing import Any
 import jax
 import numpy as np
 import onnx
+from onnx import TensorProto, numpy_helper
 
 from crisalad_jax.checkpoints.onnx_format.convert import convert
 from crisalad_jax.checkpoints.onnx_format.graph import OPSET as OPSET
-from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known, place_constants
+from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known, tensor_type
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import told_of
+
+_PAGE = 4096
+"""Bytes that arrays next to a program begin at multiples of, so that they can be mapped."""
 
 
 def onnx_graph(
@@ -80,12 +85,47 @@ def write_onnx(
     graph, values, result = onnx_graph(run, weights, inputs)
     model = graph.model(values, [(output, result)], words)
     data = path.with_name(f"{path.name}.data")
-    places = place_constants(model, graph.constants, data.name if beside else None)
+    places = _place_constants(model, graph.constants, data.name if beside else None)
     with told_of(path):
         if beside:
-            write_constants(data, places)
+            _write_constants(data, places)
         path.write_bytes(model.SerializeToString(deterministic=True))
     return _products(model, graph.constants, [np.asarray(each) for each in weights.values()])
+
+
+def _place_constants(
+    model: onnx.ModelProto, constants: Mapping[str, np.ndarray], beside: str | None
+) -> list[tuple[int, np.ndarray]]:
+    """Put constants into a program, or tell it where they lie in a file beside it.
+
+    Args:
+        model: the program, which is changed.
+        constants: the arrays by name.
+        beside: name of the file for those of a page or more; None puts all into the program.
+
+    Returns:
+        Where each array begins in the file, in order.
+    """
+    places, end = [], 0
+    for name, array in constants.items():
+        if beside is None or array.nbytes < _PAGE:
+            # A view of transposed numbers is written in the order of its axes.
+            tensor = numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
+        else:
+            tensor = TensorProto(
+                name=name,
+                data_type=tensor_type(array.dtype),
+                dims=array.shape,
+                data_location=TensorProto.EXTERNAL,
+            )
+            start = math.ceil(end / _PAGE) * _PAGE
+            where = {"location": beside, "offset": str(start), "length": str(array.nbytes)}
+            for key, value in where.items():
+                tensor.external_data.add(key=key, value=value)
+            places.append((start, array))
+            end = start + array.nbytes
+        model.graph.initializer.append(tensor)
+    return places
 
 
 def _products(
@@ -101,7 +141,7 @@ def _products(
     ]
 
 
-def write_constants(path: pathlib.Path, places: Sequence[tuple[int, np.ndarray]]) -> None:
+def _write_constants(path: pathlib.Path, places: Sequence[tuple[int, np.ndarray]]) -> None:
     """Write arrays to a file, each at its place."""
     with path.open("wb") as file:
         for start, array in places:

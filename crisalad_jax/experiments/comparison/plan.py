@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.torch_io import read_backbone
+from crisalad_jax.checkpoints.public import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_count, check_types
 from crisalad_jax.config.concise import brief

@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 
-from crisalad_jax.checkpoints.torch_io import with_backbone_of
+from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain

@@ -160,7 +160,7 @@ class Aggregator(Part, abc.ABC):
         """Whether it has a `plan`."""
         return type(self).plan is not Aggregator.plan
 
-    def bind(self, params: Any, backbone: Any) -> Any:
+    def attach_backbone_hash(self, params: Any, backbone: Any) -> Any:
         """Return parameters with the backbone's digest, if they fit only this backbone."""
         return params
 

@@ -150,7 +150,7 @@ class Backbone(Part, abc.ABC):
         """Undo `split_blocks`."""
         return params
 
-    def adopt(self, config: Any, params: Any, fresh: Any) -> tuple[Any, Any]:
+    def adapt_checkpoint(self, config: Any, params: Any, fresh: Any) -> tuple[Any, Any]:
         """Return another's configuration and parameters, changed as far as this one can do with.
 
         Args:

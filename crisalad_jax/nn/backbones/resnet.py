@@ -98,7 +98,7 @@ class ResNetConfig(StagedBackbone):
             tuple(Stage(tuple(self._init_stage(keys[i], i))) for i in range(self.stages)),
         )
 
-    def adopt(self, config: Any, params: Stages, fresh: Any) -> tuple[Any, Stages]:
+    def adapt_checkpoint(self, config: Any, params: Stages, fresh: Any) -> tuple[Any, Stages]:
         """Take the first stages of a backbone with more, as torchvision's files have four."""
         del fresh
         stages = min(config.stages, self.stages)

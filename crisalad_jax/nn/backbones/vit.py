@@ -219,7 +219,7 @@ class VisionTransformer(Backbone):
         parts = tuple(jax.tree.map(operator.itemgetter(half), stack) for half in halves)
         return dataclasses.replace(params, blocks=parts)
 
-    def adopt(self, config: Any, params: ViT, fresh: ViT) -> tuple[Any, ViT]:
+    def adapt_checkpoint(self, config: Any, params: ViT, fresh: ViT) -> tuple[Any, ViT]:
         """Take the fresh adapters where the other's are of another kind or size."""
         if config.adapter == self.adapter:
             return config, params

@@ -528,12 +528,12 @@ class Map:
         """
         file = weights_of(self.metadata, self.folder) if weights is None else weights
         if engine == "jax":
-            from crisalad_jax.checkpoints.weights import load_with_hash
+            from crisalad_jax.checkpoints.weights import read_weights
             from crisalad_jax.nn.model import Model
 
-            params, _, digest = load_with_hash(file)
-            check_model(self.metadata, self.folder, digest, file)
-            model = Model(params, self.config)
+            found = read_weights(file)
+            check_model(self.metadata, self.folder, found.digest, file)
+            model = Model(found.params, self.config)
         else:
             config = self.metadata.config
             model = open_runtime(

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from crisalad_jax.checkpoints.layouts import public_shapes, to_state
+from crisalad_jax.checkpoints.formats import public_shapes, to_state
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
 from crisalad_jax.nn.aggregators.boq import Boq, BoqConfig

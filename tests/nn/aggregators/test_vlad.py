@@ -225,7 +225,7 @@ def test_a_vocabulary_knows_its_backbone() -> None:
         {"pos_embed_cls": backbone.cls_token, "cls_token": backbone.pos_embed_cls},
     )
     for each in (backbone, *(dataclasses.replace(backbone, **change) for change in others)):
-        bound = config.bind(words, each)
+        bound = config.attach_backbone_hash(words, each)
         np.testing.assert_array_equal(bound.words, words.words)
         config.check_backbone(bound, each, "some.safetensors")
         config.check_backbone(bound, jax.tree.map(np.asarray, each), "some.safetensors")
@@ -240,7 +240,7 @@ def test_a_files_metadata_keep_whose_vocabulary_it_is() -> None:
     config, words = AnyLocConfig(clusters=2), AnyLoc(jnp.ones((2, 32)))
     assert config.metadata(words) == {}
     assert config.with_metadata(words, {}).backbone == words.backbone
-    bound = config.bind(words, random_params(MODEL).backbone)
+    bound = config.attach_backbone_hash(words, random_params(MODEL).backbone)
     kept = config.metadata(bound)
     assert kept == {"backbone": bound.backbone}
     half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), bound)
@@ -248,4 +248,4 @@ def test_a_files_metadata_keep_whose_vocabulary_it_is() -> None:
     assert config.with_metadata(words, kept).backbone == bound.backbone
     # Of any other method there is nothing to keep.
     assert MODEL.aggregator.metadata(None) == {}
-    assert MODEL.aggregator.bind(words, None) is words
+    assert MODEL.aggregator.attach_backbone_hash(words, None) is words

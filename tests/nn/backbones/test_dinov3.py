@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.layouts import check_holds, infer, public_shapes, to_params, to_state
+from crisalad_jax.checkpoints.formats import check_holds, infer, public_shapes, to_params, to_state
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig

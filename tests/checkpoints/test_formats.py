@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.layouts import (
-    LAYOUTS,
+from crisalad_jax.checkpoints.formats import (
+    FORMATS,
     check_holds,
     infer,
     public_shapes,
@@ -68,7 +68,7 @@ def expected(name: str) -> tuple[str, ModelConfig]:
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_a_public_layout_is_read_to_the_name_and_its_model_inferred(name: str) -> None:
+def test_a_public_format_is_read_to_the_name_and_its_model_inferred(name: str) -> None:
     shapes = inner(name)
     layout, config = infer(blank(shapes), source=name)
     assert (layout, config) == expected(name)
@@ -113,7 +113,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_any_model_survives_the_reference_layout_bit_for_bit(name: str) -> None:
+def test_any_model_survives_the_reference_format_bit_for_bit(name: str) -> None:
     config = MODELS[name]
     params = random_params(config)
     state = to_state(params, config, "reference", {})
@@ -202,7 +202,7 @@ def test_the_first_of_what_is_wrong_is_listed(layout: str) -> None:
         to_params(state, config, layout, source="file.pth")
     message = str(caught.value)
     assert message.startswith(
-        f"file.pth: does not fit the layout {layout} of width 64 and 2 blocks"
+        f"file.pth: does not fit the format {layout} of width 64 and 2 blocks"
     )
     # The others are `head.weight`, unknown, and the norm, missing.
     first = f"blocks.9.x unknown; blocks.10.x unknown; {token} found (1, 64), expected (1, 1, 64)"
@@ -218,7 +218,7 @@ def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
     ("change", "words"),
     [
         (lambda s: {}, "found no checkpoint that we know .its first names: none"),
-        (lambda s: {"conv1.weight": s["norm.bias"]}, "its first names: conv1.weight"),
+        (lambda s: {"stem.weight": s["norm.bias"]}, "its first names: stem.weight"),
         (lambda s: without(s, "cls_token"), "found no cls_token"),
         (lambda s: without(s, "pos_embed"), "found no pos_embed"),
         (
@@ -235,7 +235,7 @@ def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
         ),
         (
             lambda s: {k: v for k, v in s.items() if not k.startswith("blocks.0.")},
-            "found no blocks.0.mlp.fc1.weight",
+            "found no blocks.0.mlp.fc2.weight",
         ),
     ],
 )
@@ -257,16 +257,16 @@ def test_a_missing_block_leaves_those_after_it_unknown() -> None:
 
 
 @pytest.mark.parametrize("layout", ["dinov2", "huggingface", "dino-salad", "cricavpr"])
-def test_a_layout_holds_its_own_models_only(layout: str) -> None:
-    with pytest.raises(InputError, match=f"layout {layout}: found a model of aggregator salad"):
+def test_a_format_holds_its_own_models_only(layout: str) -> None:
+    with pytest.raises(InputError, match=f"format {layout}: found a model of aggregator salad"):
         table(MODEL, layout)
     assert table(MODEL, "reference")
 
 
-def test_an_unknown_layout_is_named() -> None:
-    known = ", ".join(sorted(LAYOUTS))
+def test_an_unknown_format_is_named() -> None:
+    known = ", ".join(sorted(FORMATS))
     assert "dinov2, " in known
-    with pytest.raises(InputError, match=f"layout: found 'timm', expected one of {known}"):
+    with pytest.raises(InputError, match=f"format: found 'timm', expected one of {known}"):
         table(MODEL, "timm")
 
 
@@ -295,7 +295,7 @@ def test_other_dustbins_go_to_the_reference_alone(dustbin) -> None:
         aggregator=dataclasses.replace(MODEL.aggregator, dustbin=dustbin),
         cross_image=BARE,
     )
-    with pytest.raises(InputError, match=f"layout dino-salad: cannot tell.*dustbin.*{dustbin}"):
+    with pytest.raises(InputError, match=f"format dino-salad: cannot tell.*dustbin.*{dustbin}"):
         check_holds(config, "dino-salad")
     params = random_params(config)
     state = to_state(params, config, "reference", {})

@@ -39,13 +39,6 @@ class Extra(NamedTuple):
     value: float | tuple[float, ...] = 0.0
     """Its initial value, for a model that was not read from such a file."""
     form: Form = SAME
-    free_axes: int = 0
-    """Number of leading axes whose lengths may differ from file to file."""
-
-    def fits(self, shape: tuple[int, ...]) -> bool:
-        """Return whether an array of this shape can be the extra."""
-        free = self.free_axes
-        return len(shape) == len(self.shape) and shape[free:] == self.shape[free:]
 
     def stored(self, extras: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the array as their files have it; an initial value takes no memory."""
@@ -91,6 +84,10 @@ PAIR_BIAS = Form(lambda a, b: (np.concatenate([a, b]),), lambda b: tuple(np.spli
 QKV_BIAS = Form(lambda q, k, v: (np.concatenate([q, k, v]),), lambda b: tuple(np.split(b, 3)))
 
 
+Lines = Iterator[Entry | Extra | Absent]
+"""A table of names, in the public order."""
+
+
 def affine(ours: str, theirs: str, form: Form, *, bias: bool = True) -> Iterator[Entry]:
     """Yield the lines of a weight and, if it has one, a bias."""
     yield Entry((f"{ours}.weight",), (f"{theirs}.weight",), form)
@@ -98,26 +95,26 @@ def affine(ours: str, theirs: str, form: Form, *, bias: bool = True) -> Iterator
         yield Entry((f"{ours}.bias",), (f"{theirs}.bias",), SAME)
 
 
-def batch_norm_lines(ours: str, theirs: str, *, counts: bool = True) -> Iterator[Entry | Extra]:
-    """Yield the lines of a batch norm: gain, shift, statistics, and, if kept, the batch count."""
+def affines(ours: str, theirs: str, layers: Mapping[str, Form]) -> Iterator[Entry]:
+    """Yield the lines of layers that have the same names in both, after a prefix each."""
+    for name, form in layers.items():
+        yield from affine(f"{ours}{name}", f"{theirs}{name}", form)
+
+
+def batch_norm_lines(ours: str, theirs: str) -> Lines:
+    """Yield the lines of a batch norm: gain, shift, statistics, and the count of batches."""
     yield from affine(ours, theirs, SAME)
     for name in ("running_mean", "running_var"):
         yield Entry((f"{ours}.{name}",), (f"{theirs}.{name}",), SAME)
-    if counts:
-        count = "num_batches_tracked"
-        yield Extra(f"{ours}.{count}", f"{theirs}.{count}", (), np.int64)
+    count = "num_batches_tracked"
+    yield Extra(f"{ours}.{count}", f"{theirs}.{count}", (), np.int64)
 
 
 def transformer_layer(ours: str, theirs: str) -> Iterator[Entry]:
     """Yield the lines of one layer, under torch.nn.TransformerEncoderLayer's names."""
     yield from torch_attention(f"{ours}.attn", f"{theirs}.self_attn")
-    for name, form in (
-        ("linear1", LINEAR),
-        ("linear2", LINEAR),
-        ("norm1", SAME),
-        ("norm2", SAME),
-    ):
-        yield from affine(f"{ours}.{name}", f"{theirs}.{name}", form)
+    layers = {"linear1": LINEAR, "linear2": LINEAR, "norm1": SAME, "norm2": SAME}
+    yield from affines(f"{ours}.", f"{theirs}.", layers)
 
 
 def torch_attention(ours: str, theirs: str) -> Iterator[Entry]:

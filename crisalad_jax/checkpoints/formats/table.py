@@ -1,0 +1,198 @@
+"""Convert parameters to the arrays of a public format, and back."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from crisalad_jax.checkpoints.formats.families import FORMATS, REFERENCE, VOCABULARY
+from crisalad_jax.checkpoints.formats.format import State, parts_in_words
+from crisalad_jax.checkpoints.formats.forms import Absent, Entry, Extra
+from crisalad_jax.config.checks import choose
+from crisalad_jax.config.fields import with_free_fields_of
+from crisalad_jax.config.io import differences
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.vit import VisionTransformer
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.utils.errors import InputError, few
+from crisalad_jax.utils.pytree import named_leaves
+
+
+def table(config: ModelConfig, name: str) -> list[Entry | Extra | Absent]:
+    """Return a format's table for a model, in the public order, without the prefix `module.`.
+
+    Raises:
+        InputError: no such format, or the model has parts that it cannot hold.
+    """
+    form = choose("format", name, FORMATS)
+    if not form.accepts(config):
+        raise InputError(
+            f"format {name}: found a model of {parts_in_words(config)}, expected "
+            f"{form.expected()} (format {REFERENCE} holds any)"
+        )
+    return list(form.lines(config))
+
+
+def check_holds(config: ModelConfig, name: str) -> ModelConfig:
+    """Check that a model can be written in a format and read back as the same model.
+
+    Returns:
+        The configuration that is inferred from its file, which may have other free fields.
+
+    Raises:
+        InputError: what `table` raises; or a setting that no shape tells and that differs from the
+            published one, which reading would take for it.
+    """
+    state = _initial_state(config, name)
+    if name in (REFERENCE, VOCABULARY):  # which have the configuration, or no model
+        return config
+    read_back = FORMATS[name].infer(state)
+    wrong = differences(_shown(with_free_fields_of(config, read_back)), _shown(config))
+    if wrong:
+        raise InputError(
+            f"format {name}: cannot tell these apart from the published ones: "
+            f"{'; '.join(wrong)} (format {REFERENCE} can)"
+        )
+    return read_back
+
+
+def _shown(config: ModelConfig) -> ModelConfig:
+    """Return a configuration with all fields reset that a trained model's arrays do not show."""
+    backbone = config.backbone
+    if not isinstance(backbone, VisionTransformer):
+        return config
+    adapter = backbone.adapter
+    if adapter.kind != "none":
+        kernel = {} if adapter.kind == "depthwise" else {"kernel_size": AdapterConfig.kernel_size}
+        bottleneck = backbone.adapter_dim / backbone.dim
+        adapter = dataclasses.replace(adapter, bottleneck=bottleneck, **kernel)
+    backbone = dataclasses.replace(
+        backbone, mlp_ratio=backbone.hidden / backbone.dim, adapter=adapter
+    )
+    return dataclasses.replace(config, backbone=backbone)
+
+
+def public_shapes(config: ModelConfig, name: str) -> dict[str, tuple[int, ...]]:
+    """Return every name of a format with its shape, in the public order.
+
+    Raises:
+        InputError: what `table` raises.
+    """
+    return {theirs: array.shape for theirs, array in _initial_state(config, name).items()}
+
+
+def _initial_state(config: ModelConfig, name: str) -> dict[str, np.ndarray]:
+    """Return a state of zeros and of the extras' initial values; its arrays take no memory."""
+    zeros = jax.tree.map(
+        lambda leaf: np.broadcast_to(np.zeros((), leaf.dtype), leaf.shape), parameter_shapes(config)
+    )
+    return _theirs(zeros, config, name, {})
+
+
+def to_params(
+    state: State, config: ModelConfig, name: str, *, source: str
+) -> tuple[Crisalad, dict[str, np.ndarray]]:
+    """Convert arrays by public name to (parameters, extras), as numpy arrays of the same types.
+
+    The extras are arrays of public checkpoints that no descriptor needs, and that a file may lack:
+    DINOv2's mask token, the batch norms' counts of batches, DINOv3's periods.
+
+    Raises:
+        InputError: naming `source` and the first names that are missing, unknown or misshaped.
+    """
+    lines = table(config, name)
+    shapes = public_shapes(config, name)
+    for line in lines:
+        if isinstance(line, Extra) and line.theirs not in state:
+            del shapes[line.theirs]
+    problems = [f"{theirs} missing" for theirs in shapes.keys() - state.keys()]
+    problems += [f"{theirs} unknown" for theirs in state.keys() - shapes.keys()]
+    problems += [
+        f"{theirs} found {state[theirs].shape}, expected {shape}"
+        for theirs, shape in shapes.items()
+        if theirs in state and state[theirs].shape != shape
+    ]
+    if problems:
+        raise InputError(
+            f"{source}: does not fit the format {name} of width {config.backbone.dim} and "
+            f"{config.backbone.depth} blocks: {few(sorted(problems, key=_natural))}"
+        )
+    template = named_leaves(parameter_shapes(config))
+    ours: dict[str, np.ndarray] = {}
+    extras: dict[str, np.ndarray] = {}
+    for line in lines:
+        if isinstance(line, Extra):
+            if line.theirs in state:
+                (extras[line.name],) = line.form.ours(state[line.theirs])
+        elif isinstance(line, Absent):
+            ours[line.ours] = np.full(template[line.ours].shape, line.value, np.float32)
+        else:
+            arrays = line.form.ours(*(state[theirs] for theirs in line.theirs))
+            ours |= zip(line.ours, arrays, strict=True)
+    return _from_numbered(ours, config), extras
+
+
+def to_state(
+    params: Crisalad, config: ModelConfig, name: str, extras: State
+) -> dict[str, np.ndarray]:
+    """Undo `to_params`, in the public order; missing extras have their initial values.
+
+    Raises:
+        InputError: the format has no place for a part of this model.
+    """
+    state = _theirs(jax.tree.map(np.asarray, params), config, name, extras)
+    return {theirs: np.ascontiguousarray(x).reshape(x.shape) for theirs, x in state.items()}
+
+
+def _theirs(
+    params: Crisalad, config: ModelConfig, name: str, extras: State
+) -> dict[str, np.ndarray]:
+    ours = _numbered(named_leaves(params))
+    state: dict[str, np.ndarray] = {}
+    for line in table(config, name):
+        if isinstance(line, Extra):
+            state[line.theirs] = line.stored(extras)
+        elif isinstance(line, Entry):
+            arrays = line.form.theirs(*(ours[each] for each in line.ours))
+            state |= zip(line.theirs, arrays, strict=True)
+    return state
+
+
+_STACK = re.compile(r"backbone\.blocks\.(?!\d)")
+"""Beginning of the names of stacked blocks; blocks that are no stack have numbers already."""
+
+
+def _numbered(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Split stacks of blocks into single blocks, with numbered names."""
+    single: dict[str, np.ndarray] = {}
+    for name, leaf in leaves.items():
+        if _STACK.match(name):
+            single |= {_name_of_block(name, i): block for i, block in enumerate(leaf)}
+        else:
+            single[name] = leaf
+    return single
+
+
+def _name_of_block(name: str, number: int) -> str:
+    return _STACK.sub(lambda match: f"{match[0]}{number}.", name)
+
+
+def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
+    template = parameter_shapes(config)
+    leaves = []
+    for name, leaf in named_leaves(template).items():
+        if _STACK.match(name):
+            leaves.append(np.stack([ours[_name_of_block(name, i)] for i in range(leaf.shape[0])]))
+        else:
+            # Empty arrays, such as absent registers, have no line in any table.
+            leaves.append(ours[name] if leaf.size else np.zeros(leaf.shape, leaf.dtype))
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+
+def _natural(text: str) -> list[Any]:
+    """Return a sort key that puts block 10 after block 9."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", text)]

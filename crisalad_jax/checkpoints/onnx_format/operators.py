@@ -1,0 +1,444 @@
+"""The conversion of each of JAX's primitives to nodes of ONNX."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from crisalad_jax.checkpoints.onnx_format.graph import (
+    Graph,
+    Shape,
+    Value,
+    common_shape,
+    is_known,
+    is_one,
+)
+
+Converter = Callable[[Graph, Sequence[Value], Any], list[Value]]
+"""A function that appends the nodes of JAX's equation to a graph, and returns the outputs."""
+CONVERTERS: dict[str, Converter] = {}
+"""Converters by primitive."""
+
+
+class Unsupported(Exception):
+    """A primitive, or a use of one, that has no operator; the message names it."""
+
+
+def converts(*names: str) -> Callable[[Converter], Converter]:
+    """Register a converter of primitives."""
+
+    def register(converter: Converter) -> Converter:
+        CONVERTERS.update(dict.fromkeys(names, converter))
+        return converter
+
+    return register
+
+
+# Number by number, which nodes broadcast as numpy does.
+
+_PLAIN = {
+    "abs": "Abs",
+    "add": "Add",
+    "add_any": "Add",
+    "and": "And",
+    "ceil": "Ceil",
+    "cos": "Cos",
+    "div": "Div",
+    "eq": "Equal",
+    "erf": "Erf",
+    "exp": "Exp",
+    "floor": "Floor",
+    "ge": "GreaterOrEqual",
+    "gt": "Greater",
+    "le": "LessOrEqual",
+    "log": "Log",
+    "logistic": "Sigmoid",
+    "lt": "Less",
+    "max": "Max",
+    "min": "Min",
+    "mul": "Mul",
+    "neg": "Neg",
+    "not": "Not",
+    "or": "Or",
+    "pow": "Pow",
+    "sign": "Sign",
+    "sin": "Sin",
+    "sqrt": "Sqrt",
+    "sub": "Sub",
+    "tanh": "Tanh",
+    "xor": "Xor",
+}
+"""Operators by the primitives that they are the same as."""
+_TRUTH = {"Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Not", "And", "Or", "Xor"}
+"""Operators whose results are true or false."""
+_COMPOSED: Mapping[str, Callable[..., Value]] = {
+    "clamp": lambda add, params, least, x, most: add("Min", add("Max", x, least), most),
+    "exp2": lambda add, params, x: add("Pow", 2, x),
+    "expm1": lambda add, params, x: add("Sub", add("Exp", x), 1),
+    "integer_pow": lambda add, params, x: (
+        add("Mul", x, x) if params["y"] == 2 else add("Pow", x, params["y"])
+    ),
+    # Only finite numbers are 0 times themselves; and no engine lacks these two.
+    "is_finite": lambda add, params, x: add("Equal", add("Mul", x, 0), 0),
+    "log1p": lambda add, params, x: add("Log", add("Add", x, 1)),
+    "ne": lambda add, params, x, y: add("Not", add("Equal", x, y)),
+    "rsqrt": lambda add, params, x: add("Div", 1, add("Sqrt", x)),
+    "select_n": lambda add, params, which, no, yes: add("Where", which, yes, no),
+    "square": lambda add, params, x: add("Mul", x, x),
+}
+"""Functions by primitive that make it of several operators."""
+
+
+@converts(*_PLAIN, *_COMPOSED)
+def _elementwise(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    """Convert to one operator or several. Constants are computed by JAX itself."""
+    name, dtype = eqn.primitive.name, np.dtype(eqn.outvars[0].aval.dtype)
+    shape = common_shape(*(value.shape for value in inputs))
+    if all(value.constant is not None for value in inputs):
+        arrays = [np.broadcast_to(value.constant, shape) for value in inputs]  # type: ignore
+        return [Value.of(eqn.primitive.bind(*map(np.asarray, arrays), **eqn.params))]
+    if name in ("and", "or", "not", "xor") and dtype != np.bool_:
+        raise Unsupported(f"{name} of {dtype}")
+    if name == "select_n" and (inputs[0].dtype != np.bool_ or len(inputs) != 3):
+        raise Unsupported("select_n of more than two cases")
+    add = functools.partial(_node, graph, shape)
+    if name in _PLAIN:
+        value = add(_PLAIN[name], *inputs)
+    else:
+        value = _COMPOSED[name](add, eqn.params, *inputs)
+    return [dataclasses.replace(value, dtype=dtype)]
+
+
+def _node(graph: Graph, shape: Shape, operator: str, *inputs: Value | float) -> Value:
+    """Append a node; numbers among the inputs are of the other inputs' type."""
+    dtype = next(each.dtype for each in reversed(inputs) if isinstance(each, Value))
+    values = [x if isinstance(x, Value) else Value.of(np.array(x, dtype)) for x in inputs]
+    return graph.add(operator, values, shape, np.bool_ if operator in _TRUTH else dtype)
+
+
+# Moving numbers, and computing none.
+
+
+@converts("stop_gradient", "name", "copy", "copy_p", "optimization_barrier", "reduce_precision")
+def _same(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    return list(inputs)
+
+
+@converts("convert_element_type")
+def _cast(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    return [graph.cast(inputs[0], eqn.params["new_dtype"])]
+
+
+@converts("broadcast_in_dim")
+def _broadcast(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    own: list[Any] = [1] * len(eqn.params["shape"])
+    for axis, size in zip(eqn.params["broadcast_dimensions"], inputs[0].shape, strict=True):
+        own[axis] = size
+    return [graph.reshape(inputs[0], tuple(own))]
+
+
+@converts("reshape", "squeeze", "expand_dims")
+def _reshape(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    (x,) = inputs
+    before, after = eqn.invars[0].aval.shape, eqn.outvars[0].aval.shape
+    if eqn.params.get("dimensions") is not None and eqn.primitive.name == "reshape":
+        raise Unsupported("reshape of permuted axes")
+    own = _with_other_ones(x.shape, before, after)
+    return [graph.reshape(x, own) if own else graph.reshape(graph.full(x, before), after)]
+
+
+def _with_other_ones(own: Shape, before: Shape, after: Shape) -> Shape | None:
+    """Return the lazy shape of an array that gains or loses sides of 1 alone; else None."""
+    kept = [axis for axis, size in enumerate(before) if not is_one(size)]
+    places = [axis for axis, size in enumerate(after) if not is_one(size)]
+    if [before[axis] for axis in kept] != [after[axis] for axis in places]:
+        return None
+    shape: list[Any] = [1] * len(after)
+    for axis, place in zip(kept, places, strict=True):
+        shape[place] = own[axis]
+    return tuple(shape)
+
+
+@converts("transpose")
+def _transpose(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    return [graph.transpose(inputs[0], eqn.params["permutation"])]
+
+
+@converts("slice")
+def _slice(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    starts, ends = eqn.params["start_indices"], eqn.params["limit_indices"]
+    steps = eqn.params["strides"] or (1,) * len(starts)
+    return [_cut(graph, inputs[0], eqn.invars[0].aval.shape, starts, ends, steps)]
+
+
+def _cut(
+    graph: Graph,
+    x: Value,
+    whole: Shape,
+    starts: Sequence[Any],
+    ends: Sequence[Any],
+    steps: Sequence[int],
+) -> Value:
+    """Take a part of each axis, where the array is not broadcast along it."""
+    cuts = {}
+    for axis, cut in enumerate(zip(starts, ends, steps, strict=True)):
+        start, end, step = cut
+        if (is_known(start) and start == 0 and end == whole[axis] and step == 1) or is_one(
+            x.shape[axis]
+        ):
+            continue
+        if not all(map(is_known, cut)):
+            raise Unsupported("slice of some of the images")
+        cuts[axis] = tuple(map(int, cut))
+    return graph.slice(x, cuts)
+
+
+@converts("split")
+def _split(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    (x,), axis, sizes = inputs, eqn.params["axis"], eqn.params["sizes"]
+    parts, start = [], 0
+    for size in sizes:
+        lazy = is_one(x.shape[axis])
+        parts.append(x if lazy else graph.slice(x, {axis: (start, start + size, 1)}))
+        start += size
+    return parts
+
+
+@converts("concatenate")
+def _concatenate(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    axis = eqn.params["dimension"]
+    wholes = [
+        graph.full(x, var.aval.shape, [axis]) for x, var in zip(inputs, eqn.invars, strict=True)
+    ]
+    return [graph.concatenate(wholes, axis)]
+
+
+@converts("stack")
+def _stack(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    return [stacked(graph, inputs, eqn.params["axis"])]
+
+
+def stacked(graph: Graph, values: Sequence[Value], axis: int) -> Value:
+    """Join values along a new axis."""
+    parts = [graph.reshape(x, (*x.shape[:axis], 1, *x.shape[axis:])) for x in values]
+    return graph.concatenate(parts, axis)
+
+
+@converts("pad")
+def _pad(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    x, filling = inputs
+    config = eqn.params["padding_config"]
+    if any(inside or low < 0 or high < 0 for low, high, inside in config):
+        raise Unsupported("pad between numbers, or by less than none")
+    axes = [axis for axis, sides in enumerate(config) if any(sides)]
+    x = graph.full(x, eqn.invars[0].aval.shape, axes)
+    shape = [
+        low + size + high if axis in axes else size
+        for axis, (size, (low, high, _)) in enumerate(zip(x.shape, config, strict=True))
+    ]
+    widths = graph.ints(*(low for low, _, _ in config), *(high for _, high, _ in config))
+    filling = graph.reshape(filling, ())
+    return [graph.add("Pad", [x, widths, filling], tuple(shape), x.dtype)]
+
+
+@converts("iota")
+def _iota(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    shape, axis, dtype = (eqn.params[name] for name in ("shape", "dimension", "dtype"))
+    own = tuple(size if each == axis else 1 for each, size in enumerate(shape))
+    if is_known(shape[axis]):
+        return [Value.of(np.arange(shape[axis], dtype=dtype).reshape(own))]
+    zero, one = (Value.of(np.array(number, np.int64)) for number in (0, 1))
+    count = graph.add("Squeeze", [graph.side(shape[axis])], (), np.int64)
+    numbers = graph.add("Range", [zero, count, one], (shape[axis],), np.int64)
+    return [graph.cast(graph.reshape(numbers, own), dtype)]
+
+
+@converts("dim_as_value")
+def _side(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    number = graph.add("Squeeze", [graph.side(eqn.params["dim"])], (), np.int64)
+    return [graph.cast(number, eqn.outvars[0].aval.dtype)]
+
+
+@converts("gather")
+def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    x, places = inputs
+    whole, shape = eqn.invars[0].aval.shape, eqn.invars[1].aval.shape
+    how, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
+    if how.operand_batching_dims or places.constant is None or len(shape) > 1:
+        return [_take(graph, x, places, eqn)]
+    numbers = np.broadcast_to(places.constant, shape)
+    starts, ends = [0] * len(whole), list(sizes)
+    for axis, number in zip(how.start_index_map, numbers.tolist(), strict=True):
+        if sizes[axis] != whole[axis]:
+            starts[axis] = min(max(number, 0), whole[axis] - sizes[axis])
+            ends[axis] = starts[axis] + sizes[axis]
+    part = _cut(graph, x, whole, starts, ends, [1] * len(whole))
+    kept = [axis for axis in range(len(whole)) if axis not in how.collapsed_slice_dims]
+    return [graph.reshape(part, tuple(part.shape[axis] for axis in kept))]
+
+
+def _take(graph: Graph, x: Value, places: Value, eqn: Any) -> Value:
+    """Convert a gather that takes whole slices of one axis."""
+    whole, shape = eqn.invars[0].aval.shape, eqn.invars[1].aval.shape
+    how, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
+    axes = how.start_index_map
+    others = [size for axis, size in enumerate(sizes) if axis not in axes]
+    fits = (
+        len(axes) == 1
+        and how.collapsed_slice_dims == axes
+        and not how.operand_batching_dims
+        and others == [size for axis, size in enumerate(whole) if axis not in axes]
+        and is_known(whole[axes[0]])
+    )
+    if not fits:
+        raise Unsupported("gather at places that are computed, of several axes")
+    (axis,) = axes
+    x, places = graph.full(x, whole, [axis]), graph.full(places, shape)
+    indices = graph.reshape(places, shape[:-1])
+    # A place beyond the ends is the end's, as JAX's programs of indices have it.
+    least, most = (Value.of(np.array(each, indices.dtype)) for each in (0, whole[axis] - 1))
+    if indices.constant is not None:
+        indices = Value.of(np.clip(indices.constant, 0, whole[axis] - 1))
+    else:
+        indices = graph.add("Max", [indices, least], indices.shape, indices.dtype)
+        indices = graph.add("Min", [indices, most], indices.shape, indices.dtype)
+    taken_shape = (*x.shape[:axis], *indices.shape, *x.shape[axis + 1 :])
+    taken = graph.add("Gather", [x, indices], taken_shape, x.dtype, axis=axis)
+    # There the places' axes stand where the axis was; JAX says where the others go.
+    count, rank = len(indices.shape), len(taken_shape)
+    of_places = iter(range(axis, axis + count))
+    of_others = iter([each for each in range(rank) if not axis <= each < axis + count])
+    order = [next(of_others if each in how.offset_dims else of_places) for each in range(rank)]
+    return graph.transpose(taken, order)
+
+
+# Reductions of axes, and of windows of images.
+
+
+_BY_ATTRIBUTE = {"reduce_max": "ReduceMax", "reduce_min": "ReduceMin", "reduce_prod": "ReduceProd"}
+
+
+def _whole(graph: Graph, inputs: Sequence[Value], eqn: Any, axes: Sequence[int]) -> Value:
+    return graph.full(inputs[0], eqn.invars[0].aval.shape, axes)
+
+
+@converts("reduce_sum")
+def _sum(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    axes = eqn.params["axes"]
+    x = _whole(graph, inputs, eqn, axes)
+    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
+    return [graph.add("ReduceSum", [x, graph.ints(*axes)], shape, x.dtype, keepdims=0)]
+
+
+def _extreme(graph: Graph, x: Value, name: str, axes: Sequence[int]) -> Value:
+    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
+    # Repeated rows have their own extremes.
+    return graph.add(_BY_ATTRIBUTE[name], [x], shape, x.dtype, axes=list(axes), keepdims=0)
+
+
+@converts(*_BY_ATTRIBUTE)
+def _reduce(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    axes = eqn.params["axes"]
+    return [_extreme(graph, _whole(graph, inputs, eqn, axes), eqn.primitive.name, axes)]
+
+
+@converts("reduce_and", "reduce_or")
+def _logic(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    name = {"reduce_and": "reduce_min", "reduce_or": "reduce_max"}[eqn.primitive.name]
+    x = graph.cast(inputs[0], np.float32)  # which TensorRT takes, unlike whole numbers
+    return [graph.cast(_extreme(graph, x, name, eqn.params["axes"]), np.bool_)]
+
+
+@converts("argmax")
+def _place(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    (axis,) = eqn.params["axes"]
+    x = _whole(graph, inputs, eqn, [axis])
+    shape = (*x.shape[:axis], *x.shape[axis + 1 :])
+    place = graph.add("ArgMax", [x], shape, np.int64, axis=axis, keepdims=0)
+    return [graph.cast(place, eqn.params["index_dtype"])]
+
+
+@converts("reduce_window_max")
+def _largest_of_windows(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    window, padding = eqn.params["window_dimensions"], eqn.params["padding"]
+    axes = [axis for axis, size in enumerate(window) if not is_one(size)]
+    others = [axis for axis in range(len(window)) if axis not in axes]
+    dilated = (*eqn.params["base_dilation"], *eqn.params["window_dilation"])
+    if len(others) != 2 or any(map(any, (padding[axis] for axis in others))) or set(dilated) != {1}:
+        raise Unsupported("reduce_window_max of other axes than those of an image")
+    strides = eqn.params["window_strides"]
+    x = _whole(graph, inputs, eqn, range(len(window)))
+    order = [*others, *axes]
+    result = eqn.outvars[0].aval.shape
+    pooled = graph.add(
+        "MaxPool",
+        [graph.transpose(x, order)],
+        tuple(result[axis] for axis in order),
+        x.dtype,
+        kernel_shape=[window[axis] for axis in axes],
+        strides=[strides[axis] for axis in axes],
+        pads=[padding[axis][end] for end in (0, 1) for axis in axes],
+    )
+    return [graph.transpose(pooled, np.argsort(order).tolist())]
+
+
+# Products of matrices, and convolutions.
+
+
+@converts("dot_general")
+def _product(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    (summed_a, summed_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
+    shapes = [var.aval.shape for var in eqn.invars]
+    free_a, free_b = (
+        [axis for axis in range(len(shape)) if axis not in (*summed, *batch)]
+        for shape, summed, batch in zip(
+            shapes, (summed_a, summed_b), (batch_a, batch_b), strict=True
+        )
+    )
+    # MatMul broadcasts the batch; all other axes are needed as they are.
+    a, b = (
+        graph.full(x, shape, [axis for axis in range(len(shape)) if axis not in batch])
+        for x, shape, batch in zip(inputs, shapes, (batch_a, batch_b), strict=True)
+    )
+    dtype = eqn.outvars[0].aval.dtype
+    a, b = graph.cast(a, dtype), graph.cast(b, dtype)
+    a = graph.transpose(a, [*batch_a, *free_a, *summed_a])
+    b = graph.transpose(b, [*batch_b, *summed_b, *free_b])
+    count = len(batch_a)
+    rows, columns = ([shapes[i][axis] for axis in free] for i, free in ((0, free_a), (1, free_b)))
+    sums = [shapes[0][axis] for axis in summed_a]
+    a_batch, b_batch = a.shape[:count], b.shape[:count]
+    # Rows in several axes stay so where one matrix is common to all of them.
+    if count or len(columns) != 1 or not rows:
+        a = graph.reshape(a, (*a_batch, math.prod(rows), math.prod(sums)))
+    elif len(sums) != 1:
+        a = graph.reshape(a, (*rows, math.prod(sums)))
+    b = graph.reshape(b, (*b_batch, math.prod(sums), math.prod(columns)))
+    together: Shape = (*common_shape(a_batch, b_batch), *a.shape[count:-1], b.shape[-1])
+    product = graph.add("MatMul", [a, b], together, dtype)
+    return [graph.reshape(product, (*together[:count], *rows, *columns))]
+
+
+@converts("conv_general_dilated")
+def _convolution(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    x, kernel = (graph.full(x, var.aval.shape) for x, var in zip(inputs, eqn.invars, strict=True))
+    params, order = eqn.params, eqn.params["dimension_numbers"]
+    if set(params["lhs_dilation"]) != {1} or params["batch_group_count"] != 1:
+        raise Unsupported("conv_general_dilated between pixels, or in groups of images")
+    dtype = eqn.outvars[0].aval.dtype
+    result = tuple(eqn.outvars[0].aval.shape[axis] for axis in order.out_spec)
+    pads = params["padding"]
+    convolved = graph.add(
+        "Conv",
+        [graph.transpose(x, order.lhs_spec), graph.transpose(kernel, order.rhs_spec)],
+        result,
+        dtype,
+        strides=list(params["window_strides"]),
+        dilations=list(params["rhs_dilation"]),
+        group=params["feature_group_count"],
+        pads=[pad[end] for end in (0, 1) for pad in pads],
+    )
+    return [graph.transpose(convolved, np.argsort(order.out_spec).tolist())]

@@ -1,0 +1,366 @@
+"""Read and write public checkpoints, and convert them to this package's files and back."""
+
+import dataclasses
+import json
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crisalad_jax.checkpoints.formats import (
+    FORMATS,
+    REFERENCE,
+    VOCABULARY,
+    State,
+    check_holds,
+    identify,
+    public_shapes,
+    renamed_to,
+    to_params,
+    to_state,
+)
+from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX, read_matlab
+from crisalad_jax.checkpoints.safetensors_io import read_safetensors, write_safetensors
+from crisalad_jax.checkpoints.torch_io import (
+    DECLARED,
+    Content,
+    read_tensor,
+    read_torch,
+    write_torch,
+)
+from crisalad_jax.checkpoints.weights import FORMAT, check_sizes, save_weights, unpack_weights
+from crisalad_jax.config.checks import PATH, choose, takes
+from crisalad_jax.config.concise import brief
+from crisalad_jax.config.fields import with_free_fields_of
+from crisalad_jax.config.io import differences, from_plain, to_plain
+from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig
+from crisalad_jax.nn.backbones import Backbone
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Crisalad, Model
+from crisalad_jax.nn.projection import ProjectionConfig
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_source, check_target, is_html, parse_json
+
+SUFFIXES = {"torch": (".pth", ".pt", ".ckpt"), "safetensors": (".safetensors",)}
+"""Suffixes of files that can be written, by `Format.stored`."""
+
+
+@brief
+class Checkpoint(NamedTuple):
+    """A model from any file we can read."""
+
+    params: Crisalad
+    config: ModelConfig
+    extras: dict[str, np.ndarray]
+    format: str | None
+    """Public format of the file; None for a file of this package."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Declared:
+    """What a public checkpoint that we write says of its model."""
+
+    format: str
+    config: ModelConfig
+    aggregator: dict
+    """What the aggregator keeps besides arrays."""
+
+
+def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
+    """Read a public checkpoint, or a file of this package; half precision becomes float32 exactly.
+
+    Torch files are read by `torch.load(weights_only=True)`, which runs no code of the file.
+
+    Raises:
+        InputError: the file is missing, cut short, none of the formats, asks to run code, or does
+            not fit its format (the first names that are missing, unknown or misshaped are listed);
+            or torch is needed and not installed.
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a checkpoint")
+    with path.open("rb") as file:
+        start = file.read(512)
+    if is_html(start):
+        raise InputError(f"{path}: found a page of HTML, expected a checkpoint")
+    # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
+    if path.suffix == MATLAB_SUFFIX:
+        network = read_matlab(path)
+        checkpoint = _model_of(Content(network.state), str(path))
+        red, green, blue = network.mean
+        mean = red / 255, green / 255, blue / 255
+        chain = dataclasses.replace(checkpoint.config.preprocessing, mean=mean)
+        config = dataclasses.replace(checkpoint.config, preprocessing=chain)
+        return checkpoint._replace(config=config)
+    if start[8:9] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
+        metadata, state = read_safetensors(path, "a checkpoint")
+        if FORMAT in metadata:
+            ours = unpack_weights(path, metadata, state, verify=verify)
+            return Checkpoint(ours.params, ours.config, ours.extras, None)
+        content = Content(state, metadata.get(DECLARED))
+    else:
+        content = read_torch(path)
+    return _model_of(content, str(path))
+
+
+def _model_of(content: Content, source: str) -> Checkpoint:
+    """Make a model of the arrays of a public checkpoint."""
+    state, declared = content.state, None
+    if content.declared is None:
+        name, config, state = identify(state, source=source)
+    else:
+        value = parse_json(content.declared, f"{source} ({DECLARED})", "a configuration")
+        declared = from_plain(_Declared, value, source=f"{source} ({DECLARED})")
+        name, config = declared.format, declared.config
+        check_sizes(config, state.values(), source)
+        state = renamed_to(state, public_shapes(config, name).keys())
+    state = {key: _float32(key, array, source) for key, array in state.items()}
+    params, extras = to_params(state, config, name, source=source)
+    params = jax.tree.map(jnp.asarray, params)
+    if declared is not None and declared.aggregator:
+        own = config.aggregator.with_metadata(params.aggregator, declared.aggregator)
+        config.aggregator.check_backbone(own, params.backbone, source)
+        params = dataclasses.replace(params, aggregator=own)
+    return Checkpoint(params, config, extras, name)
+
+
+def _float32(name: str, array: np.ndarray, source: str) -> np.ndarray:
+    if name.endswith("num_batches_tracked"):
+        if array.dtype != np.int64:
+            raise InputError(f"{source}: {name} found {array.dtype}, expected int64")
+        return array
+    if array.dtype.name in ("float16", "bfloat16"):
+        array = array.astype(np.float32)
+    if array.dtype != np.float32:
+        raise InputError(
+            f"{source}: {name} found {array.dtype}, expected float32, float16 or bfloat16"
+        )
+    if not np.isfinite(array).all():
+        raise InputError(f"{source}: {name} holds NaN or infinity")
+    return array
+
+
+def read_vocabulary(
+    path: str | os.PathLike[str],
+    backbone: str | os.PathLike[str],
+    fields: Mapping[str, Any] | None = None,
+) -> Checkpoint:
+    """Read a published vocabulary of AnyLoc, one tensor by itself, and its backbone.
+
+    Args:
+        path: the vocabulary.
+        backbone: any checkpoint that `read_checkpoint` reads, whose backbone is taken.
+        fields: settings of `AnyLocConfig` that no shape tells: `layer`, `facet`, `assignment`.
+
+    Returns:
+        A whole model. Images keep their sizes, but for sides that are multiples of the patch size.
+
+    Raises:
+        InputError: what `read_checkpoint` raises of either file; or a vocabulary that is no tensor
+            of words by itself, or of words of another width than the backbone's features.
+    """
+    path = pathlib.Path(path)
+    check_source(path, "a vocabulary")
+    words = _float32("the vocabulary", read_tensor(path), str(path))
+    base = read_checkpoint(backbone)
+    width = base.config.backbone.dim
+    if words.ndim != 2 or words.shape[1] != width or not len(words):
+        raise InputError(
+            f"{path}: found a tensor of shape {words.shape}, expected (words, {width}): the "
+            f"backbone's features have {width} numbers"
+        )
+    config = vocabulary_model(len(words), base.config, fields or {})
+    aggregator = AnyLoc(jnp.asarray(words))
+    aggregator = config.aggregator.attach_backbone_hash(aggregator, base.params.backbone)
+    params = Crisalad(base.params.backbone, aggregator, None)
+    return Checkpoint(params, config, base.extras, VOCABULARY)
+
+
+def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) -> ModelConfig:
+    """Return AnyLoc with so many words over the backbone of a model; see `read_vocabulary`."""
+    return dataclasses.replace(
+        model,
+        preprocessing=PreprocessingConfig(size_rule="native", pixels="floats"),
+        aggregator=AnyLocConfig(clusters=words, **fields),
+        cross_image=CrossImageConfig(layers=0),
+        projection=ProjectionConfig(),
+    )
+
+
+def format_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
+    """Choose the public format, stored as the target's suffix says, that holds the whole model."""
+    is_safetensors = pathlib.Path(target).suffix in SUFFIXES["safetensors"]
+    stored, fallback = ("safetensors", "huggingface") if is_safetensors else ("torch", REFERENCE)
+    for name, each in FORMATS.items():
+        if each.stored == stored and name != fallback and not each.bare:
+            try:
+                check_holds(config, name)
+            except InputError:
+                continue
+            return name
+    return fallback
+
+
+def write_checkpoint(
+    path: str | os.PathLike[str],
+    params: Crisalad,
+    config: ModelConfig,
+    format: str,
+    extras: State,
+) -> None:
+    """Write a model under public names, as published: nested, prefixed, in the public order.
+
+    A configuration that names and shapes do not show, such as another image size than the published
+    one, is in the metadata of the state, where no other program looks.
+
+    Raises:
+        InputError: the format cannot hold this model, or is not written; the file cannot be made;
+            or torch is needed and not installed.
+    """
+    path = pathlib.Path(path)
+    form = choose("format", format, FORMATS)
+    wanted = SUFFIXES[form.stored]
+    if path.suffix not in wanted:
+        raise InputError(
+            f"{path}: found suffix {path.suffix!r}, expected {' or '.join(wanted)} for {format}"
+        )
+    shown = check_holds(config, format)
+    is_shown = format != REFERENCE and with_free_fields_of(config, shown) == shown
+    declared = {
+        "format": format,
+        "config": to_plain(config),
+        "aggregator": config.aggregator.metadata(params.aggregator),
+    }
+    text = None if is_shown else json.dumps(declared)
+    state = to_state(params, config, format, extras)
+    if form.stored == "safetensors":
+        metadata = {} if text is None else {DECLARED: text}
+        write_safetensors(path, state, {"format": "pt"} | metadata)
+    else:
+        named = {f"{form.module}{name}": array for name, array in state.items()}
+        write_torch(path, named, under=form.under, bare=form.bare, declared=text)
+
+
+class Conversion(NamedTuple):
+    """A finished conversion: its source and target formats, None for this package's own."""
+
+    source: str | None
+    target: str | None
+    config: ModelConfig
+
+
+@takes(source=PATH, target=PATH)
+def convert(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    format: str | None = None,
+    *,
+    backbone: str | os.PathLike[str] | None = None,
+    fields: Mapping[str, Any] | None = None,
+    half: bool = False,
+) -> Conversion:
+    """Convert a public checkpoint to a file of this package, or such a file to a public one.
+
+    Args:
+        source: what `read_checkpoint` reads.
+        target: for a public source, a .safetensors file. For one of ours, the public checkpoint.
+        format: one of `FORMATS`, for a source of ours; by default the one its parts came from.
+        backbone: the backbone's checkpoint, for a source that is a vocabulary of AnyLoc by itself.
+        fields: see `read_vocabulary`.
+        half: whether to write a file of this package in half precision, of a source of ours too;
+            see `save_weights`.
+
+    Returns:
+        What was read and written.
+
+    Raises:
+        InputError: what `read_checkpoint` and `write_checkpoint` raise, or a target or format that
+            does not go with the source. Nothing is written then.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad, load, save_weights
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> save_weights(folder / "ours.safetensors", Model(params, config))
+        >>> done = convert(folder / "ours.safetensors", folder / "public.pth", "reference")
+        >>> load(folder / "public.pth").config == config
+        True
+    """
+    if format is not None:
+        choose("format", format, FORMATS)
+    check_target(target)
+    if backbone is None:
+        checkpoint = read_checkpoint(source)
+    else:
+        checkpoint = read_vocabulary(source, backbone, fields)
+    if pathlib.Path(target).exists() and os.path.samefile(source, target):
+        raise InputError(f"{target}: found the source itself, expected another file")
+    params, config, extras, found = checkpoint
+    if found is None and not half:
+        format = format or format_for(config, target)
+        write_checkpoint(target, params, config, format, extras)
+        return Conversion(None, format, config)
+    if format is not None:
+        kind = "half precision" if found is None else f"a public checkpoint ({found})"
+        raise InputError(
+            f"{source}: found {kind} and format {format}, expected a format only for a file of "
+            "this package, in full precision"
+        )
+    check_target(target, ".safetensors")
+    save_weights(target, Model(params, config), extras=extras, half=half)
+    return Conversion(found, None, config)
+
+
+@takes(path=PATH)
+def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) -> Any:
+    """Read the backbone of any checkpoint, for a model of `config`.
+
+    Adapters are read if the file has the same kind and sizes; otherwise they are those of `fresh`.
+    Of a ResNet with more stages the first ones are taken.
+
+    Args:
+        path: what `load` reads.
+        config: the backbone of the model.
+        fresh: parameters of such a backbone, whose adapters are taken where the file has none.
+
+    Returns:
+        The backbone's parameters.
+
+    Raises:
+        InputError: what `read_checkpoint` raises, or the backbone is another (all fields that
+            differ are listed).
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad, save_weights
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> save_weights(folder / "model.safetensors", Model(params, config))
+        >>> fresh = config.backbone.init(jax.random.key(1))
+        >>> backbone = read_backbone(folder / "model.safetensors", config.backbone, fresh)
+        >>> bool((backbone.cls_token == params.backbone.cls_token).all())
+        True
+    """
+    checkpoint = read_checkpoint(path)
+    theirs, params = checkpoint.config.backbone, checkpoint.params.backbone
+    if type(theirs) is type(config):
+        theirs, params = config.adapt_checkpoint(theirs, params, fresh)
+    # Ignore free fields, such as the initialisation: weights do not depend on them.
+    wrong = differences(with_free_fields_of(config, theirs), config, "backbone")
+    if wrong:
+        raise InputError(f"{path}: this backbone is another than the model's: {'; '.join(wrong)}")
+    return params
+
+
+def with_backbone_of(
+    params: Crisalad, config: ModelConfig, path: str | os.PathLike[str]
+) -> Crisalad:
+    """Return a model's parameters with the backbone of any checkpoint; see `read_backbone`."""
+    backbone = read_backbone(path, config.backbone, params.backbone)
+    return dataclasses.replace(params, backbone=backbone)
