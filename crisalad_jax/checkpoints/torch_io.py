@@ -42,7 +42,7 @@ from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
-from crisalad_jax.nn.aggregators.anyloc import AnyLoc
+from crisalad_jax.nn.aggregators.vlad import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad

@@ -17,7 +17,7 @@ from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.misfits import misfits, not_finite
+from crisalad_jax.nn.diff_trees import diff_trees, not_finite
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
 from crisalad_jax.utils.errors import InputError, few
@@ -288,7 +288,7 @@ def _fill(config: ModelConfig, arrays: dict[str, np.ndarray], path: pathlib.Path
     wanted = named_leaves(template)
     halves = {name: array for name, array in arrays.items() if array.dtype == np.float16}
     arrays |= {name: array.astype(np.float32) for name, array in halves.items()}
-    problems = misfits(arrays, wanted) or not_finite(arrays)
+    problems = diff_trees(arrays, wanted) or not_finite(arrays)
     if problems:
         raise InputError(f"{path}: weights do not fit: {few(problems)}")
     # Not the file's own memory, which another program may change, and copied when this returns.

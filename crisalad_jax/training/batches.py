@@ -8,7 +8,7 @@ from crisalad_jax.data.class_groups import class_groups
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups, training_batches
 from crisalad_jax.data.places import Places, epoch_batches
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.losses.tuples import tuple_labels
+from crisalad_jax.losses.pairs import tuple_labels
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.utils.errors import InputError

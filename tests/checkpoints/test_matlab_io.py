@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.layouts import infer, public_shapes, to_params, to
 from crisalad_jax.checkpoints.layouts.cnn import vgg_numbers
 from crisalad_jax.checkpoints.matlab_io import AVERAGE, read_matlab, write_matlab
 from crisalad_jax.checkpoints.torch_io import convert, read_checkpoint, write_checkpoint
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 from parity import zoo

@@ -9,7 +9,7 @@ import numpy as np
 from crisalad_jax.checkpoints.layouts.base import Layout, Lines, register_layout
 from crisalad_jax.checkpoints.layouts.forms import SAME, Entry
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.projection import ProjectionConfig

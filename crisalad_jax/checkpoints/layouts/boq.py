@@ -17,7 +17,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 
 _CHAIN = PreprocessingConfig(filter="bicubic", pixels="floats")

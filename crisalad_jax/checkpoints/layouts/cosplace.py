@@ -7,8 +7,7 @@ from crisalad_jax.checkpoints.layouts.cnn import Names
 from crisalad_jax.checkpoints.layouts.forms import FIRST, LINEAR, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
-from crisalad_jax.nn.aggregators.gem import GemConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 

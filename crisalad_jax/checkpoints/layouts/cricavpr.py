@@ -6,7 +6,7 @@ from crisalad_jax.checkpoints.layouts.base import State, register_head
 from crisalad_jax.checkpoints.layouts.forms import FIRST, Entry
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.gem import GemPyramidConfig
 
 _EXPONENT = "aggregation.1.p"
 

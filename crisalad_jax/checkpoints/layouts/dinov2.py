@@ -24,7 +24,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
     side,
 )
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer, ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

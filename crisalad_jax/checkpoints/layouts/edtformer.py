@@ -13,7 +13,7 @@ from crisalad_jax.checkpoints.layouts.forms import (
 )
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
+from crisalad_jax.nn.aggregators.queries import EdtFormerConfig
 
 
 @register_head("edtformer")

@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.layouts.dino_salad import infer_salad, network_lin
 from crisalad_jax.checkpoints.layouts.forms import UPCONV, Entry, Extra, affine
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.fol import FolConfig
+from crisalad_jax.nn.aggregators.salad import FolConfig
 
 
 @register_head("fol")

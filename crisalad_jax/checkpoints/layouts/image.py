@@ -6,7 +6,7 @@ from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import FIRST, Entry
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 
 _TOKENS = "learnable_aggregation_tokens"
 

@@ -8,7 +8,7 @@ from crisalad_jax.checkpoints.layouts.cnn import Names
 from crisalad_jax.checkpoints.layouts.forms import POINTWISE, SAME, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 
 

@@ -20,7 +20,7 @@ from crisalad_jax.checkpoints.layouts.forms import LINEAR, SAME, Entry, Extra, F
 from crisalad_jax.checkpoints.layouts.over_cnn import register_over_cnn
 from crisalad_jax.checkpoints.matlab_io import AVERAGE
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

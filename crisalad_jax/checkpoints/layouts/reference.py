@@ -13,7 +13,7 @@ from crisalad_jax.checkpoints.layouts.dino_salad import infer_salad
 from crisalad_jax.checkpoints.layouts.dinov2 import has_vit, vit_config, vit_lines
 from crisalad_jax.checkpoints.layouts.encoder import encoder_lines, infer_encoder
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, affine
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig

@@ -6,7 +6,7 @@ from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import POINTWISE, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
+from crisalad_jax.nn.aggregators.vlad import SuperVladConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 

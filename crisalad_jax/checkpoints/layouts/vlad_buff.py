@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from crisalad_jax.checkpoints.layouts.base import Reader, State, register_head
 from crisalad_jax.checkpoints.layouts.forms import LINEAR, POINTWISE, SAME, Entry, affine
 from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
-from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
+from crisalad_jax.nn.aggregators.vlad import VladBuffConfig
 
 _BURST = "aggregator.ab_params"
 _ROTATION = "aggregator.pca_rot"

@@ -226,7 +226,7 @@ def _race(kinds: tuple[AdapterKind, ...], rounds: int, images: int) -> Race:
 
     @functools.partial(jit, static_argnames="grid")
     def apply(params: Any, tokens: jax.Array, grid: tuple[int, int]) -> jax.Array:
-        return adapter(params, tokens, grid)
+        return adapter(params, tokens, grid)[0]
 
     def call(kind: AdapterKind) -> Any:
         params = init_adapter(jax.random.key(0), dim, AdapterConfig(kind=kind))

@@ -377,7 +377,7 @@ def _drafts(config: ComparisonConfig, weights: Mapping[str, pathlib.Path]) -> It
             size = config.image_size or training.model.image_size
             model = dataclasses.replace(training.model, image_size=size, preprocessing=way)
             training = dataclasses.replace(training, model=model)
-        learns = training.model.aggregator.learns
+        learns = training.model.aggregator.trainable
         yield Variant(name, labels, run, training, learns, rerank, None, training.model, row)
 
 
