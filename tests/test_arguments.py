@@ -55,7 +55,7 @@ CALLS = {
     "load": (lambda: cj.load(PRESET), f"path: {NO_PATH}"),
     "save_weights": (
         lambda: cj.save_weights(PARAMS, "w", PRESET),
-        "params: found str, expected Crisalad",
+        "params: found 'w', expected Crisalad",
     ),
     "init_crisalad": (
         lambda: cj.init_crisalad(PRESET, KEY),
