@@ -3,7 +3,6 @@
 from crisalad_jax import sinkhorn as sinkhorn
 from crisalad_jax.checkpoints.export import ExportConfig as ExportConfig
 from crisalad_jax.checkpoints.export import write_export as write_export
-from crisalad_jax.checkpoints.load import Model as Model
 from crisalad_jax.checkpoints.load import load as load
 from crisalad_jax.checkpoints.torch_io import convert as convert
 from crisalad_jax.checkpoints.torch_io import read_backbone as read_backbone
@@ -22,6 +21,7 @@ from crisalad_jax.data.loader import training_batches as training_batches
 from crisalad_jax.data.places import read_places as read_places
 from crisalad_jax.data.query_set import QuerySet as QuerySet
 from crisalad_jax.data.query_set import read_query_set as read_query_set
+from crisalad_jax.data.reading import Reading as Reading
 from crisalad_jax.data.resize import resize_image as resize_image
 from crisalad_jax.evaluation.calibrate import calibrate as calibrate
 from crisalad_jax.evaluation.evaluate import evaluate as evaluate
@@ -51,6 +51,7 @@ from crisalad_jax.nn.config import ModelConfig as ModelConfig
 from crisalad_jax.nn.config import with_aggregator as with_aggregator
 from crisalad_jax.nn.cross_image import CrossImageConfig as CrossImageConfig
 from crisalad_jax.nn.model import Crisalad as Crisalad
+from crisalad_jax.nn.model import Model as Model
 from crisalad_jax.nn.model import attend_across_images as attend_across_images
 from crisalad_jax.nn.model import cast_params as cast_params
 from crisalad_jax.nn.model import describe as describe
@@ -61,8 +62,9 @@ from crisalad_jax.nn.model import self_mask as self_mask
 from crisalad_jax.nn.model import valid_mask as valid_mask
 from crisalad_jax.nn.projection import ProjectionConfig as ProjectionConfig
 from crisalad_jax.nn.tokens import Tokens as Tokens
-from crisalad_jax.retrieval.alone import describe_files as describe_files
-from crisalad_jax.retrieval.alone import describe_images as describe_images
+from crisalad_jax.retrieval.describe import describe_files as describe_files
+from crisalad_jax.retrieval.describe import describe_images as describe_images
+from crisalad_jax.retrieval.describe import prepare_image as prepare_image
 from crisalad_jax.retrieval.extract import extract as extract
 from crisalad_jax.retrieval.maps.build import index as index
 from crisalad_jax.retrieval.maps.live import query_live as query_live
@@ -70,7 +72,6 @@ from crisalad_jax.retrieval.maps.map import Map as Map
 from crisalad_jax.retrieval.maps.query import query as query
 from crisalad_jax.retrieval.pca import fit_pca as fit_pca
 from crisalad_jax.retrieval.pca import load_pca as load_pca
-from crisalad_jax.retrieval.photographs import prepare_image as prepare_image
 from crisalad_jax.retrieval.search import search as search
 from crisalad_jax.retrieval.sequence import BayesFilter as BayesFilter
 from crisalad_jax.serve import serve_map as serve_map
