@@ -43,8 +43,8 @@ from crisalad_jax.nn.aggregators import Aggregator as Aggregator
 from crisalad_jax.nn.aggregators import TokenShape as TokenShape
 from crisalad_jax.nn.aggregators import register_aggregator as register_aggregator
 from crisalad_jax.nn.backbones import Backbone as Backbone
-from crisalad_jax.nn.backbones import FeatureRequest as FeatureRequest
 from crisalad_jax.nn.backbones import Features as Features
+from crisalad_jax.nn.backbones import FeatureSpec as FeatureSpec
 from crisalad_jax.nn.backbones import register_backbone as register_backbone
 from crisalad_jax.nn.config import PRESETS as PRESETS
 from crisalad_jax.nn.config import ModelConfig as ModelConfig

@@ -9,14 +9,14 @@ A step, a dustbin or a gradient of your own is registered as the built-in ones a
 
     @register_step("capacity")
     def capacity(problem, potentials):
-        column = jnp.minimum(problem.log_nu - problem.over_rows(potentials.row), 0)
-        return Potentials(problem.log_mu - problem.over_columns(column), column)
+        column = jnp.minimum(problem.log_nu - problem.lse_rows(potentials.row), 0)
+        return Potentials(problem.log_mu - problem.lse_columns(column), column)
 
     solve(scores, log_mu, log_nu, config=SinkhornConfig(step="capacity"))
 """
 
+from crisalad_jax.transport.checks import marginal_error
 from crisalad_jax.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
-from crisalad_jax.transport.diagnose import marginal_error
 from crisalad_jax.transport.differentiate import Implicit, Optimistix, Stop, Unrolled
 from crisalad_jax.transport.dustbin import (
     DUSTBINS,

@@ -18,8 +18,8 @@ def capped(problem, potentials):
 
     Potentials are dual variables over epsilon: the plan is exp(kernel + row + column).
     """
-    column = jnp.minimum(problem.log_nu - problem.over_rows(potentials.row), 0)
-    row = problem.log_mu - problem.over_columns(column)
+    column = jnp.minimum(problem.log_nu - problem.lse_rows(potentials.row), 0)
+    row = problem.log_mu - problem.lse_columns(column)
     return cj.sinkhorn.Potentials(row, column)
 
 

@@ -15,15 +15,15 @@ from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import to_state
 from crisalad_jax.nn.aggregators import Aggregator
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad, attend_across_images, train_tokens
+from crisalad_jax.nn.model import Crisalad, attend_across_images, tokens_and_statistics
 from parity.cases.case import LAYOUT, build, convert
 
 BOUND = 1e-11
@@ -94,8 +94,9 @@ def test_a_training_batch_is_normalised_as_torch_does() -> None:
         params, extras = convert(model)
 
         def weighed(params: Crisalad) -> tuple[jax.Array, tuple[jax.Array, Crisalad]]:
-            batch = jnp.asarray(images), jnp.ones(3, bool)
-            tokens, statistics = train_tokens(params, *batch, model.config)
+            tokens, statistics = tokens_and_statistics(
+                params, jnp.asarray(images), model.config, valid=jnp.ones(3, bool)
+            )
             found = attend_across_images(params, tokens, model.config)
             return (found * slopes).sum(), (found, statistics)
 

@@ -20,8 +20,8 @@ from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import convert, read_checkpoint, write_checkpoint
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
-from crisalad_jax.nn.backbones import FeatureRequest
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
+from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import vit
 from crisalad_jax.nn.config import ModelConfig
@@ -204,8 +204,8 @@ def test_facets_are_transformers(tmp_path: pathlib.Path) -> None:
         their_features(model, torch.from_numpy(images), REGISTERS)
     backbone, config = found.params.backbone, found.config.backbone
     for name, expected in outputs.items():
-        request = FeatureRequest((2,), name, norm=False)
-        ours = vit(backbone, jnp.asarray(images), config, request)
+        request = FeatureSpec((2,), name, norm=False)
+        ours, _ = vit(backbone, jnp.asarray(images), config, request)
         assert relative_error(ours.patches, expected[:, 1 + REGISTERS :]) < OUTPUT_BOUND
         assert relative_error(ours.class_token, expected[:, 0]) < OUTPUT_BOUND
 
@@ -270,7 +270,9 @@ def test_the_class_tokens_attention_turns_keys(tmp_path: pathlib.Path) -> None:
     with torch.no_grad():
         weights = model(torch.from_numpy(images).permute(0, 3, 1, 2), output_attentions=True)
     expected = weights.attentions[-1][:, :, 0, 1 + REGISTERS :].sum(dim=1).numpy()
-    backbone, request = checkpoint.config.backbone, FeatureRequest(class_attention=True)
-    found = backbone.apply(checkpoint.params.backbone, jnp.asarray(images), request, remat="none")
+    backbone, request = checkpoint.config.backbone, FeatureSpec(class_attention=True)
+    found, _ = backbone.apply(
+        checkpoint.params.backbone, jnp.asarray(images), request, remat="none"
+    )
     assert found.class_attention is not None
     assert relative_error(found.class_attention, expected) < OUTPUT_BOUND

@@ -86,7 +86,8 @@ def _special_tokens_once(adapter: Any) -> Any:
     def wrong(params: Any, tokens: Any, grid: tuple[int, int], **more: Any) -> Any:
         # Without bias, half of what counts twice is what counts once.
         special = tokens.shape[-2] - grid[0] * grid[1]
-        return adapter(params, tokens, grid, **more).at[..., :special, :].multiply(0.5)
+        adapted, updated = adapter(params, tokens, grid, **more)
+        return adapted.at[..., :special, :].multiply(0.5), updated
 
     return wrong
 

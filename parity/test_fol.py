@@ -15,8 +15,8 @@ from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import read_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.fol import FolConfig
-from crisalad_jax.nn.backbones import FeatureRequest
+from crisalad_jax.nn.aggregators.salad import FolConfig
+from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.backbones.vit import ViTConfig, vit
 from parity.reference.vit import Block, ViT, grid_of
 from parity.test_goldens import OUTPUT_BOUND, relative_error
@@ -140,13 +140,13 @@ def test_the_class_tokens_attention_is_transformers(kind: Kind, tmp_path: pathli
     with torch.no_grad():
         weights = model(torch.from_numpy(images).permute(0, 3, 1, 2), output_attentions=True)
     expected = weights.attentions[-1][:, :, 0, 1 + kind.registers :].sum(dim=1).numpy()
-    request = FeatureRequest(class_attention=True)
+    request = FeatureSpec(class_attention=True)
     backbone: ViTConfig = checkpoint.config.backbone  # pyright: ignore[reportAssignmentType]
 
     @jax.jit
     def features(images: jax.Array) -> tuple[jax.Array, ...]:
-        asked = vit(checkpoint.params.backbone, images, backbone, request)
-        plain = vit(checkpoint.params.backbone, images, backbone)
+        asked, _ = vit(checkpoint.params.backbone, images, backbone, request)
+        plain, _ = vit(checkpoint.params.backbone, images, backbone)
         assert asked.class_attention is not None
         assert plain.class_attention is None
         return asked.class_attention, asked.patches - plain.patches

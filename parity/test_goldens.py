@@ -22,8 +22,8 @@ from crisalad_jax.checkpoints.formats.forms import Entry, Extra
 from crisalad_jax.checkpoints.formats.heads import head_lines
 from crisalad_jax.checkpoints.formats.vit import adapter_lines
 from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones import Features
 from crisalad_jax.nn.backbones.vit import (
@@ -153,7 +153,7 @@ def test_vit(name: str, registers: int) -> None:
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         images = inputs["image"].transpose(0, 2, 3, 1)
         tokens = jax.vmap(lambda image: embed(params, image, config))(images)
-        tokens = run_blocks(params, tokens, config.grid(images.shape[1:3]), config)
+        tokens, _ = run_blocks([params.blocks], tokens, config.grid(images.shape[1:3]), config)
         normed = layer_norm(params.norm, tokens, epsilon=NORM_EPSILON)
         outputs = {
             "x_norm_clstoken": normed[:, 0],
@@ -181,7 +181,7 @@ def test_multi_resolution_adapter() -> None:
     )
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        return {"tokens": adapter(params, inputs["tokens"], (5, 5))}
+        return {"tokens": adapter(params, inputs["tokens"], (5, 5))[0]}
 
     names = part_names("adapter", adapter_lines(config, "adapter", "adapter"), template)
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})
@@ -217,7 +217,7 @@ def test_salad() -> None:
         assert np.abs(golden[f"grad.{name}"]).max() < 1e-6
 
     patches = inputs["features"].reshape(3, 48, -1).transpose(0, 2, 1)
-    plan = jnp.exp(config.transport(params, patches, key=None).log_plan)
+    plan = jnp.exp(config.transport(params, Features(inputs["token"], patches), key=None).log_plan)
     stored = golden["aux.assignment_with_dustbin"].transpose(0, 2, 1)
     assert relative_error(plan, stored) < OUTPUT_BOUND
 

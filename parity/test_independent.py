@@ -35,9 +35,9 @@ from crisalad_jax.checkpoints.formats import to_state
 from crisalad_jax.checkpoints.formats.format import encoder_lines
 from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig, vit
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder, init_cross_image
@@ -171,7 +171,7 @@ def their_features(model: Any, images: Tensor, registers: int) -> dict[str, Tens
 
 
 def our_features(params: Crisalad, images: Any, config: ModelConfig) -> dict[str, jax.Array]:
-    return vit(params.backbone, images, config.backbone)._asdict()
+    return vit(params.backbone, images, config.backbone)[0]._asdict()
 
 
 def torch_loss(outputs: dict[str, Tensor]) -> Tensor:
@@ -314,7 +314,7 @@ def test_training_is_that_of_the_libraries(tmp_path: pathlib.Path) -> None:
     with jax.enable_x64(True):
         config = StepConfig(
             dataclasses.replace(found.config, compute_dtype="float64"),
-            LossConfig(match_pml_zero=True, kind=MultiSimilarityConfig(base=0.5)),
+            LossConfig(pml_compat=True, kind=MultiSimilarityConfig(base=0.5)),
             OptimiserConfig(learning_rate=rate, weight_decay=weight_decay),
             planned,
         )

@@ -23,11 +23,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import Aggregator, TokenShape
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
-from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
+from crisalad_jax.nn.aggregators.gem import GemPyramidConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -313,7 +313,7 @@ def random_batch(seed: int) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("base", [0.0, 0.5])
 def test_miner_and_loss_are_the_librarys(base: float) -> None:
-    config = LossConfig(match_pml_zero=True, kind=MultiSimilarityConfig(base=base))
+    config = LossConfig(pml_compat=True, kind=MultiSimilarityConfig(base=base))
     distance = DotProductSimilarity(normalize_embeddings=False)
     miner = MultiSimilarityMiner(config.miner_margin, distance=distance)
     # Any: a type checker takes them for int, after the library's defaults.

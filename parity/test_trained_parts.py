@@ -16,8 +16,7 @@ import torch
 from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import to_params, to_state
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
-from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

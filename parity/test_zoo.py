@@ -17,10 +17,9 @@ import pytest
 from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import vocabulary_model
-from crisalad_jax.nn.aggregators.anyloc import AnyLoc, nearest_words
-from crisalad_jax.nn.aggregators.edtformer import decode
+from crisalad_jax.nn.aggregators.queries import decode
 from crisalad_jax.nn.aggregators.selavpr import local_features
-from crisalad_jax.nn.aggregators.vlad_buff import vlad_buff
+from crisalad_jax.nn.aggregators.vlad import AnyLoc, nearest_words, vlad_buff
 from crisalad_jax.nn.backbones import Features
 from crisalad_jax.nn.layers import l2_normalise
 from crisalad_jax.nn.model import Crisalad, extract_features, unit_features

@@ -30,7 +30,7 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import COLUMNS, read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig

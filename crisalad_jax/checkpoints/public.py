@@ -38,7 +38,7 @@ from crisalad_jax.config.concise import brief
 from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLoc, AnyLocConfig
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

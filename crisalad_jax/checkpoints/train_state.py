@@ -20,7 +20,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
-from crisalad_jax.nn.misfits import misfits
+from crisalad_jax.nn.diff_trees import diff_trees
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import read_json, write_json
@@ -133,7 +133,7 @@ class StateStore:
             # Check before orbax reads any array: it reads all at once, and raises for a misfit in
             # another thread.
             self._check_seal(step)
-            problems = misfits(self._manager.item_metadata(step)["state"].tree, arrays)
+            problems = diff_trees(self._manager.item_metadata(step)["state"].tree, arrays)
             if problems:
                 raise ValueError(few(problems))
         except (OSError, ValueError) as error:

@@ -16,7 +16,7 @@ from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.misfits import misfits, not_finite
+from crisalad_jax.nn.diff_trees import diff_trees, not_finite
 from crisalad_jax.nn.model import Crisalad, Model, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError
 from crisalad_jax.utils.errors import InputError, few
@@ -226,7 +226,7 @@ def _fill(
     wanted = named_leaves(template)
     halves = {name: array for name, array in arrays.items() if array.dtype == np.float16}
     arrays |= {name: array.astype(np.float32) for name, array in halves.items()}
-    problems = misfits(arrays, wanted) or not_finite(arrays)
+    problems = diff_trees(arrays, wanted) or not_finite(arrays)
     if problems:
         raise InputError(f"{path}: weights do not fit: {few(problems)}")
     leaves = jax.device_put([arrays.pop(name) for name in wanted])

@@ -70,7 +70,7 @@ def run(arguments: Export) -> None:
         grouping=arguments.grouping,
         batch_size=None if arguments.batch_size == "symbolic" else arguments.batch_size,
         weights_inside=arguments.weights_inside,
-        platforms=tuple(dict.fromkeys((arguments.platforms or "cpu,cuda").split(","))),
+        platforms=tuple(dict.fromkeys((arguments.platforms or "cpu,cuda").split(","))),  # pyright: ignore
         format=arguments.format,
         pixels=arguments.pixels,
     )

@@ -43,7 +43,7 @@ class ImageBatch(NamedTuple):
     images: UInt8[np.ndarray, "batch h w 3"] | Float32[np.ndarray, "batch h w 3"]
     """8-bit pixels, or normalised floats; zeros where not valid."""
     labels: Int32[np.ndarray, " batch"]
-    """Place index, or tuple and role (`losses.tuples`); position in the list of paths where there
+    """Place index, or tuple and role (`losses.pairs`); position in the list of paths where there
     are no groups; -1 for padding."""
     valid: Bool[np.ndarray, " batch"]
     indices: Int64[np.ndarray, " batch"]

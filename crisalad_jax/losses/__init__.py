@@ -13,12 +13,12 @@ from crisalad_jax.losses.base import LossValue as LossValue
 from crisalad_jax.losses.base import Pairs as Pairs
 from crisalad_jax.losses.metric import LossConfig as LossConfig
 from crisalad_jax.losses.metric import LossResult as LossResult
-from crisalad_jax.losses.metric import all_pairs as all_pairs
 from crisalad_jax.losses.metric import metric_loss as metric_loss
-from crisalad_jax.losses.metric import mine as mine
-from crisalad_jax.losses.tuples import Role as Role
-from crisalad_jax.losses.tuples import tuple_labels as tuple_labels
-from crisalad_jax.losses.tuples import tuple_pairs as tuple_pairs
+from crisalad_jax.losses.pairs import Role as Role
+from crisalad_jax.losses.pairs import all_pairs as all_pairs
+from crisalad_jax.losses.pairs import mine as mine
+from crisalad_jax.losses.pairs import tuple_labels as tuple_labels
+from crisalad_jax.losses.pairs import tuple_pairs as tuple_pairs
 
 register_loss = LOSSES.register
 

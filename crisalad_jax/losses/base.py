@@ -8,13 +8,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from crisalad_jax.config.checks import require
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.parts import Part, Registry, count_arguments
+from crisalad_jax.utils.pytree import expect_like
 
 Similarities = Float[Array, "anchor image"]
 
@@ -155,33 +154,11 @@ def call_loss(function: Callable[..., Any], descriptors: Any, labels: Any, valid
 
 
 def check_value(value: Any, name: str) -> None:
-    """Check that a loss has returned a number.
-
-    Args:
-        value: what it returned.
-        name: what messages call it.
-
-    Raises:
-        InputError: it has not.
-    """
-    require(
-        isinstance(value, LossValue),
-        f"loss {name}: found to return {type(value).__name__}, expected a LossValue",
-    )
-    for what, number in (("", value.loss), ("an accuracy of ", value.accuracy)):
-        if number is None and what:
-            continue
-        is_array = isinstance(number, int | float | np.generic | np.ndarray | jax.Array)
-        shape = f"shape {jnp.shape(number)}" if is_array else type(number).__name__
-        require(
-            is_array and not jnp.shape(number),
-            f"loss {name}: found to return {what}{shape}, expected a single number",
-        )
-    dtype = getattr(value.loss, "dtype", type(value.loss).__name__)
-    require(
-        dtype in (jnp.float32, jnp.float64),
-        f"loss {name}: found to return a number of type {dtype}, expected float32",
-    )
+    """Check that a loss has returned a number, in float32 at least; `name` is for messages."""
+    dtype = getattr(getattr(value, "loss", None), "dtype", None)
+    number: Any = jax.ShapeDtypeStruct((), jnp.float64 if dtype == jnp.float64 else jnp.float32)
+    has_accuracy = getattr(value, "accuracy", None) is not None
+    expect_like(name, value, LossValue(number, number if has_accuracy else None))
 
 
 LOSSES = Registry("loss", Loss, of_function=_of_function)

@@ -11,8 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 from crisalad_jax.config.checks import require, takes
 from crisalad_jax.config.concise import concise
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
-from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, Pairs, Similarities, check_value
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, Pairs, check_value
+from crisalad_jax.losses.pairs import all_pairs, mine
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 
 
 @concise("kind")
@@ -31,7 +32,7 @@ class LossConfig:
     """Miner of the pairs that enter the loss: the multi-similarity loss's, or none (all pairs)."""
     miner_margin: float = 0.1
     """Similarity margin of the miner, epsilon in its paper."""
-    match_pml_zero: bool = False
+    pml_compat: bool = False
     """Whether the loss is 0, as in pytorch-metric-learning, for a batch with at most one positive
     and at most one negative pair (its triplet loss differs)."""
 
@@ -57,58 +58,6 @@ class LossResult(NamedTuple):
     """Share of the anchors without a mined positive: all their positives are easy."""
     accuracy: Float[Array, ""] | None = None
     """Share of the images whose nearest class is their own; None for losses of pairs."""
-
-
-def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None) -> Pairs:
-    """Find all pairs of two images of one place, and of two places; none of images not `valid`.
-
-    Args:
-        labels: the place of each image.
-        valid: images that take part; None means all.
-
-    Returns:
-        The positive and the negative pairs.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> all_pairs(jnp.array([0, 0, 1])).positives.tolist()
-        [[False, True, False], [True, False, False], [False, False, False]]
-    """
-    same = labels[:, None] == labels[None, :]
-    usable = jnp.ones_like(same) if valid is None else valid[:, None] & valid[None, :]
-    return Pairs(same & usable & ~jnp.eye(len(labels), dtype=bool), ~same & usable)
-
-
-def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
-    """Choose the pairs that violate the order within their row by less than `margin`.
-
-    The miner of the multi-similarity loss (Wang et al., CVPR 2019). A positive is kept if it is
-    less similar than the hardest negative plus the margin, a negative if it is more similar than
-    the hardest positive minus the margin, strictly. An anchor without positives or without
-    negatives mines nothing.
-
-    Args:
-        similarities: of all images.
-        pairs: to choose from.
-        margin: epsilon of the paper.
-
-    Returns:
-        The chosen pairs.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> pairs = all_pairs(jnp.array([0, 0, 1]))
-        >>> similarities = jnp.array([[1.0, 0.9, 0.1], [0.9, 1.0, 0.85], [0.1, 0.85, 1.0]])
-        >>> mine(similarities, pairs, margin=0.1).positives.any(axis=1).tolist()
-        [False, True, False]
-    """
-    positives, negatives = pairs
-    hardest_negative = jnp.where(negatives, similarities, -jnp.inf).max(axis=1, keepdims=True)
-    hardest_positive = jnp.where(positives, similarities, jnp.inf).min(axis=1, keepdims=True)
-    return Pairs(
-        positives & (similarities - margin < hardest_negative),
-        negatives & (similarities + margin > hardest_positive),
-    )
 
 
 @takes(config=LossConfig)
@@ -155,33 +104,33 @@ def metric_loss(
         f"descriptors, labels: found shapes {descriptors.shape} and {labels.shape}, expected "
         "(image, descriptor) and (image,)",
     )
+    name = f"loss {config.kind.part_name}"
+    require(
+        pairs is not None or not config.kind.of_tuples,
+        f"{name}: found places, expected the pairs of mined tuples",
+    )
+    require(
+        dense is not None or not config.kind.reads_dense,
+        f"{name}: found no local features, expected an aggregator that has them in training, such "
+        "as selavpr",
+    )
+    if params is None:
+        init = functools.partial(config.kind.init, classes=1, dim=descriptors.shape[1])
+        require(
+            jax.eval_shape(init, jax.random.key(0)) is None,
+            f"{name}: found no params, expected those of its init",
+        )
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
     valid = jnp.ones(len(labels), bool) if valid is None else valid
     every = all_pairs(labels, valid=valid) if pairs is None else pairs
-    require(
-        pairs is not None or not config.kind.of_tuples,
-        f"loss {config.kind.part_name}: found places, expected the pairs of mined tuples",
-    )
-    if config.kind.reads_dense:
-        require(
-            dense is not None,
-            f"loss {config.kind.part_name}: found no local features, expected an aggregator that "
-            "has them in training, such as selavpr",
-        )
     batch = LossBatch(wide, labels, valid, every, classes, dense)
     similarities = jax.lax.stop_gradient(batch.similarities)
     mined = mine(similarities, every, margin=config.miner_margin)
     chosen = every if config.miner == "none" else mined
-    if params is None:
-        draw = functools.partial(config.kind.init, classes=1, dim=wide.shape[1])
-        require(
-            jax.eval_shape(draw, jax.random.key(0)) is None,
-            f"loss {config.kind.part_name}: found no params, expected those of its init",
-        )
     value = config.kind.apply(params, dataclasses.replace(batch, pairs=chosen))
-    check_value(value, config.kind.part_name)
+    check_value(value, name)
     loss = value.loss
-    if config.match_pml_zero:
+    if config.pml_compat:
         few = (chosen.positives.sum() <= 1) & (chosen.negatives.sum() <= 1)
         loss = jnp.where(few, 0.0, loss)
     # NaN similarities violate no margin: without this line the batch would look perfect.

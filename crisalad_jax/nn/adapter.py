@@ -1,8 +1,8 @@
 """The adapters of a block: the paper's (section 3.2), two others of its Table 2, and more.
 
 All project the tokens down, act on them, and project them up again. The up-projection starts at 0,
-so that an untrained adapter adds nothing. All but EDTformer's are beside the block's MLP; SelaVPR
-has a second one after the attention.
+so that an untrained adapter adds nothing. All but EDTformer's are parallel to the block's MLP;
+SelaVPR has a second one after the attention.
 """
 
 import dataclasses
@@ -12,25 +12,24 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_positive
 from crisalad_jax.config.concise import concise
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.convolutions import ConvNorm
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.convolutions import ConvNorm, conv_norm
 from crisalad_jax.nn.layers import (
     Conv,
     DepthwiseConv,
+    Grid,
     Linear,
-    batch_norm,
-    conv,
+    Valid,
     depthwise_conv,
     gelu,
     init_batch_norm,
     init_depthwise_conv,
     init_linear,
     linear,
-    train_batch_norm,
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -53,8 +52,8 @@ class AdapterConfig:
         "depthwise"
     )
     """Kind of adapter: the paper's depthwise-separable convolution, CricaVPR's multi-resolution
-    one, or a plain MLP; SelaVPR's plain MLPs, one after the attention and one beside the MLP; or
-    EDTformer's, on a path of their own beside all blocks (side); none leaves it out."""
+    one, or a plain MLP; SelaVPR's plain MLPs, one after the attention and one parallel to the MLP;
+    or EDTformer's, on a path of their own, parallel to all blocks (side); none leaves it out."""
     bottleneck: float = 0.5
     """Width of the adapter over the width of the backbone."""
     kernel_size: int = 3
@@ -78,22 +77,18 @@ class AdapterConfig:
             )
 
     def width(self, dim: int) -> int:
-        """Return the width of the bottleneck beside a backbone of width `dim`.
+        """Return the width of the bottleneck of an adapter in a backbone of width `dim`.
 
         Raises:
             InputError: it is 0, or does not divide into the branches of the adapter.
         """
         width = int(dim * self.bottleneck)
+        # The branches of a multi-resolution adapter take 1/2, 1/4 and 1/16 of the width.
+        factor = 16 if self.kind == "multi-resolution" else 1
         require(
-            self.kind == "none" or width >= 1,
-            f"AdapterConfig.bottleneck: found {self.bottleneck}, expected a width of at least 1 "
-            f"for dim {dim}",
-        )
-        require(
-            self.kind != "multi-resolution" or width % 16 == 0,
+            self.kind == "none" or (width >= 1 and width % factor == 0),
             f"AdapterConfig.bottleneck: found {self.bottleneck}, which is a width of {width} for "
-            f"dim {dim}; expected a multiple of 16, for the branches of a multi-resolution adapter "
-            "take 1/2, 1/4 and 1/16 of it",
+            f"dim {dim}; expected a multiple of {factor}, and at least 1",
         )
         return width
 
@@ -129,7 +124,7 @@ class MlpAdapter:
 
 @pytree_dataclass
 class SideAdapter:
-    """EDTformer's adapter: an MLP with GELU, on a path beside the blocks (Jin et al. 2025)."""
+    """EDTformer's adapter: an MLP with GELU, on a path parallel to the blocks (Jin et al. 2025)."""
 
     down: Linear
     up: Linear
@@ -137,7 +132,7 @@ class SideAdapter:
 
 @pytree_dataclass
 class SerialParallelAdapter:
-    """SelaVPR's adapters: after the attention, with a skip, and beside the MLP (Lu et al. 2024)."""
+    """SelaVPR's adapters (Lu et al. 2024): after the attention with a skip, parallel to the MLP."""
 
     serial: MlpAdapter
     parallel: MlpAdapter
@@ -148,7 +143,7 @@ Adapter = SingleAdapter | SerialParallelAdapter
 
 
 def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter | None:
-    """Draw random parameters beside a backbone of width `dim`; None for "none".
+    """Draw random parameters for a backbone of width `dim`; None for "none".
 
     The up-projection starts at 0, the convolutions of the multi-resolution adapter at 1e-5, as in
     the public code of CricaVPR.
@@ -158,15 +153,15 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
         return None
     if kind == "serial-parallel":
         plain = dataclasses.replace(config, kind="mlp")
-        serial, parallel = (init_adapter(each, dim, plain) for each in draw.split(key))
+        serial, parallel = (init_adapter(each, dim, plain) for each in random_init.split(key))
         assert isinstance(serial, MlpAdapter)
         assert isinstance(parallel, MlpAdapter)
         return SerialParallelAdapter(serial, parallel)
-    down_key, first, second, up_key = draw.split(key, 4)
+    down_key, first, second, up_key = random_init.split(key, 4)
     depthwise, convolutions = kind == "depthwise", config.bias == "convolutions"
     down = init_linear(down_key, dim, width, bias=not depthwise)
     up = init_linear(up_key, width, dim, bias=not (depthwise and convolutions))
-    up = jax.tree.map(lambda leaf: draw.zeros(*leaf.shape), up)
+    up = jax.tree.map(lambda leaf: random_init.zeros(*leaf.shape), up)
     if kind == "mlp":
         return MlpAdapter(down, up)
     if kind == "side":
@@ -189,44 +184,32 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
 
 
 def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
-    weight = draw.full((kernel_size, kernel_size, d_in, d_out), CONV_INIT)
-    return ConvNorm(Conv(weight, draw.full((d_out,), CONV_INIT)), init_batch_norm(d_out))
+    weight = random_init.full((kernel_size, kernel_size, d_in, d_out), CONV_INIT)
+    return ConvNorm(Conv(weight, random_init.full((d_out,), CONV_INIT)), init_batch_norm(d_out))
 
 
 def adapter(
     params: SingleAdapter,
     tokens: Float[Array, "*batch token dim"],
-    grid: tuple[int, int],
+    grid: Grid,
     *,
     length: int | None = None,
-) -> Float[Array, "*batch token dim"]:
+    valid: Valid = None,
+) -> tuple[Float[Array, "*batch token dim"], SingleAdapter]:
     """Apply an adapter: down, ReLU, convolutions on the patch grid plus skip, up (paper Eq. 2).
 
-    The last `grid[0] * grid[1]` of the first `length` tokens, by default of all, are patches in row
-    order. The convolutions are the identity
-    on the class and register tokens before them. With the skip these tokens therefore count twice,
-    as in CricaVPR. The MLP and side adapters have neither convolutions nor skip, and the latter has
-    GELU.
-    """
-    return train_adapter(params, tokens, grid, None, length=length)[0]
-
-
-def train_adapter(
-    params: SingleAdapter,
-    tokens: Float[Array, "*batch token dim"],
-    grid: tuple[int, int],
-    valid: Bool[Array, " image"] | None,
-    *,
-    length: int | None = None,
-) -> tuple[Float[Array, "*batch token dim"], SingleAdapter]:
-    """Apply an adapter to a training batch, whose statistics its batch norms normalise by.
+    The last `grid[0] * grid[1]` of the first `length` tokens are patches in row order. The
+    convolutions are the identity on the class and register tokens before them. With the skip these
+    tokens therefore count twice, as in CricaVPR. The MLP and side adapters have neither
+    convolutions nor skip, and the latter has GELU.
 
     Args:
         params: the adapter.
-        tokens: see `adapter`; of a batch of images where `valid` is given.
+        tokens: of an image or a batch.
         grid: rows and columns of patches.
-        valid: which images the statistics are taken of; None takes the stored ones, which stay.
-        length: see `adapter`.
+        length: number of first tokens that are not padding; None is all.
+        valid: images of a training batch whose statistics batch norms normalise by; None takes the
+            stored ones, which stay.
 
     Returns:
         (tokens, updated): the adapter's output, and the adapter with updated running statistics.
@@ -262,23 +245,17 @@ def _separable(
 
 
 def _multi_resolution(
-    params: MultiResolutionAdapter,
-    x: Float[Array, "image height width dim"],
-    valid: Bool[Array, " image"] | None,
+    params: MultiResolutionAdapter, x: Float[Array, "image height width dim"], valid: Valid
 ) -> tuple[Float[Array, "image height width dim"], MultiResolutionAdapter]:
-    def apply(layer: ConvNorm, x: Array) -> tuple[Array, ConvNorm]:
-        y = conv(layer.conv, x)
-        if valid is None:
-            return jax.nn.relu(batch_norm(layer.norm, y, epsilon=BATCH_NORM_EPSILON)), layer
-        y, norm = train_batch_norm(layer.norm, y, valid, epsilon=BATCH_NORM_EPSILON)
-        return jax.nn.relu(y), dataclasses.replace(layer, norm=norm)
-
-    first, branch1 = apply(params.branch1, x)
-    second, narrow2 = apply(params.branch2[0], x)
-    second, wide2 = apply(params.branch2[1], second)
-    third, narrow3 = apply(params.branch3[0], x)
-    third, wide3 = apply(params.branch3[1], third)
-    updated = dataclasses.replace(
-        params, branch1=branch1, branch2=(narrow2, wide2), branch3=(narrow3, wide3)
-    )
-    return jnp.concatenate([first, second, third], axis=-1), updated
+    outputs, updated = [], []
+    for branch in ((params.branch1,), params.branch2, params.branch3):
+        y, layers = x, []
+        for layer in branch:
+            y, layer = conv_norm(layer, y, valid, epsilon=BATCH_NORM_EPSILON)
+            y = jax.nn.relu(y)
+            layers.append(layer)
+        outputs.append(y)
+        updated.append(tuple(layers))
+    (first,), second, third = updated
+    params = dataclasses.replace(params, branch1=first, branch2=second, branch3=third)
+    return jnp.concatenate(outputs, axis=-1), params

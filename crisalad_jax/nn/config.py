@@ -1,7 +1,6 @@
 """The configuration of a whole model, and the presets of model sizes."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -15,9 +14,7 @@ from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.hog import HogConfig as HogConfig  # registers it
 from crisalad_jax.nn.projection import ProjectionConfig
-from crisalad_jax.utils.errors import InputError
 
 MOST_PIXELS = 4096
 """Largest side of an image that models describe: attention grows by its fourth power."""
@@ -66,62 +63,57 @@ class ModelConfig:
         """Check that the parts fit each other."""
         resolve_names(self)
         request = self.aggregator.features(self.backbone.depth)
-        name = self.aggregator.part_name
-        require(
-            self.backbone.class_token or not request.class_token,
-            f"backbone: found {self.backbone.part_name}, which has no class token, expected one "
-            f"that has, for aggregator {name}",
-        )
-        require(
-            request.insertion is None or self.backbone.inserts,
-            f"backbone: found {self.backbone.part_name} for aggregator {name}, expected one "
-            "through whose blocks tokens can run, such as vit",
-        )
-        require(
-            self.backbone.attends or not request.class_attention,
-            f"backbone: found {self.backbone.part_name} for aggregator {name}, expected one whose "
-            "class token attends to patches, such as vit",
-        )
-        self._check_size_rule()
-        self.check_image_size(self.input_size)
-        require(
-            self.aggregator.learns or not self.cross_image.layers,
-            f"CrossImageConfig.layers: found {self.cross_image.layers} for aggregator {name}, with "
-            "which nothing trains, expected 0",
-        )
-        shape = self.token_shape
-        if self.cross_image.layers:
-            self._check_cross_image(shape)
-
-    def _check_size_rule(self) -> None:
+        backbone, aggregator = self.backbone, f"aggregator {self.aggregator.part_name}"
+        for is_asked, has, what in (
+            (request.class_token, backbone.class_token, "a class token"),
+            (
+                request.insertion is not None,
+                backbone.supports_prompt_tokens,
+                "blocks through which tokens can run, such as vit",
+            ),
+            (
+                request.class_attention,
+                backbone.exposes_cls_attention,
+                "a class token that attends to patches, such as vit",
+            ),
+        ):
+            require(
+                has or not is_asked,
+                f"backbone: found {backbone.part_name} for {aggregator}, expected one with {what}",
+            )
         rule = self.preprocessing.size_rule
         require(
             rule == "fixed" or not self.aggregator.fixed_grid,
-            f"PreprocessingConfig.size_rule: found {rule}, expected fixed: aggregator "
-            f"{self.aggregator.part_name} has parameters for every patch, and was made for images "
-            "of one size alone",
+            f"PreprocessingConfig.size_rule: found {rule}, expected fixed: {aggregator} has "
+            "parameters for every patch, and was made for images of one size alone",
         )
+        self.check_image_size(self.input_size)
+        shape = self.token_shape
+        if self.cross_image.layers:
+            self._check_cross_image(shape, aggregator)
 
-    def _check_cross_image(self, shape: TokenShape) -> None:
-        heads = self.cross_image.heads
-        width, name = shape.token_dim, f"aggregator {self.aggregator.part_name}"
-        field, kind = self.aggregator.width_field, type(self.aggregator).__name__
+    def _check_cross_image(self, shape: TokenShape, aggregator: str) -> None:
+        options = self.cross_image
         require(
-            width % heads == 0,
-            f"{f'{kind}.{field}' if field else name}: found "
-            f"{width if field else f'tokens of {width} numbers'}, expected a multiple of the "
-            f"cross-image encoder's {heads} heads",
+            self.aggregator.trainable,
+            f"CrossImageConfig.layers: found {options.layers} for {aggregator}, with which nothing "
+            "trains, expected 0",
         )
         require(
-            not self.cross_image.global_token or shape.global_dim % width == 0,
-            f"{kind}.token_dim: found {shape.global_dim}, expected a multiple of "
-            f"{field or 'the width of local tokens'} {width} so that the global token can enter "
-            "the cross-image encoder (or CrossImageConfig.global_token False)",
+            shape.token_dim % options.heads == 0,
+            f"CrossImageConfig.heads: found {options.heads}, expected a divisor of the "
+            f"{shape.token_dim} numbers of a token of {aggregator}",
         )
         require(
-            self.cross_image.global_token or shape.tokens > 0,
-            f"CrossImageConfig.global_token: found False for {name}, which has no other token, "
-            "expected True, or CrossImageConfig.layers 0",
+            not options.global_token or shape.global_dim % shape.token_dim == 0,
+            f"CrossImageConfig.global_token: found True for {aggregator}, whose global token has "
+            f"{shape.global_dim} numbers, expected a multiple of a local one's {shape.token_dim}, "
+            "or False",
+        )
+        require(
+            options.global_token or shape.tokens > 0,
+            f"CrossImageConfig.global_token: found False for {aggregator}, which has no other "
+            "token, expected True, or CrossImageConfig.layers 0",
         )
 
     @property
@@ -176,7 +168,7 @@ class ModelConfig:
     @property
     def side_multiple(self) -> int:
         """Number of pixels that sides are multiples of: 1 where the backbone takes any size."""
-        return _side_multiple(self.backbone)
+        return 1 if self.backbone.any_size else self.backbone.patch_size
 
     @property
     def images_in_words(self) -> str:
@@ -199,18 +191,17 @@ class ModelConfig:
             InputError: a side is above `MOST_PIXELS` or no multiple of the patch size, there are
                 too few patches for the aggregator, or its parameters are for another size.
         """
-        if max(image_size) > MOST_PIXELS:
-            raise InputError(
-                f"image size: found {' x '.join(map(str, image_size))}, expected at most "
-                f"{MOST_PIXELS} pixels a side"
-            )
-        if self.aggregator.fixed_grid and tuple(image_size) != tuple(self.input_size):
-            given, expected = (f"{h} x {w}" for h, w in (image_size, self.input_size))
-            raise InputError(
-                f"image size: found {given}, expected {expected}: aggregator "
-                f"{self.aggregator.part_name} has parameters for every patch, and was made for "
-                "images of this size alone"
-            )
+        found = " x ".join(map(str, image_size))
+        require(
+            max(image_size) <= MOST_PIXELS,
+            f"image size: found {found}, expected at most {MOST_PIXELS} pixels a side",
+        )
+        require(
+            not self.aggregator.fixed_grid or tuple(image_size) == tuple(self.input_size),
+            f"image size: found {found}, expected {' x '.join(map(str, self.input_size))}: "
+            f"aggregator {self.aggregator.part_name} has parameters for every patch, and was made "
+            "for images of this size alone",
+        )
         self.aggregator.check_grid(self.backbone.grid(image_size), self.backbone.patch_size)
 
     def resized(self, image_size: Size | None, resize: Sequence[str] = ()) -> "ModelConfig":
@@ -248,18 +239,6 @@ class ModelConfig:
         )
         config.check_image_size(config.rounded_size(image_size))
         return dataclasses.replace(config, image_size=image_size)
-
-
-@functools.cache
-def _side_multiple(backbone: Backbone) -> int:
-    """Ask a backbone whether it takes a side that is no multiple of its patch size."""
-    size = backbone.patch_size
-    side = MOST_PIXELS // size * size - 1
-    try:
-        backbone.grid((side, side))
-    except InputError:
-        return size
-    return 1
 
 
 def _preset(dim: int, depth: int, heads: int, **backbone: Any) -> ModelConfig:

@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.layers import BatchNorm, Conv, conv, init_batch_norm, train_batch_norm
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.layers import BatchNorm, Conv, Valid, conv, init_batch_norm, train_batch_norm
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 BATCH_NORM_EPSILON = 1e-5
@@ -33,8 +33,8 @@ def init_he_conv(
     This is He et al.'s start (2015), by the number of outputs.
     """
     deviation = math.sqrt(2 / (kernel_size**2 * d_out))
-    weight = draw.normal(key, (kernel_size, kernel_size, d_in, d_out), scale=deviation)
-    return Conv(weight, draw.zeros(d_out) if bias else None)
+    weight = random_init.normal(key, (kernel_size, kernel_size, d_in, d_out), scale=deviation)
+    return Conv(weight, random_init.zeros(d_out) if bias else None)
 
 
 def init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
@@ -45,9 +45,10 @@ def init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -
 def conv_norm(
     params: ConvNorm,
     x: Float[Array, "image height width d_in"],
-    valid: Bool[Array, " image"] | None = None,
+    valid: Valid = None,
     *,
     stride: int = 1,
+    epsilon: float = BATCH_NORM_EPSILON,
 ) -> tuple[Float[Array, "image rows columns d_out"], ConvNorm]:
     """Convolve, and normalise by the stored statistics or by those of a training batch.
 
@@ -59,16 +60,17 @@ def conv_norm(
         x: a batch of images.
         valid: which images the batch's statistics are taken of; None takes the stored ones.
         stride: of the convolution.
+        epsilon: added to the variance.
 
     Returns:
         (y, updated): the second has updated running statistics where `valid` is given.
     """
     if valid is not None:
         y = conv(params.conv, x, stride=stride)
-        y, norm = train_batch_norm(params.norm, y, valid, epsilon=BATCH_NORM_EPSILON)
+        y, norm = train_batch_norm(params.norm, y, valid, epsilon=epsilon)
         return y, dataclasses.replace(params, norm=norm)
     norm = params.norm
-    scale = norm.weight * jax.lax.rsqrt(norm.running_var + BATCH_NORM_EPSILON)
+    scale = norm.weight * jax.lax.rsqrt(norm.running_var + epsilon)
     shift = norm.bias - norm.running_mean * scale
     if params.conv.bias is not None:
         shift = shift + params.conv.bias * scale

@@ -27,11 +27,11 @@ _SCOPES = {
     "blocks": "backbone blocks",
     "backbone": "backbone embedding, norm",
 }
-"""Part by scope in the program's names, the innermost scope first."""
+"""Part by scope in the names of a program and of parameters, the innermost scope first."""
 
 
-# JAX wraps scope names in transformations, as in vmap(taps).
 _NAMES = re.compile(r"\w+")
+"""JAX wraps scope names in transformations, as in vmap(taps)."""
 
 
 class PartCost(NamedTuple):
@@ -89,16 +89,10 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     ]
 
 
-def _part_of(name: str) -> str:
-    if name.startswith("projection."):
-        return "projection"
-    if name.startswith("cross_image."):
-        return "cross-image encoder"
-    if name.startswith("aggregator"):
-        return "aggregator"
-    if ".adapter." in name:
-        return "adapters"
-    return "backbone blocks" if name.startswith("backbone.blocks.") else "backbone embedding, norm"
+def _part_of(text: str) -> str:
+    """Return the part that a parameter's name or a program's scope is of; none is empty."""
+    names = _NAMES.findall(text)
+    return next((part for scope, part in _SCOPES.items() if scope in names), "")
 
 
 @lowering_for(CPU)  # whose products are all seen: a fused attention is one operation
@@ -142,9 +136,7 @@ def _walk(jaxpr: Any, scope: str, times: int, totals: "collections.Counter[str]"
             _walk(inner, here, inside, totals)
         macs = times * _macs(equation, name, here)
         if macs:
-            names = _NAMES.findall(here)
-            part = next((_SCOPES[each] for each in _SCOPES if each in names), "")
-            totals[part] += macs
+            totals[_part_of(here)] += macs
 
 
 def _inner(equation: Any) -> Iterator[Any]:

@@ -4,7 +4,6 @@ Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, 
 """
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
@@ -14,31 +13,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
 from crisalad_jax.config.concise import concise
 from crisalad_jax.config.fields import free_field
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.attention import (
-    COLUMNS,
-    Attention,
-    attention,
-    init_torch_attention,
-    mix,
-    rule_precision,
-)
-from crisalad_jax.nn.layers import (
-    LayerNorm,
-    Linear,
-    at_least_float32,
-    dropout,
-    gelu,
-    init_layer_norm,
-    init_linear,
-    layer_norm,
-    linear,
-    split_key,
-)
+from crisalad_jax.nn.attention import Attention, dot_product_attention
+from crisalad_jax.nn.layers import at_least_float32, dropout, gelu, linear, split_key
+from crisalad_jax.nn.torch_layers import EncoderLayer, encoder_layer, init_encoder_layer
 from crisalad_jax.utils.devices import IMAGE, image_mesh
 from crisalad_jax.utils.pytree import pytree_dataclass
-
-NORM_EPSILON = 1e-5
 
 
 @concise(switch=("layers", 0))
@@ -71,17 +50,6 @@ class CrossImageConfig:
 
 
 @pytree_dataclass
-class EncoderLayer:
-    """Attention and feed-forward network, a layer norm after each."""
-
-    attn: Attention
-    linear1: Linear
-    linear2: Linear
-    norm1: LayerNorm
-    norm2: LayerNorm
-
-
-@pytree_dataclass
 class CrossImageEncoder:
     """The layers, in order."""
 
@@ -98,18 +66,6 @@ def init_cross_image(key: PRNGKeyArray, dim: int, config: CrossImageConfig) -> C
     return CrossImageEncoder(tuple(layers))
 
 
-def init_encoder_layer(key: PRNGKeyArray, dim: int, feedforward: int) -> EncoderLayer:
-    """Draw parameters as torch's `nn.TransformerEncoderLayer` does."""
-    qkv_key, proj_key, first, second = draw.split(key, 4)
-    return EncoderLayer(
-        attn=init_torch_attention(qkv_key, proj_key, dim),
-        linear1=init_linear(first, dim, feedforward),
-        linear2=init_linear(second, feedforward, dim),
-        norm1=init_layer_norm(dim),
-        norm2=init_layer_norm(dim),
-    )
-
-
 def cross_image_encoder(
     params: CrossImageEncoder,
     tokens: Float[Array, "image token dim"],
@@ -124,86 +80,49 @@ def cross_image_encoder(
     means inference.
     """
     for layer, layer_key in zip(params.layers, split_key(key, config.layers), strict=True):
-        tokens = _encoder_layer(layer, tokens, config, mask=mask, key=layer_key)
+        weights_key, *keys = split_key(layer_key, 4)
+        attended = _attend_across(layer.attn, tokens, config, mask=mask, key=weights_key)
+        tokens = encoder_layer(layer, tokens, attended, gelu, rate=config.dropout, keys=keys)
     return tokens
 
 
-def _encoder_layer(
-    params: EncoderLayer,
-    tokens: Float[Array, "image token dim"],
+def _attend_across(
+    params: Attention,
+    x: Float[Array, "image token dim"],
     config: CrossImageConfig,
     *,
     mask: Bool[Array, "image image"] | None,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "image token dim"]:
-    weights_key, attended_key, hidden_key, update_key = split_key(key, 4)
-    rate = config.dropout
-    options = {"mask": mask, "dropout_rate": rate, "key": weights_key}
-    if image_mesh() is None:
-        across = attention(params.attn, tokens.swapaxes(0, 1), config.heads, **options)
-        attended = across.swapaxes(0, 1)
-    else:
-        attended = _attention_over_devices(params.attn, tokens, config.heads, **options)
-    tokens = tokens + dropout(attended, rate, key=attended_key)
-    tokens = layer_norm(params.norm1, tokens, epsilon=NORM_EPSILON)
-    hidden = dropout(gelu(linear(params.linear1, tokens)), rate, key=hidden_key)
-    update = dropout(linear(params.linear2, hidden), rate, key=update_key)
-    return layer_norm(params.norm2, tokens + update, epsilon=NORM_EPSILON)
+    """Attend from each token to the same token of all images.
 
-
-def _attention_over_devices(
-    params: Attention,
-    x: Float[Array, "image token dim"],
-    heads: int,
-    *,
-    mask: Bool[Array, "image image"] | None,
-    dropout_rate: float,
-    key: PRNGKeyArray | None,
-) -> Float[Array, "image token dim"]:
-    """Compute `attention` across images that are sharded over devices.
-
-    A device attends from its own images to those of all: keys and values are gathered once, and
-    their gradient is scattered once. Left alone, XLA splits the keys and adds up scores, totals and
-    results, with twelve collectives a layer. Dropout is drawn where it is used, with the same bits
-    as on one device.
+    Where images are sharded, a device attends from its own to those of all: keys and values are
+    gathered once, and their gradient is scattered once. Left alone, XLA splits the keys and adds up
+    scores, totals and results, with twelve collectives a layer. Dropout has the same bits as on one
+    device.
     """
-    mesh = image_mesh()
-    assert mesh is not None
     images, tokens, dim = x.shape
+    mesh, heads = image_mesh(), config.heads
     dropout_mask = None
-    if key is not None and dropout_rate > 0:
+    if key is not None and config.dropout > 0:
         every = jnp.ones((tokens, heads, images, images), at_least_float32(x[:0]).dtype)
-        dropout_mask = dropout(every, dropout_rate, key=key)
+        dropout_mask = dropout(every, config.dropout, key=key)
+
+    def by_token(x: Array) -> Float[Array, "token image head _"]:
+        return x.reshape(x.shape[0], tokens, heads, -1).swapaxes(0, 1)
 
     def attend(qkv: Array, mask: Array | None, dropout_mask: Array | None) -> Array:
         queries, others = jnp.split(qkv, [dim], axis=-1)
-        keys, values = jnp.split(_gathered(others), 2, axis=-1)
-        queries, keys, values = (
-            part.reshape(len(part), tokens, heads, dim // heads)
-            for part in (queries / math.sqrt(dim // heads), keys, values)
-        )
-        mixed = mix(
-            jnp.transpose(queries, (1, 2, 3, 0)),
-            jnp.transpose(keys, (1, 2, 0, 3)),
-            jnp.transpose(values, (1, 2, 0, 3)),
-            mask,
-            dropout_mask,
-            COLUMNS,
-            rule_precision(qkv.dtype),
-        )
-        return jnp.transpose(mixed, (3, 0, 1, 2)).reshape(-1, tokens, dim)
+        keys, values = jnp.split(others if mesh is None else _gathered(others), 2, axis=-1)
+        parts = map(by_token, (queries, keys, values))
+        mixed = dot_product_attention(*parts, mask=mask, dropout_mask=dropout_mask)
+        return mixed.swapaxes(0, 1).reshape(queries.shape)
 
-    own, by_query = PartitionSpec(IMAGE), PartitionSpec(None, IMAGE)
-    by_query_of_all = PartitionSpec(None, None, None, IMAGE)
-    attend = jax.shard_map(
-        attend,
-        mesh=mesh,
-        in_specs=(own, by_query, by_query_of_all),
-        out_specs=own,
-        check_vma=False,
-    )
-    mixed = attend(linear(params.qkv, x), None if mask is None else mask.T, dropout_mask)
-    return linear(params.proj, mixed)
+    if mesh is not None:
+        own, by_query = PartitionSpec(IMAGE), PartitionSpec(None, None, None, IMAGE)
+        specs = (own, own, by_query)
+        attend = jax.shard_map(attend, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)
+    return linear(params.proj, attend(linear(params.qkv, x), mask, dropout_mask))
 
 
 @jax.custom_vjp

@@ -9,12 +9,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from crisalad_jax.nn import draw
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.products import convolve, matmul
 from crisalad_jax.utils.pytree import pytree_dataclass
-from crisalad_jax.utils.target import target
 
 Keys = Key[Array, "*keys"]
 """One random key for all, or one for each entry of a batch."""
+Grid = tuple[int, int]
+"""Rows and columns of patches."""
+Valid = Bool[Array, " image"] | None
+"""Images of a training batch whose statistics batch norms normalise by; None takes the stored ones.
+"""
 TAPS = "taps"
 """Scope of elementwise products that are the multiply-accumulates of a convolution."""
 STATISTICS = ("running_mean", "running_var")
@@ -70,51 +75,55 @@ class BatchNorm:
 
 def init_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
     """Draw a linear layer as torch's `nn.Linear`: uniform within 1 / sqrt(d_in)."""
-    weight_key, bias_key = draw.split(key)
-    bound = 1 / math.sqrt(d_in)
-    return Linear(
-        draw.uniform(weight_key, (d_in, d_out), minval=-bound, maxval=bound),
-        draw.uniform(bias_key, (d_out,), minval=-bound, maxval=bound) if bias else None,
-    )
+    return Linear(*_within(key, (d_in, d_out), fan=d_in, bias=bias))
+
+
+def _within(
+    key: PRNGKeyArray, shape: tuple[int, ...], *, fan: int, bias: bool = True
+) -> tuple[Float[Array, "*shape"], Float[Array, " d_out"] | None]:
+    """Draw weight and bias uniformly within 1 / sqrt(fan), as torch's layers start."""
+    weight_key, bias_key = random_init.split(key)
+    bound = 1 / math.sqrt(fan)
+    draw = functools.partial(random_init.uniform, minval=-bound, maxval=bound)
+    return draw(weight_key, shape), draw(bias_key, shape[-1:]) if bias else None
 
 
 def init_small_linear(key: PRNGKeyArray, d_in: int, d_out: int, *, bias: bool = True) -> Linear:
     """Draw a linear layer as vision transformers': normal of deviation 0.02, cut at two; bias 0."""
-    weight = draw.truncated_normal(key, -2.0, 2.0, (d_in, d_out), scale=0.02)
-    return Linear(weight, draw.zeros(d_out) if bias else None)
+    weight = random_init.truncated_normal(key, -2.0, 2.0, (d_in, d_out), scale=0.02)
+    return Linear(weight, random_init.zeros(d_out) if bias else None)
 
 
 def init_layer_norm(dim: int) -> LayerNorm:
     """Make a layer norm with gain 1 and shift 0."""
-    return LayerNorm(draw.ones(dim), draw.zeros(dim))
+    return LayerNorm(random_init.ones(dim), random_init.zeros(dim))
 
 
 def init_depthwise_conv(
     key: PRNGKeyArray, kernel_size: int, dim: int, *, bias: bool = True
 ) -> DepthwiseConv:
     """Draw depthwise filters as torch's `nn.Conv2d(groups=dim)`: uniform within 1 / kernel_size."""
-    weight_key, bias_key = draw.split(key)
-    bound = 1 / kernel_size
-    return DepthwiseConv(
-        draw.uniform(weight_key, (kernel_size, kernel_size, dim), minval=-bound, maxval=bound),
-        draw.uniform(bias_key, (dim,), minval=-bound, maxval=bound) if bias else None,
-    )
+    shape = kernel_size, kernel_size, dim
+    return DepthwiseConv(*_within(key, shape, fan=kernel_size**2, bias=bias))
 
 
 def init_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
     """Draw a convolution as torch's `nn.Conv2d`: uniform within 1 / sqrt(kernel_size^2 d_in)."""
-    weight_key, bias_key = draw.split(key)
-    bound = 1 / (kernel_size * math.sqrt(d_in))
-    shape = (kernel_size, kernel_size, d_in, d_out)
-    return Conv(
-        draw.uniform(weight_key, shape, minval=-bound, maxval=bound),
-        draw.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
-    )
+    shape = kernel_size, kernel_size, d_in, d_out
+    return Conv(*_within(key, shape, fan=kernel_size**2 * d_in))
+
+
+def init_transposed_conv(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> Conv:
+    """Draw as torch's `nn.ConvTranspose2d`, which takes the channels out for those in."""
+    shape = kernel_size, kernel_size, d_in, d_out
+    return Conv(*_within(key, shape, fan=kernel_size**2 * d_out))
 
 
 def init_batch_norm(dim: int) -> BatchNorm:
     """Make a batch norm as torch's `nn.BatchNorm2d`: mean 0 and variance 1, the identity."""
-    return BatchNorm(draw.ones(dim), draw.zeros(dim), draw.zeros(dim), draw.ones(dim))
+    return BatchNorm(
+        random_init.ones(dim), random_init.zeros(dim), random_init.zeros(dim), random_init.ones(dim)
+    )
 
 
 def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -133,68 +142,14 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
     The whole batch is rows of one matrix: otherwise, for the gradient of a weight, XLA would
     transpose the cotangent by a copy.
     """
-    rows = x.reshape(-1, x.shape[-1])
-    product = _wide_gradient_matmul if _sums_gradients(x, params.weight) else _matmul
-    y = product(rows, params.weight)
+    y = matmul(x.reshape(-1, x.shape[-1]), params.weight)
     y = (y if params.bias is None else at_least_float32(y) + params.bias).astype(x.dtype)
     return y.reshape(*x.shape[:-1], y.shape[-1])
 
 
-def product_precision(dtype: Any) -> jax.lax.Precision | None:
-    """Return the precision of a product of matrices of `dtype`; None is what JAX is set to.
-
-    A pass takes numbers of 8 bits as they are, so that bfloat16 needs one.
-    """
-    single = dtype == jnp.bfloat16 and target().platform != "cpu"
-    return jax.lax.Precision.DEFAULT if single else None
-
-
-def _sums_gradients(x: Array, weight: Array) -> bool:
-    """Return whether a weight's gradient is to be summed in float32 by a rule of its own.
-
-    JAX's rule rounds it to the product's type before the sum over devices. A CPU's devices, which
-    are virtual, do without: its program stays as it is.
-    """
-    mixed = x.dtype == jnp.bfloat16 and weight.dtype != x.dtype
-    return mixed and target().platform != "cpu"
-
-
-def _matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
-    dtype = rows.dtype
-    return jnp.matmul(
-        rows,
-        weight.astype(dtype),
-        precision=product_precision(dtype),
-        preferred_element_type=target().product_dtype(dtype),
-    )
-
-
-@jax.custom_vjp
-def _wide_gradient_matmul(
-    rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]
-) -> Float[Array, "row d_out"]:
-    """Multiply bfloat16 rows by a wider weight, whose gradient is summed in the weight's type."""
-    return _matmul(rows, weight)
-
-
-def _matmul_forward(rows: Array, weight: Array) -> tuple[Array, tuple[Array, Array]]:
-    return _matmul(rows, weight), (rows, weight)
-
-
-def _matmul_backward(kept: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
-    rows, weight = kept
-    change = change.astype(rows.dtype)
-    to_rows = _matmul(change, weight.T).astype(rows.dtype)
-    to_weight = jnp.matmul(
-        rows.T,
-        change,
-        precision=product_precision(rows.dtype),
-        preferred_element_type=weight.dtype,
-    )
-    return to_rows, to_weight
-
-
-_wide_gradient_matmul.defvjp(_matmul_forward, _matmul_backward)
+def columns(params: Linear, start: int, stop: int) -> Linear:
+    """Return the part of a layer that computes the outputs from `start` to before `stop`."""
+    return jax.tree.map(lambda x: x[..., start:stop], params)
 
 
 def layer_norm(
@@ -266,84 +221,10 @@ def conv(
     """
     margin = params.weight.shape[0] // 2 if padding is None else padding
     images = x.reshape(-1, *x.shape[-3:])
-    if _sums_gradients(x, params.weight):
-        y = _wide_gradient_convolve(images, params.weight, stride, margin)
-    else:
-        y = _convolve(images, params.weight, stride, margin)
+    y = convolve(images, params.weight, stride=stride, margin=margin)
     if params.bias is not None:
         y = at_least_float32(y) + params.bias
     return y.astype(x.dtype).reshape(*x.shape[:-3], *y.shape[1:])
-
-
-def _convolve(images: Array, weight: Array, stride: int, margin: int) -> Array:
-    return jax.lax.conv_general_dilated(
-        images,
-        weight.astype(images.dtype),
-        window_strides=(stride, stride),
-        # Not "SAME", which pads less before the image than after it where the stride is 2.
-        padding=((margin, margin), (margin, margin)),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=product_precision(images.dtype),
-    )
-
-
-def _wide_gradient_convolution(
-    images: Float[Array, "image height width d_in"],
-    weight: Float[Array, "k k d_in d_out"],
-    stride: int,
-    margin: int,
-) -> Float[Array, "image rows columns d_out"]:
-    """Convolve bfloat16 images by a wider weight, whose gradient is summed in the weight's type."""
-    return _convolve(images, weight, stride, margin)
-
-
-_wide_gradient_convolve = jax.custom_vjp(_wide_gradient_convolution, nondiff_argnums=(2, 3))
-
-
-def _convolve_forward(
-    images: Array, weight: Array, stride: int, margin: int
-) -> tuple[Array, tuple[Array, Array]]:
-    return _convolve(images, weight, stride, margin), (images, weight)
-
-
-def _convolve_backward(
-    stride: int, margin: int, kept: tuple[Array, Array], change: Array
-) -> tuple[Array, Array]:
-    images, weight = kept
-    (to_images,) = jax.linear_transpose(
-        lambda images: _convolve(images, weight, stride, margin), images
-    )(change)
-    # The weight's gradient is the convolution of the images by the cotangent, whose pixels are
-    # `stride` apart; images are its channels. What no window reached is cut off at the end.
-    ends = [
-        size + (stride * (side - 1) + 1) - 1 - length - margin
-        for size, side, length in zip(
-            weight.shape[:2], change.shape[1:3], images.shape[1:3], strict=True
-        )
-    ]
-    to_weight = jax.lax.conv_general_dilated(
-        images,
-        change,
-        window_strides=(1, 1),
-        padding=[(margin, end) for end in ends],
-        rhs_dilation=(stride, stride),
-        dimension_numbers=("CHWN", "IHWO", "HWNC"),
-        precision=product_precision(images.dtype),
-        preferred_element_type=weight.dtype,
-    )
-    return to_images, to_weight
-
-
-_wide_gradient_convolve.defvjp(_convolve_forward, _convolve_backward)
-
-
-def batch_norm(
-    params: BatchNorm, x: Float[Array, "*batch dim"], *, epsilon: float
-) -> Float[Array, "*batch dim"]:
-    """Normalise by the stored statistics, as torch in evaluation mode; return the type of `x`."""
-    wide = at_least_float32(x)
-    scale = params.weight * jax.lax.rsqrt(params.running_var + epsilon)
-    return ((wide - params.running_mean) * scale + params.bias).astype(x.dtype)
 
 
 def train_batch_norm(
@@ -409,12 +290,25 @@ def split_statistics(params: PyTree) -> tuple[PyTree, PyTree]:
         >>> statistics.weight is None, rest.running_mean is None
         (True, True)
     """
-    measured = jax.tree_util.tree_map_with_path(
-        lambda path, _: jax.tree_util.keystr(path[-1:], simple=True) in STATISTICS, params
-    )
-    import equinox as eqx  # which takes a quarter of a second, and describing does without
 
-    return eqx.partition(params, measured)
+    def choose(*, measured: bool) -> PyTree:
+        def keep(path: Any, leaf: Any) -> Any:
+            name = jax.tree_util.keystr(path[-1:], simple=True)
+            return leaf if (name in STATISTICS) == measured else None
+
+        return jax.tree_util.tree_map_with_path(keep, params)
+
+    return choose(measured=True), choose(measured=False)
+
+
+def merge_statistics(statistics: PyTree, params: PyTree) -> PyTree:
+    """Replace the running statistics in parameters by those of `split_statistics`."""
+    return jax.tree.map(
+        lambda new, old: old if new is None else new,
+        statistics,
+        params,
+        is_leaf=lambda leaf: leaf is None,
+    )
 
 
 @jax.custom_jvp
@@ -448,8 +342,8 @@ def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys | None) -> Floa
     """
     if key is None or rate == 0:
         return x
-    draw = functools.partial(jax.random.bernoulli, p=1 - rate, shape=x.shape[key.ndim :])
-    keep = jax.vmap(draw)(key) if key.ndim else draw(key)
+    keep_some = functools.partial(jax.random.bernoulli, p=1 - rate, shape=x.shape[key.ndim :])
+    keep = jax.vmap(keep_some)(key) if key.ndim else keep_some(key)
     return jnp.where(keep, x / (1 - rate), 0)
 
 

@@ -3,6 +3,7 @@
 DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
 """
 
+import contextlib
 import dataclasses
 import functools
 import re
@@ -17,21 +18,22 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
 from crisalad_jax.config.checks import takes
 from crisalad_jax.config.concise import brief
-from crisalad_jax.nn import draw
+from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
+from crisalad_jax.nn.diff_trees import diff_trees, not_finite
 from crisalad_jax.nn.layers import (
     Keys,
     Linear,
     at_least_float32,
     init_linear,
     l2_normalise,
+    merge_statistics,
     split_key,
     split_statistics,
 )
-from crisalad_jax.nn.misfits import misfits, not_finite
 from crisalad_jax.nn.pixels import check_pixels, normalise
 from crisalad_jax.nn.projection import project
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
@@ -91,36 +93,30 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         (128,)
     """
     with compiler.number_types():
-        return _drawn(key, config)
-
-
-def _drawn(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
-    keys = draw.split(key, 3)
-    backbone = config.backbone.init(keys[0])
-    check_drawn(backbone, f"backbone {config.backbone.part_name}")
-    aggregator = config.aggregator.init(keys[1], config.backbone, config.grid)
-    check_drawn(aggregator, f"aggregator {config.aggregator.part_name}")
-    return Crisalad(
-        backbone=backbone,
-        aggregator=aggregator,
-        cross_image=init_cross_image(keys[2], config.token_shape.token_dim, config.cross_image)
-        if config.cross_image.layers
-        else None,
-        projection=init_linear(draw.fold_in(key, 3), config.unprojected_dim, config.projection.dim)
-        if config.projection.dim
-        else None,
-    )
+        keys = random_init.split(key, 3)
+        backbone = config.backbone.init(keys[0])
+        check_drawn(backbone, f"backbone {config.backbone.part_name}")
+        aggregator = config.aggregator.init(keys[1], config.backbone, config.grid)
+        check_drawn(aggregator, f"aggregator {config.aggregator.part_name}")
+        cross_image = projection = None
+        if config.cross_image.layers:
+            dim = config.token_shape.token_dim
+            cross_image = init_cross_image(keys[2], dim, config.cross_image)
+        if config.projection.dim:
+            dims = config.unprojected_dim, config.projection.dim
+            projection = init_linear(jax.random.fold_in(key, 3), *dims)
+        return Crisalad(backbone, aggregator, cross_image, projection)
 
 
 @functools.lru_cache(maxsize=64)
 def parameter_shapes(config: ModelConfig) -> Crisalad:
     """Return shapes and types of all parameters (`jax.ShapeDtypeStruct`); nothing is computed."""
-    with draw.only_shapes():
-        return jax.eval_shape(lambda: init_crisalad(jax.random.key(0), config))
+    return jax.eval_shape(lambda key: init_crisalad(key, config), jax.random.key(0))
 
 
+@takes(params=Crisalad, config=ModelConfig)
 def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> None:
-    """Check that parameters are those of a configuration: names, shapes, types and classes.
+    """Check that parameters are those of a configuration: names, shapes and types.
 
     Traced parameters pass as arrays do, and so do those that training has cast or cut:
     `config.compute_dtype` may stand for float32, and blocks may be in several stacks.
@@ -131,7 +127,7 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
         stored: whether a file is to keep them, which takes whole, finite float32 arrays alone.
 
     Raises:
-        InputError: they are not, the first of the misfits are listed; or the model computes in
+        InputError: they are not, the first differences are listed; or the model computes in
             float64, outside of JAX's 64-bit mode.
 
     Example:
@@ -144,53 +140,27 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
         ...
         crisalad_jax.utils.errors.InputError: params: not of this configuration: aggregator. ...
     """
-    _check_classes(params, config)
     template = parameter_shapes(config)
     if stored:
-        problems = misfits(params, template) or not_finite(params)
+        problems = diff_trees(params, template) or not_finite(params)
     else:
-        _check_width(params, config)
+        _check_64_bit_mode(config)
         dtypes = {jnp.dtype(config.compute_dtype)}
-        problems = misfits(params, template, dtypes)
+        problems = diff_trees(params, template, dtypes)
         if problems:
-            joined = _joined(params, config)
-            problems = problems if joined is None else misfits(joined, template, dtypes)
+            with contextlib.suppress(Exception):  # there may be anything in the place of the blocks
+                backbone = jax.eval_shape(config.backbone.join_blocks, params.backbone)
+                joined = dataclasses.replace(params, backbone=backbone)
+                problems = diff_trees(joined, template, dtypes)
     if problems:
         raise InputError(f"params: not of this configuration: {few(problems)}")
 
 
-def _joined(params: Crisalad, config: ModelConfig) -> Crisalad | None:
-    """Return the shapes of parameters whose blocks training has cut; None where they do not fit."""
-    try:
-        backbone = jax.eval_shape(config.backbone.join_blocks, params.backbone)
-    except Exception:  # there may be anything in the place of the blocks
-        return None
-    return dataclasses.replace(params, backbone=backbone)
-
-
-def _check_classes(params: Any, config: Any) -> None:
-    if not isinstance(params, Crisalad):
+def _check_64_bit_mode(config: ModelConfig) -> None:
+    if config.compute_dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
         raise InputError(
-            f"params: found {type(params).__name__}, expected Crisalad, of `init_crisalad` or "
-            "`load(FILE).params`"
-        )
-    if not isinstance(config, ModelConfig):
-        raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
-
-
-def _check_width(params: Any, config: ModelConfig) -> None:
-    """Raise InputError where JAX would compute in float32 what is float64."""
-    if config.compute_dtype == "float64":
-        if not jax.config.jax_enable_x64:  # pyright: ignore
-            raise InputError(
-                "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
-                "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)"
-            )
-    elif any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves(params)):
-        wide = [n for n, x in named_leaves(params).items() if getattr(x, "dtype", 0) == np.float64]
-        raise InputError(
-            f"params: found float64: {few(wide)}; expected float32, or ModelConfig.compute_dtype "
-            "float64"
+            "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
+            "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)"
         )
 
 
@@ -228,51 +198,24 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     return jax.tree.map(cast, params)
 
 
-def _door(second: str, check: Callable[[Any, ModelConfig], None]) -> Callable[[_F], _F]:
-    """Make a decorator that checks what a trace cannot, before the call of a compiled function.
+def _of_images(function: _F) -> _F:
+    """Check the pixels' values, which a trace does not know, before a compiled function is called.
 
-    Args:
-        second: name of the second argument, after `params` and before `config`.
-        check: raises InputError where the second argument has wrong values.
+    The function knows the devices that its images are sharded over.
     """
+    spread = over_images("images", 1)(function)
 
-    def decorate(function: _F) -> _F:
-        @functools.wraps(function)
-        def call(*args: Any, **options: Any) -> Any:
-            given = dict(zip(("params", second, "config"), args, strict=False), **options)
-            if len(given.keys() & {"params", second, "config"}) < 3:
-                return function(*args, **options)  # which raises Python's own error
-            params, config = given["params"], given["config"]
-            _check_classes(params, config)
-            _check_width(params, config)  # a trace takes NumPy's float64 for float32
-            check(given[second], config)
-            if config.compute_dtype == "float64":
-                check_params(params, config)
-                args, options = (), given | {"params": cast_params(params, config)}
-            try:
-                return function(*args, **options)
-            except TypeError:
-                check_params(params, config)  # a leaf may be no array
-                raise
+    @takes(params=Crisalad, config=ModelConfig)
+    @functools.wraps(spread)
+    def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
+        check_pixels(images, config.preprocessing)
+        _check_64_bit_mode(config)
+        return spread(params, images, config, **options)
 
-        return cast(_F, call)
-
-    return decorate
+    return cast(_F, call)
 
 
-def _check_images(images: Any, config: ModelConfig) -> None:
-    check_pixels(images, config.preprocessing)
-
-
-def _check_token_class(tokens: Any, _: ModelConfig) -> None:
-    if not isinstance(tokens, Tokens):
-        raise InputError(
-            f"tokens: found {type(tokens).__name__}, expected Tokens, of `extract_tokens`"
-        )
-
-
-@_door("images", _check_images)
-@over_images("images", 1)
+@_of_images
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def describe(
     params: Crisalad,
@@ -325,8 +268,7 @@ def describe(
     return attend_across_images(params, tokens, config, mask=mask, key=cross_key)
 
 
-@_door("images", _check_images)
-@over_images("images", 1)
+@_of_images
 @functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def extract_tokens(
     params: Crisalad,
@@ -363,20 +305,19 @@ def extract_tokens(
         >>> extract_tokens(params, np.zeros((1, 98, 98, 3), np.uint8), config).local.shape
         (1, 16, 32)
     """
+    return tokens_and_statistics(params, images, config, key=key, micro_batch=micro_batch)[0]
 
-    return _extract_tokens(params, images, None, config, key, micro_batch)[0]
 
-
-def train_tokens(
+def tokens_and_statistics(
     params: Crisalad,
     images: Images,
-    valid: Bool[Array, " image"],
     config: ModelConfig,
     *,
+    valid: Bool[Array, " image"] | None = None,
     key: Key[Array, ""] | None = None,
     micro_batch: int | None = None,
-) -> tuple[Tokens, Crisalad]:
-    """Extract the tokens of a training batch, by the statistics of the batch.
+) -> tuple[Tokens, Crisalad | None]:
+    """Extract tokens in a trace, in training by the statistics of the batch.
 
     Where the backbone has batch norms, these normalise by the mean and variance of the batch's
     valid images, as torch's in training mode. So a token depends on the other images. Devices that
@@ -386,30 +327,18 @@ def train_tokens(
     Args:
         params: see `describe`.
         images: see `describe`.
-        valid: which images are no padding.
         config: see `describe`.
+        valid: images that the statistics are taken of; None takes the stored ones.
         key: see `describe`.
         micro_batch: see `extract_tokens`.
 
     Returns:
         (tokens, statistics): a tree of the structure of `params`, which holds the running
-        statistics after this batch, and None for all other leaves.
+        statistics after this batch, and None for all other leaves; None where `valid` is None.
 
     Raises:
         InputError: as `describe`.
     """
-    return _extract_tokens(params, images, valid, config, key, micro_batch)
-
-
-def _extract_tokens(
-    params: Crisalad,
-    images: Images,
-    valid: Bool[Array, " image"] | None,
-    config: ModelConfig,
-    key: Key[Array, ""] | None,
-    micro_batch: int | None,
-) -> tuple[Tokens, Any]:
-    """Extract tokens, and the running statistics; None in their place where `valid` is None."""
     count = images.shape[0]  # which may be symbolic, where `len` is not
     keys = None if key is None else jax.random.split(key, count)
     if micro_batch is not None and count % micro_batch:
@@ -447,28 +376,25 @@ def _tokens_in_parts(
     config: ModelConfig,
     keys: Keys | None,
     micro_batch: int | None,
-) -> tuple[Tokens, Any]:
-    """Extract tokens `micro_batch` images at a time; see `_extract_tokens`."""
+) -> tuple[Tokens, Crisalad | None]:
+    """Extract tokens `micro_batch` images at a time; see `tokens_and_statistics`."""
 
     def tokens_of(
-        statistics: Crisalad | None, images: Images, keys: Keys | None, valid: Array | None
+        statistics: Crisalad | None, part: tuple[Images, Keys | None, Array | None]
     ) -> tuple[Crisalad | None, Tokens]:
-        current = params
-        if statistics is not None:
-            import equinox as eqx  # which takes a quarter of a second, and describing does without
-
-            current = eqx.combine(statistics, params)
-        features, statistics = _extract_features(current, images, valid, config)
+        images, keys, valid = part
+        current = params if statistics is None else merge_statistics(statistics, params)
+        features, updated = _extract_features(current, images, config, valid=valid)
         grid = config.backbone.grid((images.shape[1], images.shape[2]))
         with jax.named_scope("aggregator"):
             tokens = config.aggregator.apply(params.aggregator, features, grid, key=keys)
         check_tokens(tokens, config.aggregator, config.backbone.dim, (images.shape[0],))
-        return statistics, tokens
+        return None if statistics is None else split_statistics(updated)[0], tokens
 
     statistics = None if valid is None else split_statistics(params)[0]
-    count = images.shape[0]
+    count, whole = images.shape[0], (images, keys, valid)
     if micro_batch is None or micro_batch == count:
-        statistics, tokens = tokens_of(statistics, images, keys, valid)
+        statistics, tokens = tokens_of(statistics, whole)
         return tokens, statistics
 
     # Parts are interleaved, so that each device of a sharded batch has a share of every part.
@@ -478,13 +404,12 @@ def _tokens_in_parts(
     def join(x: Array) -> Array:
         return x.swapaxes(0, 1).reshape(count, *x.shape[2:])
 
-    once = jax.checkpoint(lambda statistics, part: tokens_of(statistics, *part), prevent_cse=False)
-    parts = jax.tree.map(split, (images, keys, valid))
-    statistics, tokens = jax.lax.scan(once, statistics, parts)
+    once = jax.checkpoint(tokens_of, prevent_cse=False)
+    statistics, tokens = jax.lax.scan(once, statistics, jax.tree.map(split, whole))
     return jax.tree.map(join, tokens), statistics
 
 
-@_door("images", _check_images)
+@_of_images
 @functools.partial(compiler.jit, static_argnames="config")
 def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
     """Extract the features of every image that the aggregator requests.
@@ -508,18 +433,18 @@ def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> F
         >>> extract_features(params, np.zeros((1, 98, 98, 3), np.uint8), config).patches.shape
         (1, 49, 128)
     """
-    return _extract_features(params, images, None, config)[0]
+    return _extract_features(params, images, config)[0]
 
 
 def _extract_features(
     params: Crisalad,
     images: Images,
-    valid: Bool[Array, " image"] | None,
     config: ModelConfig,
     *,
-    inserts: bool = True,
-) -> tuple[Features, Crisalad | None]:
-    """Extract features, and the running statistics; None where `valid` is None."""
+    valid: Bool[Array, " image"] | None = None,
+    with_insertion: bool = True,
+) -> tuple[Features, Crisalad]:
+    """Extract features; return parameters with updated statistics, as `Backbone.apply` does."""
     check_params(params, config)
     if images.ndim != 4 or images.shape[-1] != 3:
         raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
@@ -527,31 +452,36 @@ def _extract_features(
         raise InputError("images: found none, expected at least one")
     images = jnp.asarray(images)
     config.check_image_size((images.shape[1], images.shape[2]))
-    if images.dtype != jnp.uint8 and not jnp.issubdtype(images.dtype, jnp.floating):
+    if images.dtype == jnp.uint8:
+        images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
+    elif not jnp.issubdtype(images.dtype, jnp.floating):
         raise InputError(
             f"images: found {images.dtype}, expected uint8 pixels, or floats that are normalised"
         )
-    if images.dtype == jnp.uint8:
-        images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
+    params = _widened(params, config)
     request = config.aggregator.features(config.backbone.depth)
-    if not inserts:
+    if not with_insertion:
         request = dataclasses.replace(request, insertion=None)
     elif request.insertion is not None:
         inserted = config.aggregator.inserted(params.aggregator)
         request = dataclasses.replace(request, inserted=inserted)
-    pixels = images.astype(config.compute_dtype)
     with jax.named_scope("backbone"):
-        if valid is None:
-            features = config.backbone.apply(params.backbone, pixels, request, remat=config.remat)
-            return features, None
-        features, backbone = config.backbone.apply_training(
-            params.backbone, pixels, request, remat=config.remat, valid=valid
+        features, backbone = config.backbone.apply(
+            params.backbone,
+            images.astype(config.compute_dtype),
+            request,
+            remat=config.remat,
+            valid=valid,
         )
-    statistics, _ = split_statistics(dataclasses.replace(params, backbone=backbone))
-    return features, statistics
+    return features, dataclasses.replace(params, backbone=backbone)
 
 
-@_door("images", _check_images)
+def _widened(params: Crisalad, config: ModelConfig) -> Crisalad:
+    """Cast all parameters for a model that computes in float64."""
+    return cast_params(params, config) if config.compute_dtype == "float64" else params
+
+
+@_of_images
 @functools.partial(compiler.jit, static_argnames="config")
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
@@ -563,11 +493,11 @@ def unit_features(
     Raises:
         InputError: as `describe`.
     """
-    features, _ = _extract_features(params, images, None, config, inserts=False)
+    features, _ = _extract_features(params, images, config, with_insertion=False)
     return l2_normalise(at_least_float32(features.patches))
 
 
-@_door("tokens", _check_token_class)
+@takes(params=Crisalad, tokens=Tokens, config=ModelConfig)
 @functools.partial(compiler.jit, static_argnames="config")
 def attend_across_images(
     params: Crisalad,
@@ -605,19 +535,27 @@ def attend_across_images(
         (2, 576)
     """
     check_params(params, config)
-    _check_token_shapes(tokens, config)
+    params = _widened(params, config)
+    count = tokens.local.shape[0]
+    shape = config.token_shape
+    found = tokens.global_token.shape, tokens.local.shape
+    expected = (count, shape.global_dim), (count, shape.tokens, shape.token_dim)
+    if found != expected:
+        raise InputError(
+            f"tokens: found a global token of shape {found[0]} and local tokens of {found[1]}, "
+            f"expected {expected[0]} and {expected[1]}"
+        )
     if params.cross_image is not None:
-        options = config.cross_image
-        enter = functools.partial(as_sequence, global_token=options.global_token)
-        leave = functools.partial(from_sequence, global_token=options.global_token)
         if mask is not None:
-            count = tokens.local.shape[0]
             if mask.shape != (count, count):
                 raise InputError(
                     f"mask: found shape {mask.shape}, expected {(count, count)}, a row and a "
                     "column for each image"
                 )
             mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
+        options = config.cross_image
+        enter = functools.partial(as_sequence, global_token=options.global_token)
+        leave = functools.partial(from_sequence, global_token=options.global_token)
         with jax.named_scope("cross_image"):
             sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
             sequence = cross_image_encoder(
@@ -632,19 +570,7 @@ def attend_across_images(
         return project(params.projection, descriptors, config.projection)
 
 
-def _check_token_shapes(tokens: Tokens, config: ModelConfig) -> None:
-    shape = config.token_shape
-    found = tokens.global_token.shape, tokens.local.shape
-    count = tokens.local.shape[0]
-    expected = (count, shape.global_dim), (count, shape.tokens, shape.token_dim)
-    if found != expected:
-        raise InputError(
-            f"tokens: found a global token of shape {found[0]} and local tokens of {found[1]}, "
-            f"expected {expected[0]} and {expected[1]}"
-        )
-
-
-@_door("images", _check_images)
+@_of_images
 @functools.partial(compiler.jit, static_argnames="config")
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig

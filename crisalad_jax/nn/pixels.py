@@ -19,7 +19,7 @@ LOCAL_NOISE = 0.02
 _BYTES_FROM = 30.0
 """Numbers above this are pixels of 0 to 255. ImageNet's normalisation gives at most 2.7, and that
 of local contrast at most 21, the root of its window's size. Other means and deviations may give
-more: see `_largest`."""
+more."""
 _OVERSHOOT = 1.5
 """Range of what a bicubic filter on floats gives, for pixels of a range of 1."""
 _SPREAD = 0.5
@@ -29,7 +29,7 @@ _SPREAD = 0.5
 def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) -> None:
     """Check that images are an array, and that floats are normalised and no plain pixels.
 
-    Traced values are not known, and pass.
+    Values that are traced, or lie with other processes, are not known, and pass.
 
     Args:
         images: 8-bit pixels, or floats.
@@ -51,17 +51,12 @@ def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) 
             f"images: found {type(images).__name__}, expected an array of shape "
             f"(image, height, width, 3){hint}"
         )
-    if isinstance(images, Tracer) or not images.size:
+    is_known = not isinstance(images, Tracer) and getattr(images, "is_fully_addressable", True)
+    if not is_known or not images.size or not jnp.issubdtype(images.dtype, jnp.floating):
         return
-    if not jnp.issubdtype(images.dtype, jnp.floating):
-        return
-    if isinstance(images, np.ndarray):
-        low, high = float(images.min()), float(images.max())
-    elif images.is_fully_addressable:
-        low, high = map(float, _range(images))
-    else:
-        return  # parts of it lie with other processes
-    if high > max(_BYTES_FROM, _largest(how)):
+    low, high = float(images.min()), float(images.max())
+    largest = max((_OVERSHOOT - m) / d for m, d in zip(how.mean, how.deviation, strict=True))
+    if high > max(_BYTES_FROM, largest):
         cure = "images.round().astype(np.uint8)"
     elif low >= 0 and high <= 1 and high - low >= _SPREAD:
         cure = "(255 * images).round().astype(np.uint8)"
@@ -71,17 +66,6 @@ def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) 
         f"images: found {images.dtype} from {low:.3g} to {high:.3g}, which are pixels, expected "
         f"floats that are normalised, or uint8: {cure}"
     )
-
-
-def _largest(how: PreprocessingConfig) -> float:
-    """Return the largest number that pixels can be normalised to by mean and deviation."""
-    pairs = zip(how.mean, how.deviation, strict=True)
-    return max((_OVERSHOOT - mean) / deviation for mean, deviation in pairs)
-
-
-@jax.jit
-def _range(images: Float[Array, "..."]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    return images.min(), images.max()
 
 
 def normalise(

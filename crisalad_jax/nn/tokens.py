@@ -11,7 +11,7 @@ from crisalad_jax.config.concise import brief
 class TransportStatistics(NamedTuple):
     """Statistics of a transport, for a log."""
 
-    column_error: Float[Array, "*batch"]
+    marginal_error: Float[Array, "*batch"]
     """Largest relative error of a cluster's mass."""
     dustbin_share: Float[Array, "*batch"]
     """Share of all mass that went to the dustbin."""

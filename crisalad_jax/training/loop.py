@@ -175,7 +175,7 @@ def check_learns(config: TrainConfig) -> None:
     Raises:
         InputError: nothing of the model trains.
     """
-    if not config.model.aggregator.learns:
+    if not config.model.aggregator.trainable:
         raise InputError(
             f"aggregator: found {config.model.aggregator.part_name}, with which nothing trains, "
             "expected another; `crisalad vocabulary` makes its models"

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Int32, Int64
 
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.losses.tuples import Role, tuple_labels
+from crisalad_jax.losses.pairs import Role, tuple_labels
 from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.utils.errors import InputError
 
@@ -29,7 +29,7 @@ class Mined(NamedTuple):
     """First step of the round; -1 before the first."""
     images: Int32[np.ndarray, "tuple image"]
     roles: Int32[np.ndarray, "tuple image"]
-    """See `losses.tuples.Role`."""
+    """See `losses.pairs.Role`."""
     hardest: Int32[np.ndarray, "query negative"]
     """Last negatives of each query, which are candidates again; -1 for none."""
 

@@ -29,8 +29,7 @@ from crisalad_jax.nn.layers import split_key, split_statistics
 from crisalad_jax.nn.model import (
     Crisalad,
     attend_across_images,
-    extract_tokens,
-    train_tokens,
+    tokens_and_statistics,
     valid_mask,
 )
 from crisalad_jax.nn.pixels import check_pixels
@@ -353,12 +352,16 @@ def train_step(
     def loss_of(trained: tuple[PyTree, Any]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
         learnt, classifier = trained
         params = eqx.combine(learnt, statistics, frozen)
-        options = {"key": tokens_key, "micro_batch": config.micro_batch}
+        updates_statistics = bool(jax.tree.leaves(statistics))
         # The two halves of `describe`, because the tokens carry the transport's statistics.
-        if jax.tree.leaves(statistics):
-            tokens, measured = train_tokens(params, images, valid, config.model, **options)
-        else:
-            tokens, measured = extract_tokens(params, images, config.model, **options), statistics
+        tokens, measured = tokens_and_statistics(
+            params,
+            images,
+            config.model,
+            valid=valid if updates_statistics else None,
+            key=tokens_key,
+            micro_batch=config.micro_batch,
+        )
         descriptors = attend_across_images(
             params, tokens, config.model, mask=valid_mask(all_valid), key=cross_key
         )
@@ -368,7 +371,11 @@ def train_step(
         if len(all_labels) <= WHOLE_LOSS:
             loss = devices.whole_on_each(loss)
         result = loss(descriptors, dense, all_labels, all_valid, classifier, group)
-        return result.loss, (result, tokens.transport, measured)
+        return result.loss, (
+            result,
+            tokens.transport,
+            measured if updates_statistics else statistics,
+        )
 
     (loss, (result, transport, statistics)), (gradient, classifier_gradient) = jax.value_and_grad(
         loss_of, has_aux=True
@@ -457,5 +464,5 @@ def _loss(
         )
     easy = metric_loss(descriptors, labels, valid=valid, pairs=pairs).easy_anchor_fraction
     value = call_loss(config.loss, descriptors, labels, valid)
-    check_value(LossValue(value), getattr(config.loss, "__name__", "given"))
+    check_value(LossValue(value), f"loss {getattr(config.loss, '__name__', 'given')}")
     return LossResult(value, easy)

@@ -88,7 +88,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
             prefixes += ("backbone.cls_token", "backbone.pos_embed")
     else:
         raise InputError(f"trainable: found {trainable!r}, expected {EXPECTED}")
-    constant = () if config.aggregator.learns else ("aggregator.",)
+    constant = () if config.aggregator.trainable else ("aggregator.",)
     names = iter(named_leaves(params))
 
     def learns(name: str) -> bool:

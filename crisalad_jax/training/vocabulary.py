@@ -25,7 +25,7 @@ from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS
-from crisalad_jax.nn.backbones import FeatureRequest
+from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, cast_params, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
@@ -261,7 +261,7 @@ def vocabulary_words(config: ModelConfig) -> str:
     """
     name, request = config.aggregator.part_name, config.aggregator.features(config.backbone.depth)
     if request.levels is None:
-        return name if request == FeatureRequest() else f"{name} ({request.facet})"
+        return name if request == FeatureSpec() else f"{name} ({request.facet})"
     blocks = ", ".join(str(level - 1) for level in request.levels)
     return f"{name} ({request.facet} of block {blocks})"
 

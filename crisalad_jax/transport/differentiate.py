@@ -15,10 +15,6 @@ from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem, 
 from crisalad_jax.transport.steps import solve_columns
 from crisalad_jax.utils.target import target
 
-PARTS = 2
-"""Number of parts of a batch that choose a domain, one after the other: the memory for a choice's
-gradient is allocated whatever is chosen."""
-
 
 def solve_in_domain(
     problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
@@ -34,32 +30,23 @@ def solve_in_domain(
     if not count:
         return solution
 
-    def solve_in_log(problem: Problem, init: Potentials, params: Any) -> Solution:
+    def solve_in_log(problem: Problem, init: Potentials, params: Any, _: Solution) -> Solution:
         # Solve the problems one by one, so that this branch needs little memory.
+        @jax.checkpoint
         def solve_one(inputs: tuple[Problem, Potentials]) -> Solution:
             return iterate(inputs[0], config, params, inputs[1])
 
-        return jax.lax.map(jax.checkpoint(solve_one), (problem, init))
+        flat = jax.tree.map(lambda x: x.reshape(count, *x.shape[len(batch) :]), (problem, init))
+        found = jax.lax.map(solve_one, flat)
+        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), found)
 
     # Keep the scaling domain's iterations outside of `cond`: a branch would copy out all residuals
     # of its gradient, and zeros for those of the other branch.
     @jax.checkpoint
-    def choose(problem: Problem, init: Potentials, solution: Solution, params: Any) -> Solution:
-        return jax.lax.cond(
-            scaled.in_range,
-            lambda problem, init, solution, params: solution,
-            lambda problem, init, solution, params: solve_in_log(problem, init, params),
-            *(problem, init, solution, params),
-        )
+    def choose(*inputs: Any) -> Solution:
+        return jax.lax.cond(scaled.in_range, lambda *inputs: inputs[-1], solve_in_log, *inputs)
 
-    parts = PARTS if count % PARTS == 0 else 1
-    # Parts are interleaved, so that each device of a sharded batch has a share of every part.
-    split = jax.tree.map(
-        lambda x: x.reshape(count // parts, parts, *x.shape[len(batch) :]),
-        (problem, init, solution),
-    )
-    chosen = [choose(*jax.tree.map(lambda x, i=i: x[:, i], split), params) for i in range(parts)]
-    return jax.tree.map(lambda *x: jnp.stack(x, axis=1).reshape(*batch, *x[0].shape[1:]), *chosen)
+    return choose(problem, init, params, solution)
 
 
 @GRADIENTS.register("unrolled")

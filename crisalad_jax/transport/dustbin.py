@@ -9,17 +9,17 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.parts import Part, Registry
-from crisalad_jax.transport.diagnose import wide_dtype
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.transport.problem import Matrix, Rows
 
 
 @brief
 class Marginals(NamedTuple):
     """Scores that include the dustbin, and the masses of rows and columns."""
 
-    scores: Float[Array, "*batch rows columns"]
+    scores: Matrix
     log_mu: Float[Array, "*#batch rows"]
     log_nu: Float[Array, "*#batch columns"]
 
@@ -67,8 +67,7 @@ DUSTBINS = Registry("dustbin", Dustbin)
 
 def _check_shape(params: Any, expected: tuple[int, ...] | None, name: str) -> None:
     shape = None if params is None else jnp.shape(params)
-    if shape != expected:
-        raise InputError(f"dustbin: found shape {shape}, expected {expected} for {name!r}")
+    require(shape == expected, f"dustbin: found shape {shape}, expected {expected} for {name!r}")
 
 
 def check_marginals(marginals: Any, dustbin: Dustbin, scores: Array) -> Marginals:
@@ -78,15 +77,17 @@ def check_marginals(marginals: Any, dustbin: Dustbin, scores: Array) -> Marginal
         InputError: it is not; the message names the dustbin.
     """
     where = f"dustbin {dustbin.part_name}: found to return"
-    if not isinstance(marginals, Marginals):
-        raise InputError(f"{where} {type(marginals).__name__}, expected Marginals")
+    require(
+        isinstance(marginals, Marginals),
+        f"{where} {type(marginals).__name__}, expected Marginals",
+    )
     shape, (rows, clusters) = jnp.shape(marginals.scores), scores.shape[-2:]
     clusters -= dustbin.scores
-    if len(shape) != scores.ndim or shape[-2] < rows or shape[-1] < clusters:
-        raise InputError(
-            f"{where} scores of shape {shape}, expected at least the {rows} patches and the "
-            f"{clusters} clusters of {scores.shape}"
-        )
+    require(
+        len(shape) == scores.ndim and shape[-2] >= rows and shape[-1] >= clusters,
+        f"{where} scores of shape {shape}, expected at least the {rows} patches and the "
+        f"{clusters} clusters of {scores.shape}",
+    )
     return marginals
 
 
@@ -185,8 +186,7 @@ def _with_column(scores: Array, column: Array) -> Marginals:
 
 
 def append_dustbin(
-    scores: Float[Array, "*batch rows clusters"],
-    dustbin: float | Float[Array, ""] | Float[Array, "*batch rows"],
+    scores: Float[Array, "*batch rows clusters"], dustbin: float | Float[Array, ""] | Rows
 ) -> Float[Array, "*batch rows clusters+1"]:
     """Append a column of the dustbin's score to the scores (paper Eq. 4).
 
@@ -206,8 +206,10 @@ def append_dustbin(
         [[0.0, 1.0], [0.0, 1.0]]
     """
     column = jnp.asarray(dustbin).astype(scores.dtype)
-    if column.shape not in ((), scores.shape[:-1]):
-        raise InputError(f"dustbin: found shape {column.shape}, expected () or {scores.shape[:-1]}")
+    require(
+        column.shape in ((), scores.shape[:-1]),
+        f"dustbin: found shape {column.shape}, expected () or {scores.shape[:-1]}",
+    )
     column = jnp.broadcast_to(column[..., None] if column.ndim else column, (*scores.shape[:-1], 1))
     return jnp.concatenate([scores, column], axis=-1)
 
@@ -232,25 +234,11 @@ def log_marginals(
         >>> [x.tolist() for x in log_marginals(3, 2)]
         [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     """
-    if rows <= clusters:
-        raise InputError(
-            f"transport: found {rows} patches for {clusters} clusters, expected more patches than "
-            "clusters: the dustbin's mass is their difference"
-        )
+    require(
+        rows > clusters,
+        f"transport: found {rows} patches for {clusters} clusters, expected more patches than "
+        "clusters: the dustbin's mass is their difference",
+    )
     log_mu = jnp.zeros(rows, dtype)
     log_nu = jnp.zeros(clusters + 1, dtype).at[-1].set(math.log(rows - clusters))
     return log_mu, log_nu
-
-
-def widened(scores: Float[Array, "*batch patches clusters"]) -> Array:
-    """Convert scores of patches to float32 at least.
-
-    Raises:
-        InputError: they have not two axes, or one is empty.
-    """
-    if scores.ndim < 2 or 0 in scores.shape[-2:]:
-        raise InputError(
-            f"assign_with_dustbin: found scores of shape {scores.shape}, expected (..., patches, "
-            "clusters)"
-        )
-    return scores.astype(wide_dtype(scores))

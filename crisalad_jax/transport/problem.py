@@ -17,16 +17,27 @@ SCALING_RANGE = 60
 Within it no sum is below exp(-60), whatever the potentials, and what float32 flushes to zero, below
 exp(-87), is no part of such a sum's last place."""
 
-NO_MASS = -1e5
+LOG_ZERO = -1e5
 """Logarithm below which a mass is 0: no format of floats holds exp(-1e5)."""
+EMPTY = -1e30
+"""Logarithm that stands for a mass of 0, and the potential of such a row or column.
+
+It is finite, so that differences and gradients are; and so low that numbers of the size of
+potentials vanish in a sum with it.
+"""
+
+
+Matrix = Float[Array, "*batch rows columns"]
+Rows = Float[Array, "*batch rows"]
+Columns = Float[Array, "*batch columns"]
 
 
 @brief
 class Potentials(NamedTuple):
     """Dual variables over epsilon: the plan is exp(kernel + row + column)."""
 
-    row: Float[Array, "*batch rows"]
-    column: Float[Array, "*batch columns"]
+    row: Rows
+    column: Columns
 
 
 @pytree_dataclass
@@ -39,21 +50,21 @@ class Problem:
     Attributes:
         clusters: all columns but the last of the scores over epsilon.
         last: the last column.
-        log_mu: logarithms of the rows' masses; `floor` for a mass of 0.
-        log_nu: logarithms of the columns' masses, alike.
+        log_mu: logarithms of the rows' masses; `EMPTY` for a mass of 0.
+        log_nu: the same of the columns' masses.
         row_tau: 1 where rows meet their marginals exactly; below 1 a Kullback-Leibler penalty of
             weight epsilon * tau / (1 - tau) draws them there (Chizat et al., Math. Comp. 2018).
         column_tau: the same for columns.
 
     Example:
         >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
-        >>> problem.over_rows(jnp.zeros(2)).shape
+        >>> problem.lse_rows(jnp.zeros(2)).shape
         (2,)
     """
 
     clusters: Float[Array, "*batch rows clusters"]
-    last: Float[Array, "*batch rows"]
-    log_mu: Float[Array, "*batch rows"]
+    last: Rows
+    log_mu: Rows
     log_nu: Float[Array, "*batch clusters+1"]
     row_tau: float = static_field(default=1.0)
     column_tau: float = static_field(default=1.0)
@@ -61,9 +72,9 @@ class Problem:
     @classmethod
     def of(
         cls,
-        kernel: Float[Array, "*batch rows columns"],
-        log_mu: Float[Array, "*batch rows"],
-        log_nu: Float[Array, "*batch columns"],
+        kernel: Matrix,
+        log_mu: Rows,
+        log_nu: Columns,
         row_tau: float = 1.0,
         column_tau: float = 1.0,
     ) -> "Problem":
@@ -71,13 +82,13 @@ class Problem:
 
         A mass of 0 has the logarithm -inf, or any below -1e5.
         """
-        log_mu, log_nu = (jnp.where(x < NO_MASS, floor(x.dtype), x) for x in (log_mu, log_nu))
+        log_mu, log_nu = (jnp.where(x < LOG_ZERO, EMPTY, x) for x in (log_mu, log_nu))
         # Split, not two slices: their gradients would be two zero-padded matrices to add up.
         clusters, last = jax.lax.split(kernel, (kernel.shape[-1] - 1, 1), axis=kernel.ndim - 1)
         return Problem(clusters, last[..., 0], log_mu, log_nu, row_tau, column_tau)
 
     @property
-    def kernel(self) -> Float[Array, "*batch rows columns"]:
+    def kernel(self) -> Matrix:
         """Scores divided by epsilon."""
         return _joined(self.clusters, self.last)
 
@@ -89,38 +100,36 @@ class Problem:
     @property
     def empty(self) -> tuple[Bool[Array, "*batch rows"], Bool[Array, "*batch columns"]]:
         """Which rows and which columns have no mass."""
-        return self.log_mu < NO_MASS, self.log_nu < NO_MASS
+        return self.log_mu < LOG_ZERO, self.log_nu < LOG_ZERO
 
-    def masked(self, potentials: Potentials, value: float | None = None) -> Potentials:
+    def masked(self, potentials: Potentials, value: float = EMPTY) -> Potentials:
         """Set the potentials of rows and columns without mass.
 
         Args:
             potentials: of all rows and columns.
-            value: what to set; by default `floor`, with which they are in no sum and no plan.
+            value: what to set; by default `EMPTY`, with which they are in no sum and no plan.
         """
-        if value is None:
-            value = floor(self.log_mu.dtype)
         pairs = zip(self.empty, potentials, strict=True)
         return Potentials(*(jnp.where(empty, value, x) for empty, x in pairs))
 
-    def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
+    def lse_columns(self, column: Columns) -> Rows:
         """Return the logarithm of each row's sum of exp(kernel + column)."""
         return jax.nn.logsumexp(self.kernel + column[..., None, :], axis=-1)
 
-    def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
+    def lse_rows(self, row: Rows) -> Columns:
         """Return the logarithm of each column's sum of exp(kernel + row)."""
         return jax.nn.logsumexp(self.kernel + row[..., :, None], axis=-2)
 
-    def log_plan(self, potentials: Potentials) -> Float[Array, "*batch rows columns"]:
+    def log_plan(self, potentials: Potentials) -> Matrix:
         """Return the logarithm of the plan that the potentials make."""
-        # Where one side has no mass at all, the other's potentials must not make up for its floor.
-        most = -floor(self.log_mu.dtype) / 4
+        # Where one side has no mass at all, the other's potentials must not make up for it.
+        most = -EMPTY / 4
         row, column = (jnp.where((x > most) & (x < jnp.inf), most, x) for x in potentials)
         clusters = self.clusters + row[..., :, None] + column[..., None, :-1]
         return _joined(clusters, self.last + row + column[..., -1:])
 
     def zeros(self) -> Potentials:
-        """Return zero potentials, but `floor` where there is no mass."""
+        """Return zero potentials, but `EMPTY` where there is no mass."""
         return self.masked(zero_potentials(self.kernel))
 
 
@@ -136,9 +145,9 @@ class ScalingProblem(Problem):
             are finite but wrong.
     """
 
-    row_max: Float[Array, "*batch rows"] = dataclasses.field(kw_only=True)
+    row_max: Rows = dataclasses.field(kw_only=True)
     gibbs: Float[Array, "*batch rows clusters"] = dataclasses.field(kw_only=True)
-    gibbs_last: Float[Array, "*batch rows"] = dataclasses.field(kw_only=True)
+    gibbs_last: Rows = dataclasses.field(kw_only=True)
     in_range: Bool[Array, ""] = dataclasses.field(kw_only=True)
 
     @classmethod
@@ -155,13 +164,13 @@ class ScalingProblem(Problem):
             in_range=(row_max - row_min).max(initial=0) < SCALING_RANGE,
         )
 
-    def over_columns(self, column: Float[Array, "*batch columns"]) -> Float[Array, "*batch rows"]:
+    def lse_columns(self, column: Columns) -> Rows:
         """Return the logarithm of each row's sum of exp(kernel + column)."""
         scaled, top = _exponentials(column)
         sums = product("...nk,...k->...n", self.gibbs, scaled[..., :-1])
         return self.row_max + self._log(sums + self.gibbs_last * scaled[..., -1:]) + top
 
-    def over_rows(self, row: Float[Array, "*batch rows"]) -> Float[Array, "*batch columns"]:
+    def lse_rows(self, row: Rows) -> Columns:
         """Return the logarithm of each column's sum of exp(kernel + row)."""
         scaled, top = _exponentials(row + self.row_max)
         sums = product("...nk,...n->...k", self.gibbs, scaled)
@@ -176,17 +185,7 @@ class ScalingProblem(Problem):
 product = functools.partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
 
 
-def floor(dtype: jnp.dtype) -> float:
-    """Return the logarithm that stands for a mass of 0, and the potential of such a row or column.
-
-    It is finite, so that differences and gradients are; and so low that numbers of the size of
-    potentials vanish beside it: the floor plus a potential is the floor.
-    """
-    # An eighth: a plan adds two of them, and a step may add more.
-    return float(jnp.finfo(dtype).min) / 8
-
-
-def zero_potentials(kernel: Float[Array, "*batch rows columns"]) -> Potentials:
+def zero_potentials(kernel: Matrix) -> Potentials:
     """Return zero potentials for scores of this shape."""
     # Derive them from the kernel, so that under `shard_map` they vary over devices as it does.
     row = 0 * jax.lax.stop_gradient(kernel)[..., 0]

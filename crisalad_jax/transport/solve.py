@@ -10,8 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.concise import brief
-from crisalad_jax.transport.config import SinkhornConfig
-from crisalad_jax.transport.diagnose import (
+from crisalad_jax.transport.checks import (
     check_init,
     check_inputs,
     check_solution,
@@ -20,9 +19,10 @@ from crisalad_jax.transport.diagnose import (
     marginal_error,
     wide_dtype,
 )
+from crisalad_jax.transport.config import SinkhornConfig
 from crisalad_jax.transport.differentiate import centred
-from crisalad_jax.transport.dustbin import DUSTBINS, Dustbin, check_marginals, widened
-from crisalad_jax.transport.problem import Potentials, Problem, zero_potentials
+from crisalad_jax.transport.dustbin import DUSTBINS, Dustbin, check_marginals
+from crisalad_jax.transport.problem import Matrix, Potentials, Problem, zero_potentials
 from crisalad_jax.utils.errors import InputError
 
 
@@ -30,7 +30,7 @@ from crisalad_jax.utils.errors import InputError
 class SinkhornResult(NamedTuple):
     """A transport plan and how well it meets its marginals."""
 
-    log_plan: Float[Array, "*batch rows columns"]
+    log_plan: Matrix
     potentials: Potentials
     """Potentials, in balanced transport unique up to a constant: the columns' mean is 0.
 
@@ -51,7 +51,7 @@ class SinkhornResult(NamedTuple):
 
 
 def solve(
-    scores: Float[Array, "*batch rows columns"],
+    scores: Matrix,
     log_mu: Float[Array, "*#batch rows"],
     log_nu: Float[Array, "*#batch columns"],
     *,
@@ -83,7 +83,7 @@ def solve(
         log_mu: logarithms of the rows' masses; -inf, or any below -1e5, for a mass of 0.
         log_nu: logarithms of the columns' masses; where the step is `entropic` and neither
             tau below 1 they sum to the same. Totals of half-precision masses may differ by their
-            rounding: the coarser side takes the other's total, of two alike the columns.
+            rounding: the columns take the rows' total.
         epsilon: entropic regularisation, above 0. It may be traced or learnt.
         row_tau: 1 for rows that meet their marginals; below 1 a Kullback-Leibler penalty of
             epsilon * row_tau / (1 - row_tau) draws them there. Static.
@@ -120,11 +120,11 @@ def solve(
     check_inputs(scores, log_mu, log_nu, epsilon, equal_totals=equal)
     if init is not None:
         init = check_init(init, scores, log_mu, log_nu)
-    if solver is not None and not config.gradient.takes_solver:
-        raise InputError(
-            f"sinkhorn: found a solver beside gradient {config.gradient.part_name!r}, expected one "
-            "that takes it, such as 'optimistix'"
-        )
+    require(
+        solver is None or config.gradient.takes_solver,
+        f"sinkhorn: found a solver with gradient {config.gradient.part_name!r}, expected one that "
+        "takes it, such as 'optimistix'",
+    )
     arguments = scores, log_mu, log_nu, epsilon, init, step_params, row_tau, column_tau, config
     # A solver need not be hashable, so it cannot be a static argument.
     result = _compiled(*arguments) if solver is None else _solve(*arguments, solver)
@@ -162,9 +162,7 @@ def _solve(
     potentials, step = problem.masked(solution.potentials), config.step
     log_plan = step.log_plan(problem, potentials)
     errors = marginal_error(log_plan, problem.log_mu, problem.log_nu)
-    finite = jnp.isfinite(potentials.row).all(axis=-1) & jnp.isfinite(potentials.column).all(
-        axis=-1
-    )
+    finite = jnp.isfinite(jnp.concatenate(potentials, axis=-1)).all(axis=-1)
     converged = jax.lax.stop_gradient(solution.met) & finite
     if problem.balanced and config.tolerance is not None and step.entropic:
         # The tolerance is on logarithms, whose rounding error is a few machine epsilons.
@@ -233,7 +231,13 @@ def assign_with_dustbin(
         >>> result.log_plan.shape
         (3, 3)
     """
-    scores = widened(jnp.asarray(scores))
+    scores = jnp.asarray(scores)
+    require(
+        scores.ndim >= 2 and 0 not in scores.shape[-2:],
+        f"assign_with_dustbin: found scores of shape {scores.shape}, expected (..., patches, "
+        "clusters)",
+    )
+    scores = scores.astype(wide_dtype(scores))
     if isinstance(dustbin, str):
         dustbin = DUSTBINS.make(dustbin)
     full, log_mu, log_nu = check_marginals(

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.parts import Part, Registry, count_arguments
-from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem, product
+from crisalad_jax.transport.problem import (
+    Columns,
+    Matrix,
+    Potentials,
+    Problem,
+    ScalingProblem,
+    product,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +33,7 @@ class Step(Part, abc.ABC):
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, register_step, solve
         >>> @register_step("columns-alone")
         ... def columns_alone(problem, potentials):
-        ...     column = problem.log_nu - problem.over_rows(potentials.row)
+        ...     column = problem.log_nu - problem.lse_rows(potentials.row)
         ...     return Potentials(potentials.row, column)
         >>> zeros = jnp.zeros(2)
         >>> config = SinkhornConfig(step="columns-alone", iterations=1)
@@ -77,9 +84,7 @@ class Step(Part, abc.ABC):
         """Return the potentials of the plan, after the last iteration."""
         return potentials
 
-    def log_plan(
-        self, problem: Problem, potentials: Potentials
-    ) -> Float[Array, "*batch rows columns"]:
+    def log_plan(self, problem: Problem, potentials: Potentials) -> Matrix:
         """Return the logarithm of the plan; by default kernel + row + column."""
         return problem.log_plan(potentials)
 
@@ -124,9 +129,9 @@ class SinkhornStep(Step):
         self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
     ) -> tuple[Potentials, Any]:
         """Take both half steps."""
-        column = problem.column_tau * (problem.log_nu - problem.over_rows(potentials.row))
+        column = problem.column_tau * (problem.log_nu - problem.lse_rows(potentials.row))
         column = self._further(potentials.column, column, problem.column_tau)
-        row = problem.row_tau * (problem.log_mu - problem.over_columns(column))
+        row = problem.row_tau * (problem.log_mu - problem.lse_columns(column))
         return Potentials(self._further(potentials.row, row, problem.row_tau), column), state
 
     def _further(self, old: Array, new: Array, tau: float) -> Array:
@@ -151,7 +156,7 @@ class SinkhornStep(Step):
         """
         if self.relaxation == 1:
             return potentials
-        row = problem.row_tau * (problem.log_mu - problem.over_columns(potentials.column))
+        row = problem.row_tau * (problem.log_mu - problem.lse_columns(potentials.column))
         return Potentials(row, potentials.column)
 
 
@@ -165,6 +170,13 @@ HOTTEST = 1e12
 """Where the search for a temperature ends, for scores that are not finite."""
 
 
+class NewtonState(NamedTuple):
+    """The state of Newton's step."""
+
+    temperature: Float[Array, "*batch"]
+    """Multiple of the problem's epsilon that the next step solves for."""
+
+
 @STEPS.register("newton")
 @dataclasses.dataclass(frozen=True)
 class NewtonStep(Step):
@@ -175,19 +187,18 @@ class NewtonStep(Step):
     Sinkhorn's the one with the largest semi-dual is taken, which therefore never falls.
 
     Where scores are too sharp to begin with, epsilon is first a multiple of the problem's, the
-    temperature, which falls to 1 as the errors do. It is the state; 0 says that it is to be found.
-    Problems must be balanced.
+    temperature, which falls to 1 as the errors do. Problems must be balanced.
     """
 
     entropic: ClassVar[bool] = True
 
-    def init(self, problem: Problem, params: Any) -> Float[Array, "*batch"]:
-        """Return no temperature: the first step finds it, for the potentials that it is given."""
-        return 0 * problem.log_mu[..., 0]
+    def init(self, problem: Problem, params: Any) -> NewtonState:
+        """Return a temperature of 1; the first step finds the one for its potentials."""
+        return NewtonState(0 * problem.log_mu[..., 0] + 1)
 
     def step(
         self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    ) -> tuple[Potentials, NewtonState]:
         """Take the best of four steps at the state's temperature.
 
         Raises:
@@ -198,45 +209,58 @@ class NewtonStep(Step):
             f"step newton: found row_tau {problem.row_tau} and column_tau {problem.column_tau}, "
             "expected 1: it is for balanced problems",
         )
-        temperature = jax.lax.stop_gradient(state)
-        temperature = jnp.where(
-            temperature > 0, temperature, _temperature(problem, potentials.column, temperature)
-        )
+        temperature = jax.lax.stop_gradient(state.temperature)
+        temperature = _temperature(problem, potentials.column, temperature, iteration == 0)
         tempered, column = _tempered(problem, potentials.column, temperature)
-        row = problem.log_mu - tempered.over_columns(column)
+        row = problem.log_mu - tempered.lse_columns(column)
         log_plan = tempered.log_plan(Potentials(row, column))
-        log_masses = tempered.over_rows(row) + column
-        gradient = jnp.exp(problem.log_nu) - jnp.exp(log_masses)
+        log_masses = tempered.lse_rows(row) + column
         shares = jnp.exp(log_plan - problem.log_mu[..., None])
-        newton = solve_columns(jnp.exp(log_plan), shares, gradient, 1.0, 1.0)
-        # A constant changes no plan. The median's, for a few columns may have very far to go.
-        newton = newton - jnp.median(newton, axis=-1, keepdims=True)
-        sinkhorn = jnp.clip(problem.log_nu - log_masses, -LONGEST[0], LONGEST[0])
-        # Entry by entry, so that those columns do not hold up the others.
-        clipped = [jnp.clip(newton, -most, most) for most in LONGEST]
-        tries = jnp.stack([*clipped, sinkhorn], axis=-1)
-        weights = jax.nn.softmax(problem.log_nu)[..., None]
-        tries = tries - (weights * tries).sum(axis=-2, keepdims=True)
-        # The semi-dual's gain, from the plan at hand: no new exponentials of matrices.
-        mixed = product("...nk,...kt->...nt", shares, jnp.expm1(tries))
-        least = math.expm1(-2 * LONGEST[0])  # but for rounding
-        gains = product("...k,...kt->...t", jnp.exp(problem.log_nu), tries) - product(
-            "...n,...nt->...t", jnp.exp(problem.log_mu), jnp.log1p(jnp.maximum(mixed, least))
-        )
-        best = jnp.argmax(jnp.where(jnp.isnan(gains), -jnp.inf, gains), axis=-1)
-        change = jnp.take_along_axis(tries, best[..., None, None], axis=-1)[..., 0]
+        newton = _newton_change(problem, jnp.exp(log_plan), shares, log_masses)
+        change = _best_change(problem, shares, newton, problem.log_nu - log_masses)
         column = potentials.column + temperature[..., None] * change
-        error = jnp.abs(log_masses - problem.log_nu).max(axis=-1)
-        short = jnp.abs(newton).max(axis=-1) <= LONGEST[1]
-        # Errors hardly fall by themselves later, when columns share no rows any more.
-        near = (error <= 0.03) | ((error <= 1) & short)
-        lower = jnp.maximum(temperature / COOLING, 1)
-        row = problem.log_mu - problem.over_columns(column)
-        return Potentials(row, column), jnp.where(near, lower, temperature)
+        row = problem.log_mu - problem.lse_columns(column)
+        lower = _cooled(temperature, newton, jnp.abs(log_masses - problem.log_nu).max(axis=-1))
+        return Potentials(row, column), NewtonState(lower)
 
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
         """Return the remaining marginal error: far from the solution a step may be small."""
-        return column_error(problem, new)
+        return _marginal_error(problem, new)
+
+
+def _newton_change(problem: Problem, plan: Array, shares: Array, log_masses: Array) -> Array:
+    """Compute Newton's change of the columns' potentials."""
+    gradient = jnp.exp(problem.log_nu) - jnp.exp(log_masses)
+    newton = solve_columns(plan, shares, gradient, 1.0, 1.0)
+    # A constant changes no plan. The median's, for a few columns may have very far to go.
+    return newton - jnp.median(newton, axis=-1, keepdims=True)
+
+
+def _best_change(problem: Problem, shares: Array, newton: Array, sinkhorn: Array) -> Array:
+    """Return the change with the largest semi-dual, of Newton's at several lengths and Sinkhorn's.
+
+    Changes are clipped entry by entry, so that far columns do not hold up the others.
+    """
+    clipped = [jnp.clip(newton, -most, most) for most in LONGEST]
+    tries = jnp.stack([*clipped, jnp.clip(sinkhorn, -LONGEST[0], LONGEST[0])], axis=-1)
+    weights = jax.nn.softmax(problem.log_nu)[..., None]
+    tries = tries - (weights * tries).sum(axis=-2, keepdims=True)
+    # The semi-dual's gain, from the plan at hand: no new exponentials of matrices.
+    mixed = product("...nk,...kt->...nt", shares, jnp.expm1(tries))
+    least = math.expm1(-2 * LONGEST[0])  # but for rounding
+    gains = product("...k,...kt->...t", jnp.exp(problem.log_nu), tries) - product(
+        "...n,...nt->...t", jnp.exp(problem.log_mu), jnp.log1p(jnp.maximum(mixed, least))
+    )
+    best = jnp.argmax(jnp.where(jnp.isnan(gains), -jnp.inf, gains), axis=-1)
+    return jnp.take_along_axis(tries, best[..., None, None], axis=-1)[..., 0]
+
+
+def _cooled(temperature: Array, newton: Array, error: Array) -> Array:
+    """Lower the temperature where the plan is near the one that it solves for."""
+    short = jnp.abs(newton).max(axis=-1) <= LONGEST[1]
+    # Errors hardly fall by themselves later, when columns share no rows any more.
+    near = (error <= 0.03) | ((error <= 1) & short)
+    return jnp.where(near, jnp.maximum(temperature / COOLING, 1), temperature)
 
 
 @STEPS.register("softmax")
@@ -249,7 +273,7 @@ class SoftmaxStep(Step):
     ) -> tuple[Potentials, Any]:
         """Meet the rows' marginals, and ignore the columns'."""
         column = problem.zeros().column
-        return Potentials(problem.log_mu - problem.over_columns(column), column), state
+        return Potentials(problem.log_mu - problem.lse_columns(column), column), state
 
 
 @STEPS.register("dual-softmax")
@@ -262,28 +286,30 @@ class DualSoftmaxStep(Step):
     ) -> tuple[Potentials, Any]:
         """Normalise rows and columns, independently of each other."""
         row, column = problem.zeros()
-        return Potentials(-problem.over_columns(column), -problem.over_rows(row)), state
+        return Potentials(-problem.lse_columns(column), -problem.lse_rows(row)), state
 
-    def log_plan(
-        self, problem: Problem, potentials: Potentials
-    ) -> Float[Array, "*batch rows columns"]:
+    def log_plan(self, problem: Problem, potentials: Potentials) -> Matrix:
         """Return the sum of both log-softmaxes."""
         return problem.kernel + problem.log_plan(potentials)
 
 
-def _temperature(problem: Problem, column: Array, like: Array) -> Array:
-    """Return the least temperature, of powers of `COOLING`, that leaves errors of `FAR` at most."""
+def _temperature(problem: Problem, column: Array, current: Array, is_first: Array) -> Array:
+    """Return the current temperature; before the first step find one.
+
+    It is the least, of powers of `COOLING`, that leaves errors of `FAR` at most.
+    """
     problem, column = jax.lax.stop_gradient((problem, column))
 
     def too_far(temperature: Array) -> Array:
         tempered, scaled = _tempered(problem, column, temperature)
-        row = problem.log_mu - tempered.over_columns(scaled)
-        return (column_error(tempered, Potentials(row, scaled)) > FAR) & (temperature < HOTTEST)
+        row = problem.log_mu - tempered.lse_columns(scaled)
+        error = _marginal_error(tempered, Potentials(row, scaled))
+        return is_first & (error > FAR) & (temperature < HOTTEST)
 
     def hotter(temperature: Array) -> Array:
         return jnp.where(too_far(temperature), COOLING * temperature, temperature)
 
-    return jax.lax.while_loop(lambda at: too_far(at).any(), hotter, jnp.ones_like(like))
+    return jax.lax.while_loop(lambda at: too_far(at).any(), hotter, current)
 
 
 def _tempered(problem: Problem, column: Array, temperature: Array) -> tuple[Problem, Array]:
@@ -304,19 +330,15 @@ def _tempered(problem: Problem, column: Array, temperature: Array) -> tuple[Prob
     return tempered, problem.log_nu + (column - problem.log_nu) / by
 
 
-def column_error(problem: Problem, potentials: Potentials) -> Float[Array, "*batch"]:
+def _marginal_error(problem: Problem, potentials: Potentials) -> Float[Array, "*batch"]:
     """Return the largest difference of the logarithms of a column's mass and of its marginal."""
-    masses = problem.over_rows(potentials.row) + potentials.column
+    masses = problem.lse_rows(potentials.row) + potentials.column
     return jnp.abs(masses - problem.log_nu).max(axis=-1)
 
 
 def solve_columns(
-    plan: Float[Array, "*batch rows columns"],
-    shares: Float[Array, "*batch rows columns"],
-    target: Float[Array, "*batch columns"],
-    row_tau: float,
-    column_tau: float,
-) -> Float[Array, "*batch columns"]:
+    plan: Matrix, shares: Matrix, target: Columns, row_tau: float, column_tau: float
+) -> Columns:
     """Solve the columns' part of the linearised optimality conditions.
 
     The matrix is diag(masses / column_tau) - row_tau * shares^T plan. It is written as a Laplacian,

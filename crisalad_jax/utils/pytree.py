@@ -87,6 +87,43 @@ def check_drawn(tree: Any, where: str) -> None:
             raise InputError(f"{where}: found no numbers in parameter {name}, expected None")
 
 
+def expect_like(name: str, found: Any, wanted: Any) -> None:
+    """Check that what a plug-in returned has the structure, shapes and types that it should have.
+
+    Args:
+        name: of the plug-in, with which the message begins.
+        found: what it returned.
+        wanted: a tree of arrays or of their shapes.
+
+    Raises:
+        InputError: it has not.
+
+    Example:
+        >>> import numpy as np
+        >>> expect_like("step x", (np.ones(2), None), (np.ones(3), None))
+        Traceback (most recent call last):
+        ...
+        crisalad_jax.utils.errors.InputError: step x: found to return (float64[2], None), ...
+    """
+    trees = [jax.tree.map(_Word, tree) for tree in (found, wanted)]
+    kinds = [(jax.tree.structure(tree), str(jax.tree.leaves(tree))) for tree in trees]
+    if kinds[0] != kinds[1]:
+        words = [" ".join(str(tree).split()) for tree in trees]
+        raise InputError(f"{name}: found to return {words[0]}, expected {words[1]}")
+
+
+class _Word:
+    """A leaf, which prints as its type and shape, or its class."""
+
+    def __init__(self, leaf: Any) -> None:
+        shape, dtype = getattr(leaf, "shape", None), getattr(leaf, "dtype", None)
+        sizes = f"[{','.join(map(str, shape or ()))}]"
+        self._words = type(leaf).__name__ if dtype is None else f"{dtype}{sizes}"
+
+    def __repr__(self) -> str:
+        return self._words
+
+
 def named_leaves(tree: Any) -> dict[str, Any]:
     """Return the leaves by dotted path, as in `backbone.blocks.mlp.fc1.weight`, in tree order."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)

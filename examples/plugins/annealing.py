@@ -28,11 +28,11 @@ class Annealing(cj.sinkhorn.Step):
         left = jnp.maximum(1 - iteration / self.iterations, 0)
         times = jnp.asarray(self.start**left, problem.kernel.dtype)
         smooth = cj.sinkhorn.Problem.of(problem.kernel / times, problem.log_mu, problem.log_nu)
-        column = times * (problem.log_nu - smooth.over_rows(potentials.row / times))
-        row = times * (problem.log_mu - smooth.over_columns(column / times))
+        column = times * (problem.log_nu - smooth.lse_rows(potentials.row / times))
+        row = times * (problem.log_mu - smooth.lse_columns(column / times))
         return cj.sinkhorn.Potentials(row, column), state
 
     def finish(self, problem, potentials):
         """Meet the rows' marginals at epsilon itself, wherever the schedule was left."""
-        row = problem.log_mu - problem.over_columns(potentials.column)
+        row = problem.log_mu - problem.lse_columns(potentials.column)
         return potentials._replace(row=row)

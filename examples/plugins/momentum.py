@@ -25,7 +25,7 @@ class Momentum(cj.sinkhorn.Step):
 
     def step(self, problem, potentials, state, iteration):
         """Move the columns further than their marginals ask for, then meet the rows'."""
-        column = problem.column_tau * (problem.log_nu - problem.over_rows(potentials.row))
+        column = problem.column_tau * (problem.log_nu - problem.lse_rows(potentials.row))
         column = column + (self.weight - 1) * state
-        row = problem.row_tau * (problem.log_mu - problem.over_columns(column))
+        row = problem.row_tau * (problem.log_mu - problem.lse_columns(column))
         return cj.sinkhorn.Potentials(row, column), column - potentials.column

@@ -8,18 +8,14 @@ import numpy as np
 
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import Aggregator
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
-from crisalad_jax.nn.aggregators.gem import GemConfig
-from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
-from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig, NetVladConfig, SuperVladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

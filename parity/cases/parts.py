@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from crisalad_jax.losses import LossConfig, all_pairs, metric_loss, mine
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones import Features
@@ -112,7 +112,7 @@ def positions(grid: tuple[int, int]) -> Part:
 
 def _our_attention(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
     weights, heads = _last_block(params).attn, _vit(config).heads
-    return {"tokens": attention(weights, x["tokens"], heads, key=None)}
+    return {"tokens": attention(weights, x["tokens"], heads)}
 
 
 ATTENTION = Part(
@@ -126,7 +126,7 @@ FEED_FORWARD = Part(
 
 
 def _our_block(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    return {"tokens": block(_last_block(params), x["tokens"], GRID, _vit(config))}
+    return {"tokens": block(_last_block(params), x["tokens"], GRID, _vit(config))[0]}
 
 
 BLOCK = Part(

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
 from parity.reference.layers import Conv2d, LayerNorm, Linear, at_least_float32
 
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
+from crisalad_jax.nn.aggregators.queries import EdtFormerConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from parity.reference.layers import l2_normalise
 from parity.reference.vit import ViT

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from parity.reference.layers import at_least_float32
 
 
@@ -68,7 +68,7 @@ def multi_similarity_loss(descriptors: Tensor, labels: Tensor, config: LossConfi
         + _log1p_sum_exp(constants.beta * centred, pairs.negatives) / constants.beta
     )
     loss = per_anchor.mean()
-    if config.match_pml_zero and max(pairs.positives.sum(), pairs.negatives.sum()) <= 1:
+    if config.pml_compat and max(pairs.positives.sum(), pairs.negatives.sum()) <= 1:
         loss = 0 * loss
     return LossResult(loss, 1 - pairs.positives.any(dim=1).to(loss.dtype).mean())
 

@@ -6,18 +6,14 @@ DINO-SALAD, CricaVPR and bare DINOv2 are the same composition with other parts.
 import torch
 from torch import Tensor, nn
 
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
-from crisalad_jax.nn.aggregators.gem import GemConfig
-from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
-from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig, NetVladConfig, SuperVladConfig
 from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig

@@ -5,7 +5,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from crisalad_jax.nn.aggregators.gem_pyramid import PYRAMID_LEVELS
+from crisalad_jax.nn.aggregators.gem import PYRAMID_LEVELS
 from parity.reference.gem import GeM
 
 

@@ -41,7 +41,7 @@ import jax  # isort: skip
 import torch  # isort: skip
 
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig

@@ -44,13 +44,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
 ON_PHOTOGRAPHS = ("published, k = 3", "no dustbin", "dustbin a token", "softmax")
 KS = (1, 5)
 WATCHED = {
-    "column_error": "mass error",
+    "marginal_error": "mass error",
     "dustbin_share": "dustbin",
     "patches_per_cluster": "patches",
 }
 """Of the transport in the last step: the largest relative error of a cluster's mass, the dustbin's
 share of all mass, the effective number of patches in a cluster."""
-DIGITS = {"R@1": 1, "R@5": 1, "column_error": 3, "dustbin_share": 2, "patches_per_cluster": 1}
+DIGITS = {"R@1": 1, "R@5": 1, "marginal_error": 3, "dustbin_share": 2, "patches_per_cluster": 1}
 
 Runs = list[dict[str, float]]
 """What each seed's run came to."""

@@ -28,10 +28,10 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.prepare import Preparation
-from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, describe, init_crisalad, self_mask
 from crisalad_jax.sinkhorn import SinkhornConfig

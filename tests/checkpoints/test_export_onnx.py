@@ -21,11 +21,11 @@ from crisalad_jax.checkpoints import export as exports
 from crisalad_jax.checkpoints.engines import import_openvino, load_program
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.onnx_format.program import write_onnx
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.formats import infer, public_shapes, to_params
 from crisalad_jax.checkpoints.formats.cnn import vgg_numbers
 from crisalad_jax.checkpoints.matlab_io import read_matlab
 from crisalad_jax.checkpoints.public import convert, read_checkpoint
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 from parity import zoo

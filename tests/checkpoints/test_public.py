@@ -27,7 +27,7 @@ from crisalad_jax.checkpoints.public import (
 )
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig

@@ -17,7 +17,7 @@ from crisalad_jax.checkpoints.formats import FORMATS, VOCABULARY, infer, public_
 from crisalad_jax.checkpoints.public import vocabulary_model
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config, rotary_periods
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig

@@ -20,7 +20,7 @@ from torch import nn
 
 from crisalad_jax.checkpoints.public import Checkpoint, convert, read_backbone, read_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.backbones.base import FeatureRequest
+from crisalad_jax.nn.backbones.base import FeatureSpec
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import Note
@@ -89,8 +89,8 @@ def test_what_wraps_a_network_leaves_no_name(tmp_path: pathlib.Path, kind: str) 
 
 def assert_same_outputs(found: Checkpoint, net: ViT) -> None:
     images = np.random.default_rng(0).normal(size=(2, 42, 28, 3)).astype(np.float32)
-    request = FeatureRequest(class_token=True)
-    ours = found.config.backbone.apply(
+    request = FeatureSpec(class_token=True)
+    ours, _ = found.config.backbone.apply(
         found.params.backbone, jnp.asarray(images), request, remat="none"
     )
     with torch.no_grad():

@@ -13,7 +13,7 @@ import crisalad_jax as cj
 from crisalad_jax.checkpoints.formats import public_shapes
 from crisalad_jax.checkpoints.public import read_backbone
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig

@@ -10,7 +10,7 @@ from crisalad_jax.checkpoints.formats import VOCABULARY, public_shapes
 from crisalad_jax.checkpoints.public import convert, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

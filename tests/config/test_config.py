@@ -19,24 +19,24 @@ from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.experiments.demo import DemoConfig
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.circle import CircleConfig
-from crisalad_jax.losses.contrastive import ContrastiveConfig
-from crisalad_jax.losses.fast_ap import FastAPConfig
 from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
-from crisalad_jax.losses.supcon import SupConConfig
-from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.losses.pairwise import (
+    CircleConfig,
+    ContrastiveConfig,
+    FastAPConfig,
+    MultiSimilarityConfig,
+    SupConConfig,
+    TripletConfig,
+)
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
-from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
-from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig, NetVladConfig, VladBuffConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig

@@ -95,7 +95,7 @@ def test_fields_left_out_take_their_defaults():
         ({"seed": True}, ["True", "expected int", "config.seed"]),
         ({"patience": "x"}, ["'x'", "config.patience"]),
         ({"cities": "Rome"}, ["'Rome'", "list of names", "config.cities"]),
-        ({"loss": {"match_pml_zero": "no"}}, ["'no'", "expected bool", "loss.match_pml_zero"]),
+        ({"loss": {"pml_compat": "no"}}, ["'no'", "expected bool", "loss.pml_compat"]),
         ({"model": {"aggregator": ["gem"]}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"clusters": 32}}}, ["None", "config.model.aggregator"]),

@@ -25,13 +25,15 @@ from pytorch_metric_learning.losses import (
 from pytorch_metric_learning.miners import MultiSimilarityMiner
 
 from crisalad_jax.losses import LossConfig, all_pairs, metric_loss, mine
-from crisalad_jax.losses.circle import CircleConfig
-from crisalad_jax.losses.contrastive import ContrastiveConfig
-from crisalad_jax.losses.fast_ap import FastAPConfig
 from crisalad_jax.losses.large_margin_cosine import large_margin_cosine_loss
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
-from crisalad_jax.losses.supcon import SupConConfig
-from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.losses.pairwise import (
+    CircleConfig,
+    ContrastiveConfig,
+    FastAPConfig,
+    MultiSimilarityConfig,
+    SupConConfig,
+    TripletConfig,
+)
 from crisalad_jax.utils.errors import InputError
 
 PAPER = LossConfig()
@@ -95,7 +97,7 @@ def test_value_gradient_and_pairs_equal_the_library(base: float, margin: float) 
     config = LossConfig(
         kind=MultiSimilarityConfig(base=base),
         miner_margin=margin,
-        match_pml_zero=True,
+        pml_compat=True,
     )
     nonzero = 0
     for seed in range(40):
@@ -143,7 +145,7 @@ def test_every_loss_and_its_gradient_equal_the_librarys(config: LossConfig) -> N
     """In float64: float32 tells little of the distance of descriptors that are nearly equal."""
     # The library's triplets know no such zero, and its FastAP none either.
     few_are_zero = isinstance(config.kind, ContrastiveConfig | CircleConfig | SupConConfig)
-    config = dataclasses.replace(config, match_pml_zero=few_are_zero)
+    config = dataclasses.replace(config, pml_compat=few_are_zero)
     nonzero = 0
     for seed in range(40):
         x, labels = random_batch(seed, images=5 if seed % 2 else 16)
@@ -258,7 +260,7 @@ def test_the_librarys_zero_is_an_option() -> None:
     assert pairs.negatives.sum() == 1
     assert theirs(x, labels, LossConfig())[0] == 0
     zero, plain = (
-        metric_loss(jnp.asarray(x), jnp.asarray(labels), LossConfig(match_pml_zero=option)).loss
+        metric_loss(jnp.asarray(x), jnp.asarray(labels), LossConfig(pml_compat=option)).loss
         for option in (True, False)
     )
     assert zero == 0
@@ -302,7 +304,7 @@ def test_the_librarys_zero_needs_few_pairs_on_both_sides(
     pairs = mine(jnp.asarray(x @ x.T), all_pairs(jnp.asarray(labels)), margin=0.1)
     assert pairs.positives.sum() == positives
     assert pairs.negatives.sum() == negatives
-    config = LossConfig(match_pml_zero=True)
+    config = LossConfig(pml_compat=True)
     loss, _, _ = theirs(x, np.array(labels), config)
     assert loss > 0
     value, _ = ours(jnp.asarray(x), jnp.asarray(labels), config)

@@ -49,7 +49,7 @@ def test_equals_torch(special: int, kernel_size: int, bias: Literal["convolution
     branch = torch.cat([hidden[:special], torch.relu(maps)[0].reshape(8, -1).T])
     expected = (branch + hidden) @ t.up.weight + (0 if t.up.bias is None else t.up.bias)
     # Chains of at most 25 products of order 1, then 8 of order 10.
-    np.testing.assert_allclose(adapter(params, tokens, GRID), expected, atol=2e-5)
+    np.testing.assert_allclose(adapter(params, tokens, GRID)[0], expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("bias", ["convolutions", "up"])
@@ -80,7 +80,7 @@ def test_an_untrained_adapter_adds_nothing(kind: str) -> None:
     config = ViTConfig(dim=32, heads=2, adapter=AdapterConfig(kind=kind))
     params = init_adapter(jax.random.key(0), config.dim, config.adapter)
     tokens = jax.random.normal(jax.random.key(2), (16, 32))
-    np.testing.assert_array_equal(adapter(params, tokens, GRID), jnp.zeros((16, 32)))
+    np.testing.assert_array_equal(adapter(params, tokens, GRID)[0], jnp.zeros((16, 32)))
 
 
 def test_cricavprs_convolutions_start_at_1e_5() -> None:
@@ -104,7 +104,7 @@ def test_serial_and_parallel_adapters_add_nothing_untrained() -> None:
     assert isinstance(params, SerialParallelAdapter)
     tokens = jax.random.normal(jax.random.key(2), (16, 32))
     for each in (params.serial, params.parallel):
-        np.testing.assert_array_equal(adapter(each, tokens, GRID), jnp.zeros((16, 32)))
+        np.testing.assert_array_equal(adapter(each, tokens, GRID)[0], jnp.zeros((16, 32)))
     assert (params.serial.down.weight != params.parallel.down.weight).any()
 
 
@@ -121,4 +121,4 @@ def test_an_mlp_adapter_looks_at_no_neighbour() -> None:
     hidden = np.maximum(tokens @ params.down.weight + params.down.bias, 0)
     expected = np.broadcast_to(hidden.sum(axis=1, keepdims=True) + 1, (16, 32))
     # A sum of 16 numbers of order 1.
-    np.testing.assert_allclose(adapter(params, tokens, GRID), expected, atol=1e-5)
+    np.testing.assert_allclose(adapter(params, tokens, GRID)[0], expected, atol=1e-5)

@@ -11,15 +11,14 @@ import torch
 
 from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.attention import (
-    COLUMNS,
     Attention,
     Rotation,
     attention,
     cross_attention,
-    mix,
-    padded_length,
+    dot_product_attention,
 )
-from crisalad_jax.nn.layers import init_linear
+from crisalad_jax.nn.attention_fused import padded_length
+from crisalad_jax.nn.layers import init_linear, linear
 from crisalad_jax.utils.target import CPU, GPU, TPU, Target, lowering_for
 
 TOKENS, DIM, HEADS = 7, 12, 3
@@ -40,6 +39,13 @@ def make() -> tuple[Attention, jax.Array, torch.nn.MultiheadAttention]:
     return params, jax.random.normal(data, (TOKENS, DIM)), theirs
 
 
+def masked_attention(params: Attention, x: jax.Array, mask: Any, dropped: Any = None) -> jax.Array:
+    qkv = linear(params.qkv, x).reshape(*x.shape[:-1], 3 * HEADS, DIM // HEADS)
+    parts = jnp.split(qkv, 3, axis=-2)
+    mixed = dot_product_attention(*parts, mask=mask, dropout_mask=dropped)
+    return linear(params.proj, mixed.reshape(x.shape))
+
+
 def test_equals_torch_with_and_without_mask() -> None:
     params, x, theirs = make()
     x = jnp.stack([x, 1 - x])
@@ -50,8 +56,10 @@ def test_equals_torch_with_and_without_mask() -> None:
         forbidden = None if allowed is None else torch.tensor(~allowed)
         expected = theirs(tx, tx, tx, attn_mask=forbidden, need_weights=False)[0]
         seen = None if allowed is None else jnp.asarray(allowed)
-        ours = attention(params, x, HEADS, mask=seen, key=None)
-        one = attention(params, x[1], HEADS, mask=seen, key=None)
+        ours = masked_attention(params, x, seen)
+        one = masked_attention(params, x[1], seen)
+        if allowed is None:
+            np.testing.assert_array_equal(attention(params, x, HEADS), ours)
         # Two products of 12 terms of order 1 in float32.
         np.testing.assert_allclose(ours, expected.detach().numpy(), atol=2e-6)
         np.testing.assert_allclose(one, expected[1].detach().numpy(), atol=2e-6)
@@ -91,7 +99,7 @@ def test_a_masked_token_has_no_influence_and_no_gradient() -> None:
     mask = jnp.ones((TOKENS, TOKENS), bool).at[:-1, -1].set(False)
 
     def seen(x: jax.Array) -> jax.Array:
-        return attention(params, x, HEADS, mask=mask, key=None)[:-1]
+        return masked_attention(params, x, mask)[:-1]
 
     np.testing.assert_array_equal(seen(x), seen(x.at[-1].set(1e6)))
     gradient = jax.grad(lambda x: jnp.sin(seen(x)).sum())(x)
@@ -103,29 +111,29 @@ def test_a_masked_token_has_no_influence_and_no_gradient() -> None:
 @pytest.mark.parametrize("dropping", [False, True], ids=["whole", "dropped"])
 def test_gradient_equals_that_of_torchs_softmax(masked: bool, dropping: bool) -> None:
     generator = np.random.default_rng(0)
-    queries, change = generator.normal(size=(2, HEADS, DIM, TOKENS)).astype(np.float32)
-    keys, values = generator.normal(size=(2, HEADS, TOKENS, DIM)).astype(np.float32)
-    mask = generator.random((TOKENS, TOKENS)) < 0.5 if masked else None  # keys by queries
+    shape = (4, TOKENS, HEADS, DIM)
+    queries, keys, values, change = generator.normal(size=shape).astype(np.float32)
+    mask = generator.random((TOKENS, TOKENS)) < 0.5 if masked else None  # queries by keys
     if mask is not None:
         np.fill_diagonal(mask, True)
-    shape = (HEADS, TOKENS, TOKENS)
+    shape = (HEADS, TOKENS, TOKENS)  # heads, keys, queries
     kept = 2.0 * (generator.random(shape) < 0.5).astype(np.float32) if dropping else None
 
     def ours(queries: jax.Array, keys: jax.Array, values: jax.Array) -> jax.Array:
-        return (
-            mix(queries, keys, values, *jax.tree.map(jnp.asarray, (mask, kept)), COLUMNS, None)
-            * change
-        ).sum()
+        masks = {"mask": mask, "dropout_mask": kept}
+        masks = {k: None if x is None else jnp.asarray(x) for k, x in masks.items()}
+        return (dot_product_attention(queries, keys, values, **masks) * change).sum()
 
     found, gradients = jax.value_and_grad(ours, argnums=(0, 1, 2))(
         *map(jnp.asarray, (queries, keys, values))
     )
     theirs = [torch.tensor(x, requires_grad=True) for x in (queries, keys, values)]
-    scores = theirs[1] @ theirs[0]
+    scores = torch.einsum("ihd,jhd->hij", theirs[0], theirs[1]) / DIM**0.5
     if mask is not None:
         scores = scores.masked_fill(~torch.tensor(mask), -torch.inf)
-    weights = scores.softmax(dim=1) * (1 if kept is None else torch.tensor(kept))
-    expected = ((theirs[2].mT @ weights) * torch.tensor(change)).sum()
+    weights = scores.softmax(dim=2) * (1 if kept is None else torch.tensor(kept).mT)
+    mixed = torch.einsum("hij,jhd->ihd", weights, theirs[2])
+    expected = (mixed * torch.tensor(change)).sum()
     expected.backward()
     # Sums of a few hundred numbers of order 1 in float32, and scores of order 10.
     np.testing.assert_allclose(found, expected.item(), rtol=1e-4)
@@ -135,20 +143,10 @@ def test_gradient_equals_that_of_torchs_softmax(masked: bool, dropping: bool) ->
 
 def test_scores_of_bfloat16_are_float32() -> None:
     params, x, _ = make()
-    ours = attention(params, x.astype(jnp.bfloat16), HEADS, key=None)
+    ours = attention(params, x.astype(jnp.bfloat16), HEADS)
     assert ours.dtype == jnp.bfloat16
     # bfloat16 keeps 8 bits: inputs, weights and outputs of order 1 are each off by up to 2^-9.
-    np.testing.assert_allclose(
-        np.asarray(ours, np.float32), attention(params, x, HEADS, key=None), atol=0.02
-    )
-
-
-def test_dropout_needs_a_key_and_changes_the_output() -> None:
-    params, x, _ = make()
-    plain = attention(params, x, HEADS, dropout_rate=0.5, key=None)
-    np.testing.assert_array_equal(plain, attention(params, x, HEADS, key=None))
-    dropped = attention(params, x, HEADS, dropout_rate=0.5, key=jax.random.key(1))
-    assert not np.allclose(plain, dropped, atol=1e-3)
+    np.testing.assert_allclose(np.asarray(ours, np.float32), attention(params, x, HEADS), atol=0.02)
 
 
 def network(dim: int) -> Attention:
@@ -170,7 +168,7 @@ def with_gradient(x: jax.Array, heads: int, **options: Any) -> tuple[jax.Array, 
     params = network(x.shape[-1])
 
     def value(params: Attention, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        y = attention(params, x, heads, key=None, **options)
+        y = attention(params, x, heads, **options)
         return jnp.sin(3 * y.astype(jnp.float32)).sum(), y
 
     gradient, y = jax.jit(jax.grad(value, argnums=(0, 1), has_aux=True))(params, x)
@@ -285,16 +283,14 @@ def test_a_tpus_kernel_runs_on_the_device_of_its_sequences() -> None:
 
 def test_a_tpus_kernel_works_under_vmap(interpreted: list[None]) -> None:
     params, x = network(128), sample(9, 128, 6).reshape(3, 2, 9, 128)
-    expected = attention(params, x, 2, key=None)
+    expected = attention(params, x, 2)
     with lowering_for(TPU):
-        found = jax.vmap(lambda x: attention(params, x, 2, key=None))(x)
+        found = jax.vmap(lambda x: attention(params, x, 2))(x)
     assert interpreted
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 UNFUSED = {
-    "a mask": {"mask": jnp.tri(9, dtype=bool)},
-    "dropout": {"dropout_rate": 0.5, "key": jax.random.key(0)},
     "heads of 16": {"heads": 8},
     "too many tokens": {"x": sample(11, 128)},
     "another type": {"x": jnp.ones((2, 9, 128), jnp.float16)},
@@ -306,7 +302,7 @@ def test_what_a_tpus_kernel_does_not_take_is_computed_all_the_same(
     interpreted: list[None], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(attention_pallas._TOKENS, jnp.dtype("float32"), 10)
-    told = {"x": sample(9, 128), "heads": 2, "key": None} | UNFUSED[name]
+    told = {"x": sample(9, 128), "heads": 2} | UNFUSED[name]
     expected = attention(network(128), **told)
     with lowering_for(TPU):
         found = attention(network(128), **told)
@@ -322,10 +318,11 @@ def test_an_accelerators_products_are_the_cpus(masked: bool, dropping: bool) -> 
     params, x, _ = make()
     x = jnp.stack([x, 1 - x])
     mask = jnp.tri(TOKENS, dtype=bool) if masked else None
-    key, rate = (jax.random.key(5), 0.5) if dropping else (None, 0.0)
+    shape = (HEADS, TOKENS, TOKENS)
+    dropped = 2.0 * jax.random.bernoulli(jax.random.key(5), 0.5, shape) if dropping else None
 
     def value(params: Attention, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        y = attention(params, x, HEADS, mask=mask, dropout_rate=rate, key=key)
+        y = masked_attention(params, x, mask, dropped)
         return jnp.sin(y).sum(), y
 
     slope = jax.grad(value, argnums=(0, 1), has_aux=True)
@@ -387,13 +384,11 @@ def test_cudnn_is_asked_only_where_it_can_answer(stand_in: list[Any]) -> None:
     x = sample(9, 128).astype(jnp.bfloat16)
     params = network(128)
     with lowering_for(GPU):
-        attention(params, x, 32, key=None)  # heads of 4 numbers: cuDNN takes eights
-        attention(network(512), sample(9, 512).astype(x.dtype), 2, key=None)  # heads of 256
-        attention(params, x, 2, mask=jnp.ones((9, 9), bool), key=None)
-        attention(params, x.astype(jnp.float32), 2, key=None)
-        attention(params, x, 2, dropout_rate=0.5, key=jax.random.key(0))
+        attention(params, x, 32)  # heads of 4 numbers: cuDNN takes eights
+        attention(network(512), sample(9, 512).astype(x.dtype), 2)  # heads of 256
+        attention(params, x.astype(jnp.float32), 2)
     with lowering_for(CPU):
-        attention(params, x, 2, key=None)
+        attention(params, x, 2)
     assert not stand_in
 
 
@@ -403,8 +398,8 @@ def test_padding_is_never_attended_to(chosen: Target) -> None:
     params, x = network(24), sample(5, 24)
     more = jnp.pad(x, ((0, 0), (0, 3), (0, 0)), constant_values=100)
     with lowering_for(chosen):
-        expected = attention(params, x, 3, key=None)
-        found = attention(params, more, 3, length=5, key=None)
+        expected = attention(params, x, 3)
+        found = attention(params, more, 3, length=5)
     np.testing.assert_allclose(found[:, :5], expected, atol=2e-6)  # of order 1, in float32
 
 
@@ -426,7 +421,7 @@ def test_a_tpus_kernel_sees_no_padding(interpreted: list[None]) -> None:
     more = jnp.pad(x, ((0, 0), (0, 6), (0, 0)), constant_values=100)
 
     def value(x: jax.Array, **options: Any) -> jax.Array:
-        y = attention(network(128), x, 2, rotation=angles(48, 64), key=None, **options)
+        y = attention(network(128), x, 2, rotation=angles(48, 64), **options)
         return jnp.sin(3 * y[:, :50]).sum()
 
     expected, slope = jax.value_and_grad(value)(x)

@@ -17,10 +17,10 @@ from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.aggregators.anyloc import AnyLoc
+from crisalad_jax.nn.aggregators.vlad import AnyLoc
 from crisalad_jax.nn.config import ModelConfig, with_aggregator
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.misfits import misfits
+from crisalad_jax.nn.diff_trees import diff_trees
 from crisalad_jax.nn.model import (
     Crisalad,
     Model,
@@ -126,7 +126,7 @@ DOORS: dict[str, Callable[..., Any]] = {
         out / "w.safetensors", Model(params, config)
     ),
 }
-MISFITS: dict[str, tuple[Any, ModelConfig, str]] = {
+DIFFERENCES: dict[str, tuple[Any, ModelConfig, str]] = {
     "clusters": (
         PARAMS,
         changed(clusters=2),
@@ -150,29 +150,23 @@ MISFITS: dict[str, tuple[Any, ModelConfig, str]] = {
         "found bfloat16 (",
     ),
     "half a model": (split_params(PARAMS, MODEL, "head")[0], MODEL, "patch_embed.weight missing"),
-    "another class": (
-        dataclasses.replace(PARAMS, aggregator=dict(vars(PARAMS.aggregator))),
-        MODEL,
-        "found dict, expected Salad",
-    ),
     "no Crisalad": ((PARAMS, MODEL), MODEL, "params: found tuple, expected Crisalad"),
 }
 
 ELSEWHERE = {
     ("a step", "no Crisalad"),
-    ("a step", "another class"),
     ("describe, jitted", "no Crisalad"),
 }
 
 
 @pytest.mark.parametrize("door", DOORS)
-@pytest.mark.parametrize("misfit", MISFITS)
+@pytest.mark.parametrize("difference", DIFFERENCES)
 @pytest.mark.usefixtures("_unchecked")
 def test_every_door_refuses_parameters_of_another_configuration(
-    door: str, misfit: str, tmp_path: pathlib.Path, shared: pathlib.Path
+    door: str, difference: str, tmp_path: pathlib.Path, shared: pathlib.Path
 ) -> None:
-    params, config, words = MISFITS[misfit]
-    if (door, misfit) in ELSEWHERE:
+    params, config, words = DIFFERENCES[difference]
+    if (door, difference) in ELSEWHERE:
         pytest.skip("JAX refuses it before the door is reached")
     with pytest.raises(InputError, match=re.escape(words)) as caught:
         DOORS[door](params, config, tmp_path, shared)
@@ -181,22 +175,12 @@ def test_every_door_refuses_parameters_of_another_configuration(
 
 
 @pytest.mark.usefixtures("_unchecked")
-def test_a_leaf_that_is_no_array_is_named() -> None:
-    broken = dataclasses.replace(
-        PARAMS, backbone=dataclasses.replace(PARAMS.backbone, cls_token="token")
-    )
-    words = r"^params: not of this .*: backbone\.cls_token found str, expected float32 \(32,\)$"
-    with pytest.raises(InputError, match=words):
-        describe(broken, IMAGES, MODEL)
-
-
-@pytest.mark.usefixtures("_unchecked")
 def test_a_configuration_of_another_kind_is_refused() -> None:
-    with pytest.raises(InputError, match=r"^config: found str, expected ModelConfig$"):
+    with pytest.raises(InputError, match=r"^config: found 'tiny', expected ModelConfig$"):
         describe(PARAMS, IMAGES, "tiny")
 
 
-def test_many_misfits_are_cut_short() -> None:
+def test_many_differences_are_cut_short() -> None:
     with pytest.raises(InputError, match=r"(.* missing; ){3}and 21 more$"):
         check_params(dataclasses.replace(PARAMS, cross_image=None), MODEL)
 
@@ -266,17 +250,16 @@ def test_no_file_of_weights_holds_what_cannot_be_loaded(value: float, tmp_path) 
     assert load_weights(path, expected=MODEL)[1] == MODEL
 
 
-def test_misfits_are_told_of_names_shapes_and_types() -> None:
+def test_differences_are_told_of_names_shapes_and_types() -> None:
     expected = {"a": np.ones(3), "b": np.ones((2, 2), np.float32), "c": np.ones(1)}
     found = {"a": np.ones(2), "b": np.ones((2, 2), np.float16), "d": np.ones(1)}
-    assert misfits(found, expected) == [
+    assert diff_trees(found, expected) == [
         "a found float64 (2,), expected float64 (3,)",
         "b found float16 (2, 2), expected float32 (2, 2)",
         "c missing",
         "d unknown",
     ]
-    assert misfits(expected, expected) == []
-    assert misfits([np.ones(2)], (np.ones(2),)) == ["found list, expected tuple"]
+    assert diff_trees(expected, expected) == []
 
 
 DOORS_OF_IMAGES: dict[str, Callable[[Any], Any]] = {

@@ -12,22 +12,20 @@ import jax.numpy as jnp
 import pytest
 
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig, ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
-from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
-from crisalad_jax.nn.aggregators.fol import FolConfig
-from crisalad_jax.nn.aggregators.gem import GemConfig
-from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
+from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
-from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
-from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
+from crisalad_jax.nn.aggregators.vlad import (
+    AnyLocConfig,
+    NetVladConfig,
+    SuperVladConfig,
+    VladBuffConfig,
+)
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.costs import adapter_macs, count_macs, paper_adapter_macs, part_costs

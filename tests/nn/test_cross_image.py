@@ -86,8 +86,8 @@ def test_dropout_is_on_with_a_key_only() -> None:
 
 def test_dropout_stands_where_torch_has_it(monkeypatch) -> None:
     """In each layer on attention weights, after attention, after GELU, and after linear2."""
-    import crisalad_jax.nn.attention as attention_module
     import crisalad_jax.nn.cross_image as module
+    import crisalad_jax.nn.torch_layers as layers
 
     calls = []
 
@@ -96,7 +96,7 @@ def test_dropout_stands_where_torch_has_it(monkeypatch) -> None:
         return x
 
     monkeypatch.setattr(module, "dropout", record)
-    monkeypatch.setattr(attention_module, "dropout", record)
+    monkeypatch.setattr(layers, "dropout", record)
     params = init_cross_image(jax.random.key(0), DIM, CONFIG)
     tokens = jax.random.normal(jax.random.key(1), (IMAGES, TOKENS, DIM))
     cross_image_encoder(params, tokens, CONFIG, key=jax.random.key(2))

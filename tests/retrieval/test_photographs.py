@@ -14,7 +14,7 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
+from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe

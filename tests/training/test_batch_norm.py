@@ -14,9 +14,9 @@ import pytest
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.places import read_places
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.model import describe, init_crisalad, train_tokens
+from crisalad_jax.nn.model import describe, init_crisalad, tokens_and_statistics
 from crisalad_jax.training import run_files
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.loop import fit
@@ -45,7 +45,7 @@ STEP = StepConfig(
 LABELS = jnp.array([0, 0, 1, 1, 2, 2])
 ALL = np.ones(6, bool)
 PARAMS = random_params(MODEL)
-tokens_of = jax.jit(train_tokens, static_argnames=("config", "micro_batch"))
+tokens_of = jax.jit(tokens_and_statistics, static_argnames=("config", "micro_batch"))
 
 
 def statistics(tree) -> dict[str, np.ndarray]:
@@ -94,8 +94,8 @@ def test_stored_statistics_stay_and_serve_the_step() -> None:
 def test_images_that_only_pad_count_for_nothing() -> None:
     """The statistics are those of a batch without them."""
     valid = jnp.array([True, True, True, False, False, False])
-    _, ours = tokens_of(PARAMS, pictures(6), valid, config=MODEL)
-    _, fewer = tokens_of(PARAMS, pictures(6)[:3], valid[:3], config=MODEL)
+    _, ours = tokens_of(PARAMS, pictures(6), valid=valid, config=MODEL)
+    _, fewer = tokens_of(PARAMS, pictures(6)[:3], valid=valid[:3], config=MODEL)
     assert_close(ours, fewer)
 
 
@@ -109,12 +109,12 @@ def test_a_step_that_is_not_taken_changes_no_statistic() -> None:
 def test_micro_batches_are_forward_passes_in_turn() -> None:
     """As torch's: each has its own statistics, and moves the running ones by a tenth."""
     images, valid = pictures(6), jnp.ones(6, bool)
-    _, found = tokens_of(PARAMS, images, valid, config=MODEL, micro_batch=3)
+    _, found = tokens_of(PARAMS, images, valid=valid, config=MODEL, micro_batch=3)
     # Parts are interleaved.
-    _, first = tokens_of(PARAMS, images[0::2], valid[:3], config=MODEL)
-    _, second = tokens_of(eqx.combine(first, PARAMS), images[1::2], valid[:3], config=MODEL)
+    _, first = tokens_of(PARAMS, images[0::2], valid=valid[:3], config=MODEL)
+    _, second = tokens_of(eqx.combine(first, PARAMS), images[1::2], valid=valid[:3], config=MODEL)
     assert_close(found, second)
-    _, whole = tokens_of(PARAMS, images, valid, config=MODEL)
+    _, whole = tokens_of(PARAMS, images, valid=valid, config=MODEL)
     assert any(not np.allclose(statistics(whole)[n], x) for n, x in statistics(found).items())
 
 

@@ -523,7 +523,7 @@ def test_a_plan_without_mass_has_no_statistics_and_ends_nothing(
     assert fit(RECIPE, places, tmp_path, initial=params, quiet=True).steps == STEPS
     for line in metrics_of(tmp_path):
         assert "dustbin_share" not in line
-        assert line["column_error"] >= 0
+        assert line["marginal_error"] >= 0
 
 
 @pytest.mark.parametrize(

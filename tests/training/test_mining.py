@@ -19,8 +19,7 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.experiments.train import train
 from crisalad_jax.losses import LossConfig, Role, metric_loss, tuple_labels, tuple_pairs
-from crisalad_jax.losses.selavpr import SelaVprLoss
-from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.losses.pairwise import SelaVprLoss, TripletConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.model import describe
 from crisalad_jax.training import run_files

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from crisalad_jax.losses import LossConfig, metric_loss
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import dropout
 from crisalad_jax.nn.model import (

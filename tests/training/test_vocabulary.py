@@ -14,10 +14,15 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVlad, NetVladConfig
-from crisalad_jax.nn.aggregators.vlad_buff import VladBuff, VladBuffConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
+from crisalad_jax.nn.aggregators.vlad import (
+    AnyLoc,
+    AnyLocConfig,
+    NetVlad,
+    NetVladConfig,
+    VladBuff,
+    VladBuffConfig,
+)
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, Model, unit_features
 from crisalad_jax.training.loop import fit

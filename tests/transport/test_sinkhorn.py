@@ -137,9 +137,9 @@ def test_over_relaxation_never_makes_the_dual_fall() -> None:
         return np.array(found)
 
     def unguarded(problem: Problem, at: Potentials) -> Potentials:
-        column = problem.log_nu - problem.over_rows(at.row)
+        column = problem.log_nu - problem.lse_rows(at.row)
         column = at.column + 1.9 * (column - at.column)
-        row = problem.log_mu - problem.over_columns(column)
+        row = problem.log_mu - problem.lse_columns(column)
         return Potentials(at.row + 1.9 * (row - at.row), column)
 
     # Rounding of float32 potentials of order 10, times masses of 30.
@@ -368,10 +368,10 @@ def test_newtons_steps_by_hand() -> None:
         problem = Problem.of(*map(jnp.asarray, (scores, log_mu, log_nu)))
         at, newton = Potentials(jnp.zeros((4, 12)), jnp.zeros((4, 5))), NewtonStep()
         state = newton.init(problem, None)
-        step = jax.jit(lambda at, state: newton.step(problem, at, state, jnp.zeros((), int)))
+        step = jax.jit(lambda at, state, number: newton.step(problem, at, state, number))
         started = None
-        for _ in range(5):
-            at, state = step(at, state)
+        for number in range(5):
+            at, state = step(at, state, number)
             for i in range(4):
                 columns[i], temperatures[i], best = newton_by_hand(
                     scores[i], mu, nu, columns[i], temperatures[i]
@@ -379,7 +379,7 @@ def test_newtons_steps_by_hand() -> None:
                 taken.add(best)
             # Rounding of float64 potentials of 100, amplified tenfold by each of five systems.
             np.testing.assert_allclose(at.column, columns, rtol=1e-9, atol=1e-8)
-            np.testing.assert_allclose(state, temperatures, rtol=1e-12)
+            np.testing.assert_allclose(state.temperature, temperatures, rtol=1e-12)
             started = started or list(temperatures)
     assert started is not None
     assert started[0] == 1
@@ -1017,8 +1017,8 @@ def test_softmax_and_dual_softmax_are_torchs() -> None:
 @register_step("test-sinkhorn-capacity")
 def _capacity(problem: Problem, potentials: Potentials) -> Potentials:
     """Columns take no more than their marginals, and may take less."""
-    column = jnp.minimum(problem.log_nu - problem.over_rows(potentials.row), 0)
-    return Potentials(problem.log_mu - problem.over_columns(column), column)
+    column = jnp.minimum(problem.log_nu - problem.lse_rows(potentials.row), 0)
+    return Potentials(problem.log_mu - problem.lse_columns(column), column)
 
 
 def test_a_step_with_marginals_of_its_own() -> None:

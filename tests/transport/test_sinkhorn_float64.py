@@ -426,10 +426,10 @@ def test_a_batch_has_the_gradients_of_its_members() -> None:
 @register_step("test-float64-rows-first")
 def _rows_first(problem: Problem, potentials: Potentials) -> Potentials:
     """Rows, columns, rows; and columns half as far again: another way to the same plan."""
-    row = problem.log_mu - problem.over_columns(potentials.column)
-    met = problem.log_nu - problem.over_rows(row)
+    row = problem.log_mu - problem.lse_columns(potentials.column)
+    met = problem.log_nu - problem.lse_rows(row)
     column = potentials.column + 1.2 * (met - potentials.column)
-    return Potentials(problem.log_mu - problem.over_columns(column), column)
+    return Potentials(problem.log_mu - problem.lse_columns(column), column)
 
 
 @register_step("test-float64-by-the-kernel")
@@ -691,8 +691,8 @@ def test_without_a_tolerance_a_far_score_moves_nobody_else() -> None:
 
 
 def two_halves(problem: Problem, potentials: Potentials) -> Potentials:
-    column = problem.log_nu - problem.over_rows(potentials.row)
-    return Potentials(problem.log_mu - problem.over_columns(column), column)
+    column = problem.log_nu - problem.lse_rows(potentials.row)
+    return Potentials(problem.log_mu - problem.lse_columns(column), column)
 
 
 @register_step("test-float64-momentum")
@@ -763,13 +763,13 @@ class _Lengths(Step):
         self, problem: Problem, potentials: Potentials, state: Any, iteration: Any
     ) -> tuple[Potentials, Any]:
         lengths = state["lengths"][iteration]
-        column = problem.log_nu - problem.over_rows(potentials.row)
+        column = problem.log_nu - problem.lse_rows(potentials.row)
         column = potentials.column + lengths[0] * (column - potentials.column)
-        row = problem.log_mu - problem.over_columns(column)
+        row = problem.log_mu - problem.lse_columns(column)
         return Potentials(potentials.row + lengths[1] * (row - potentials.row), column), state
 
     def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
-        row = problem.log_mu - problem.over_columns(potentials.column)
+        row = problem.log_mu - problem.lse_columns(potentials.column)
         return Potentials(row, potentials.column)
 
 
@@ -810,7 +810,7 @@ class _Rounds(Step):
         return two_halves(problem, potentials), state
 
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Any:
-        masses = jnp.exp(problem.over_rows(new.row) + new.column)
+        masses = jnp.exp(problem.lse_rows(new.row) + new.column)
         return jnp.abs(masses - jnp.exp(problem.log_nu)).sum(axis=-1)
 
     def finish(self, problem: Problem, potentials: Potentials) -> Potentials:

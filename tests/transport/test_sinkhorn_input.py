@@ -105,7 +105,7 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: solve(
             jnp.zeros((6, 3)), MU, NU, solver=optimistix.FixedPointIteration(rtol=0, atol=1)
         ),
-        "a solver beside gradient 'unrolled', expected one that takes it",
+        "a solver with gradient 'unrolled', expected one that takes it",
     ),
     "no clusters": (
         lambda: assign_with_dustbin(jnp.zeros((6, 0)), 1.0),
@@ -121,11 +121,11 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a step's tuple": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
-        r"^step test-input-tuple: found to return \(float32.*, expected Potentials\(row",
+        r"^step test-input-tuple: found to return \(\(float32.*, expected \(Potentials\(row",
     ),
     "a step's shapes": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-short")),
-        r"^step test-input-short: found to return Potentials\(row=float32\[2\]",
+        r"^step test-input-short: found to return \(Potentials\(row=float32\[2\]",
     ),
     "a step's type": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-half")),
@@ -133,11 +133,11 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a step's state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-state")),
-        "^step test-input-state: found to return a state of .*float32.*, expected .*int32",
+        "^step test-input-state: found to return .*, float32.*, expected .*, int32",
     ),
     "a step without a state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-alone")),
-        "^step test-input-alone: found to return Potentials.*expected \\(Potentials, state\\)",
+        "^step test-input-alone: found to return Potentials.*expected \\(Potentials.*, None\\)",
     ),
     "appended": (
         lambda: append_dustbin(jnp.zeros((6, 3)), jnp.ones(5)),
@@ -193,10 +193,10 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
         (0.0, MU.at[1].set(jnp.inf), NU, 1.0, "log_mu found with NaN or infinity"),
         (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
         (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN or infinity"),
-        (0.0, MU, NU, 0.0, "epsilon found 0.0, expected more than 0"),
-        (0.0, MU, NU, -1.0, "epsilon found -1.0, expected more than 0"),
-        (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected more than 0"),
-        (1.0, MU, NU, 1e-40, r"up to 1\.0e\+40, expected numbers that float32 can hold"),
+        (0.0, MU, NU, 0.0, "epsilon found 0.0, expected at least 1.2e-38"),
+        (0.0, MU, NU, -1.0, "epsilon found -1.0, expected at least"),
+        (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected at least"),
+        (1e10, MU, NU, 1e-35, "scores overflow, expected numbers that float32 can hold"),
         (0.0, MU, NU + 1e-3, 1.0, "found to sum to 6 and 6.006, expected the same"),
         (0.0, MU, NU + 3e-4, 1.0, "found to sum to 6 and 6.0018, expected the same"),
         (0.0, jnp.stack([MU, MU - 1]), NU, 1.0, "found to sum to 2.20728 and 6, expected the same"),
@@ -236,7 +236,7 @@ def test_half_precision_marginals_have_the_totals_of_their_rounding(
 ) -> None:
     """Masses of 256 rows and 65 columns, whose totals differ by up to half a hundredth as given.
 
-    The coarser side takes the other's total, of two of one type the columns take the rows'.
+    The columns take the rows' total.
     """
     generator = np.random.default_rng(0)
     # One heavy mass a side, whose rounding no others' makes up for.
@@ -256,10 +256,9 @@ def test_half_precision_marginals_have_the_totals_of_their_rounding(
         result = call(scores, log_mu, log_nu, config=config)
         assert result.converged
         plan = np.exp(np.asarray(result.log_plan, np.float64))
-        total = totals[1] if coarse == "rows" else totals[0]
         # The tolerance of 1e-5, and as much rounding of sums in float32.
-        np.testing.assert_allclose(plan.sum(axis=1), given[0] * total / totals[0], rtol=3e-5)
-        np.testing.assert_allclose(plan.sum(axis=0), given[1] * total / totals[1], rtol=3e-5)
+        np.testing.assert_allclose(plan.sum(axis=1), given[0], rtol=3e-5)
+        np.testing.assert_allclose(plan.sum(axis=0), given[1] * totals[0] / totals[1], rtol=3e-5)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
@@ -299,20 +298,6 @@ def test_whole_numbers_are_logarithms_too() -> None:
 
 def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
     assert solve(jnp.zeros((6, 3)), MU, NU + 1, column_tau=0.5).finite
-
-
-def test_settings_of_the_problem_are_no_settings_of_the_solver() -> None:
-    """Where they once stood: nothing runs at an epsilon of 1 that was given another."""
-    for name, value in (("epsilon", 0.1), ("row_tau", 0.5), ("column_tau", 0.5)):
-        with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
-            solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig(**{name: value}))
-    with pytest.raises(TypeError, match="unexpected keyword argument 'dustbin'"):
-        assign_with_dustbin(jnp.zeros((6, 3)), 1.0, config=SinkhornConfig(dustbin="mass"))
-    for name, value in (("must_converge", True), ("anderson", 3), ("method", "newton")):
-        with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
-            SinkhornConfig(**{name: value})
-    with pytest.raises(TypeError, match="unexpected keyword argument 'step'"):
-        solve(jnp.zeros((6, 3)), MU, NU, step=SinkhornStep())
 
 
 @pytest.mark.usefixtures("_unchecked")
@@ -392,77 +377,6 @@ def test_bad_settings_raise(kind: type, fields: Any, message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
         kind(**fields)
     assert "\n" not in str(raised.value)
-
-
-# Registrations
-
-
-class _Bare(Step):
-    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Any) -> Any:
-        return potentials, state
-
-
-@dataclasses.dataclass
-class _Thawed:
-    size: int = 3
-
-
-@dataclasses.dataclass(frozen=True)
-class _Stranger:
-    size: int = 3
-
-
-@dataclasses.dataclass(frozen=True)
-class _Empty(Step):
-    size: int = 3
-
-
-@dataclasses.dataclass(frozen=True)
-class _Named(_Bare):
-    name: str = "mine"
-
-
-@dataclasses.dataclass(frozen=True)
-class _Sound(_Bare):
-    size: int = 3
-
-
-def _a_function(problem: Problem, potentials: Potentials) -> Potentials:
-    return potentials
-
-
-@pytest.mark.parametrize(
-    ("register", "name", "part", "message"),
-    [
-        (
-            register_step,
-            "newton",
-            _Sound,
-            "^register_step: found the name 'newton' taken by crisalad_jax.transport.steps."
-            "NewtonStep, expected another name for _Sound$",
-        ),
-        (register_step, "sinkhorn", _a_function, "found the name 'sinkhorn' taken by .*SinkhornS"),
-        (
-            register_step,
-            "x",
-            _Bare,
-            "^register_step 'x': found _Bare, which is no frozen dataclass",
-        ),
-        (register_step, "test-bad", _Thawed, "'test-bad': found _Thawed, which is no frozen data"),
-        (register_step, "test-bad", _Stranger, "found _Stranger, expected a subclass of Step$"),
-        (register_step, "test-bad", _Empty, "'test-bad': found no method step, expected it$"),
-        (register_step, "test-bad", _Named, "found a field 'name', which files keep the part's"),
-        (register_step, "test-bad", 3, "found int, expected a frozen dataclass that inherits from"),
-        (register_dustbin, "test-bad", _Sound, "found _Sound, expected a subclass of Dustbin$"),
-        (register_dustbin, "test-bad", _a_function, "register_dustbin 'test-bad': found function,"),
-    ],
-)
-def test_bad_registrations_raise(register: Any, name: str, part: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message) as raised:
-        register(name)(part)
-    assert "\n" not in str(raised.value)
-    with pytest.raises(InputError):
-        SinkhornConfig(step="test-bad")
 
 
 def test_what_is_registered_twice_is_the_later() -> None:

@@ -53,9 +53,9 @@ class _Push(Step):
     def step(
         self, problem: Problem, potentials: Potentials, state: Any, iteration: Any
     ) -> tuple[Potentials, Any]:
-        column = problem.log_nu - problem.over_rows(potentials.row) + 0.2 * state
+        column = problem.log_nu - problem.lse_rows(potentials.row) + 0.2 * state
         return (
-            Potentials(problem.log_mu - problem.over_columns(column), column),
+            Potentials(problem.log_mu - problem.lse_columns(column), column),
             column - potentials.column,
         )
 

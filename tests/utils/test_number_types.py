@@ -250,15 +250,12 @@ def wide(params: Any, make: Any = np.asarray) -> Any:
 
 
 def test_float64_parameters_are_told_unless_the_model_computes_in_float64() -> None:
-    count = len(jax.tree.leaves(PARAMS))
-    message = rf"^params: found float64: .*; and {count - 3} more; expected float32, or ModelConf"
-    with pytest.raises(InputError, match=message):
-        describe(wide(PARAMS), IMAGES, MODEL)  # NumPy's, which JAX would make float32
+    message = r"found float64 .*, expected float32"
     config = dataclasses.replace(MODEL, compute_dtype="float64")
     with jax.enable_x64(True):
         with pytest.raises(InputError, match=message):
             describe(wide(PARAMS, jnp.asarray), IMAGES, MODEL)
-        with pytest.raises(InputError, match=r"found float64 .*, expected float32"):
+        with pytest.raises(InputError, match=message):
             check_params(wide(PARAMS), MODEL, stored=True)
         found = describe(wide(PARAMS, jnp.asarray), IMAGES, config)
         assert found.dtype == jnp.float64

@@ -23,7 +23,7 @@ from crisalad_jax.checkpoints.formats.format import (
 from crisalad_jax.checkpoints.formats.forms import LINEAR, POINTWISE, Extra, Lines, affine
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import Aggregator
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.resnet import ResNetConfig

@@ -23,23 +23,20 @@ from crisalad_jax.checkpoints.formats.forms import (
     transformer_layer,
 )
 from crisalad_jax.nn.aggregators import Aggregator
-from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
-from crisalad_jax.nn.aggregators.boq import BoqConfig
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
+from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig, ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
-from crisalad_jax.nn.aggregators.edtformer import EdtFormerConfig
-from crisalad_jax.nn.aggregators.fol import FolConfig
-from crisalad_jax.nn.aggregators.gem import START, GemConfig
-from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramidConfig
+from crisalad_jax.nn.aggregators.gem import START, CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
-from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
+from crisalad_jax.nn.aggregators.salad import FolConfig, SaladConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
-from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
-from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
+from crisalad_jax.nn.aggregators.vlad import (
+    AnyLocConfig,
+    NetVladConfig,
+    SuperVladConfig,
+    VladBuffConfig,
+)
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import parameter_shapes

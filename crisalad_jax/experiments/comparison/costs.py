@@ -183,4 +183,4 @@ def _adapter_call(kind: AdapterKind, images: int) -> Callable[[], Any]:
 
 @functools.partial(jit, static_argnames="grid")
 def _apply_adapter(params: Any, tokens: jax.Array, grid: tuple[int, int]) -> jax.Array:
-    return adapter(params, tokens, grid)
+    return adapter(params, tokens, grid)[0]

@@ -218,7 +218,7 @@ class Variant:
     @property
     def trains(self) -> bool:
         """Whether the variant is trained here: not loaded from a file, nor a vocabulary alone."""
-        return self.weights is None and self.model.aggregator.learns
+        return self.weights is None and self.model.aggregator.trainable
 
 
 @brief

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.parts import Part, Registry
-from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import expect_like
+
+Centroids = Float[Array, "cluster dim"]
+FeatureRows = Float[Array, "feature dim"]
+FlattenOrder = Literal["token-first", "dimension-first"]
 
 
 @brief
@@ -53,31 +58,29 @@ class Aggregator(Part, abc.ABC):
         768
     """
 
-    dimension_first: ClassVar[bool] = False
-    """Whether descriptors have the first dimension of all local tokens, then their second, and so
-    on, as public ones; if not, token after token."""
-    learns: ClassVar[bool] = True
+    flatten_order: ClassVar[FlattenOrder] = "token-first"
+    """Order of a descriptor's numbers: token after token, or the first dimension of all local
+    tokens, then their second, and so on."""
+    trainable: ClassVar[bool] = True
     """Whether its parameters train; if not, no part of the model does."""
     fixed_grid: ClassVar[bool] = False
     """Whether its parameters fit the patches of one image size only."""
     centroid_images: ClassVar[int] = 500
     """Number of training images, at most, whose features' centroids training starts from."""
-    width_field: ClassVar[str | None] = None
-    """Name of the field that sets the tokens' width; None where the backbone's width does."""
 
     @abc.abstractmethod
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of an image's tokens for features of width `dim`."""
 
-    def features(self, depth: int) -> FeatureRequest:
+    def features(self, depth: int) -> FeatureSpec:
         """Return the features to request from a backbone of `depth` blocks; by default the last.
 
         Raises:
             InputError: the backbone has too few blocks.
         """
-        return FeatureRequest()
+        return FeatureSpec()
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Any:
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Any:
         """Draw random parameters, a pytree of arrays in float32; by default None.
 
         Args:
@@ -95,9 +98,7 @@ class Aggregator(Part, abc.ABC):
         return None
 
     @abc.abstractmethod
-    def apply(
-        self, params: Any, features: Features, grid: tuple[int, int], *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
         """Return the tokens of one image or of a batch, in float32 at least.
 
         Args:
@@ -107,18 +108,10 @@ class Aggregator(Part, abc.ABC):
             key: draws dropout, one for all or one an image; None means inference.
         """
 
-    def order(self, local: Float[Array, "*batch token dim"]) -> Array:
-        """Return the local tokens in the published order of the descriptor's numbers."""
-        return jnp.swapaxes(local, -2, -1) if self.dimension_first else local
-
-    def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
+    def check_grid(self, grid: Grid, patch_size: int) -> None:
         """Raise InputError where an image with this grid is too small; by default never."""
 
-    def from_centroids(
-        self,
-        centroids: Float[Array, "cluster dim"],
-        features: Float[Array, "feature dim"],
-    ) -> Any:
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Any:
         """Make parameters from k-means centroids of unit features.
 
         `starts_from_centroids` tells whether an aggregator has this.
@@ -129,9 +122,7 @@ class Aggregator(Part, abc.ABC):
         """
         raise NotImplementedError
 
-    def centroid_features(
-        self, features: Float[Array, "feature dim"]
-    ) -> Float[Array, "feature reduced"]:
+    def centroid_features(self, features: FeatureRows) -> Float[Array, "feature reduced"]:
         """Return what k-means makes its centroids of; by default the unit features themselves."""
         return features
 
@@ -168,11 +159,11 @@ class Aggregator(Part, abc.ABC):
         """Raise InputError, beginning with `source`, where parameters are of another backbone."""
 
     def metadata(self, params: Any) -> dict[str, str]:
-        """Return the parameters' metadata that a file of weights stores beside their arrays."""
+        """Return the parameters' metadata that a file of weights stores with their arrays."""
         return {}
 
     def with_metadata(self, params: Any, metadata: Mapping[str, str]) -> Any:
-        """Return parameters with the metadata that a file stores beside their arrays."""
+        """Return parameters with the metadata that a file stores with their arrays."""
         return params
 
     def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"] | None:
@@ -195,24 +186,20 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
     Raises:
         InputError: it has not; the message names the aggregator.
     """
-    name = aggregator.part_name
-    require(
-        isinstance(tokens, Tokens),
-        f"aggregator {name}: found to return {_kind(tokens)}, expected Tokens",
-    )
-    for array in tokens.global_token, tokens.local:
-        require(
-            array.dtype in (jnp.float32, jnp.float64),
-            f"aggregator {name}: found to return tokens of type {array.dtype}, expected float32",
-        )
+
+    def wanted(token: Any, *sizes: int) -> Any:
+        is_wide = getattr(token, "dtype", None) == jnp.float64
+        return jax.ShapeDtypeStruct((*batch, *sizes), jnp.float64 if is_wide else jnp.float32)
+
     shape = aggregator.token_shape(dim)
-    shapes = tokens.global_token.shape, tokens.local.shape
-    expected = (*batch, shape.global_dim), (*batch, shape.tokens, shape.token_dim)
-    require(
-        shapes == expected,
-        f"aggregator {name}: found to return a global token of shape {shapes[0]} and local tokens "
-        f"of {shapes[1]}, expected {expected[0]} and {expected[1]}, as its token_shape says",
+    global_token, local = getattr(tokens, "global_token", None), getattr(tokens, "local", None)
+    expected = Tokens(
+        wanted(global_token, shape.global_dim),
+        wanted(local, shape.tokens, shape.token_dim),
+        getattr(tokens, "transport", None),
+        getattr(tokens, "dense", None),
     )
+    expect_like(f"aggregator {aggregator.part_name}", tokens, expected)
 
 
 def _kind(value: Any) -> str:
@@ -221,7 +208,7 @@ def _kind(value: Any) -> str:
     return f"an array of shape {value.shape}" if is_array else type(value).__name__
 
 
-def require_side(name: str, grid: tuple[int, int], regions: int, patch_size: int) -> None:
+def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:
     """Check that there is a patch for every region of a side.
 
     Raises:
@@ -243,13 +230,14 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
         result = function(features)
         if isinstance(result, Tokens):
             return result
-        if not isinstance(result, jax.Array) or result.ndim not in (1, 2):
+        ndim = getattr(result, "ndim", None)
+        if ndim not in (1, 2):
             raise InputError(
                 f"aggregator {function.__name__}: found to return {_kind(result)}, expected a "
                 "vector, a matrix of token vectors, or Tokens"
             )
-        made = Tokens.of_global if result.ndim == 1 else Tokens.of_local
-        return made(at_least_float32(result))
+        make = Tokens.of_global if ndim == 1 else Tokens.of_local
+        return make(at_least_float32(result))
 
     def token_shape(self: Aggregator, dim: int) -> TokenShape:
         # Use the 256 patches of 224 x 224 pixels: the shape is needed before there is an image.
@@ -274,5 +262,5 @@ AGGREGATORS = Registry("aggregator", Aggregator, of_function=_of_function)
 
 def to_descriptor(tokens: Tokens, aggregator: Aggregator) -> Float[Array, " descriptor"]:
     """Return one unit descriptor: the global token, then the local ones in the published order."""
-    local = aggregator.order(tokens.local)
+    local = tokens.local if aggregator.flatten_order == "token-first" else tokens.local.T
     return l2_normalise(jnp.concatenate([tokens.global_token, local.ravel()]))

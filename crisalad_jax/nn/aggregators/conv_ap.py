@@ -7,8 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
-from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape, require_side
-from crisalad_jax.nn.backbones.base import Backbone, Features
+from crisalad_jax.nn.aggregators.base import (
+    AGGREGATORS,
+    Aggregator,
+    FlattenOrder,
+    TokenShape,
+    require_side,
+)
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, linear
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
@@ -26,8 +32,7 @@ class ConvAp:
 class ConvApConfig(Aggregator):
     """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
-    dimension_first: ClassVar[bool] = True
-    width_field: ClassVar[str] = "channels"
+    flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     channels: int = 1024
     """Channels of the 1 x 1 convolution."""
     side: int = 2
@@ -41,17 +46,15 @@ class ConvApConfig(Aggregator):
         """Return the shape of one mean for each region."""
         return TokenShape(0, self.side**2, self.channels)
 
-    def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
+    def check_grid(self, grid: Grid, patch_size: int) -> None:
         """Require a patch in every region."""
         require_side(self.part_name, grid, self.side, patch_size)
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> ConvAp:
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> ConvAp:
         """Draw parameters as torch's convolutions do."""
         return ConvAp(init_linear(key, backbone.dim, self.channels))
 
-    def apply(
-        self, params: ConvAp, features: Features, grid: tuple[int, int], *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: ConvAp, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
         """Return a token for each of side x side regions, row by row.
 
         The published order is convolution, then means. Both are linear and the weights of a mean
@@ -63,9 +66,7 @@ class ConvApConfig(Aggregator):
         return Tokens.of_local(at_least_float32(tokens))
 
 
-def adaptive_means(
-    patches: Float[Array, "*batch patch dim"], grid: tuple[int, int], side: int
-) -> Float[Array, "*batch region dim"]:
+def adaptive_means(patches: Patches, grid: Grid, side: int) -> Float[Array, "*batch region dim"]:
     """Average the patches over side x side regions, as torch's `AdaptiveAvgPool2d` cuts them.
 
     Region i of a side of n patches goes from floor(i n / side) to ceil((i + 1) n / side): where

@@ -1,16 +1,18 @@
-"""Generalised mean of an image's patches (GeM; Radenovic et al., TPAMI 2018)."""
+"""Generalised means of patches (GeM): of an image, of a pyramid of regions, and CosPlace's head."""
 
 import dataclasses
+import itertools
 import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, Features
-from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
+from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape, require_side
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -18,6 +20,8 @@ GEM_FLOOR = 1e-6
 """Floor of the numbers of a generalised mean, because negative numbers have no power."""
 START = 3.0
 """Initial exponent of public implementations."""
+PYRAMID_LEVELS = (2, 3)
+"""Cuts of a side, as CricaVPR's: 4 and 9 regions."""
 
 
 @pytree_dataclass
@@ -36,25 +40,92 @@ class GemConfig(Aggregator):
         """Return the shape of a global token as wide as the backbone."""
         return TokenShape(dim, 0, dim)
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Gem:
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Gem:
         """Start at an exponent of 3, as public implementations do."""
-        return Gem(draw.full((), START))
+        return Gem(random_init.full((), START))
+
+    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the mean of all patches, a global token as wide as the backbone."""
+        return Tokens.of_global(gem(features.patches, params.p))
+
+
+@AGGREGATORS.register("gem-pyramid")
+@dataclasses.dataclass(frozen=True)
+class GemPyramidConfig(GemConfig):
+    """CricaVPR's class token and generalised means over 13 regions (Lu et al., CVPR 2024).
+
+    All regions have one exponent.
+    """
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the last patches and the class token."""
+        return FeatureSpec(class_token=True)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of tokens as wide as the backbone."""
+        return TokenShape(dim, sum(level**2 for level in PYRAMID_LEVELS), dim)
+
+    def check_grid(self, grid: Grid, patch_size: int) -> None:
+        """Require a patch in every region."""
+        require_side(self.part_name, grid, max(PYRAMID_LEVELS), patch_size)
+
+    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the class token, and a generalised mean for each region."""
+        means = gem_pyramid(features.patches, params.p, grid)
+        return Tokens(at_least_float32(features.class_token), means)
+
+
+@pytree_dataclass
+class CosPlace:
+    """The exponent of the generalised mean, and the linear layer after it."""
+
+    p: Float[Array, ""]
+    fc: Linear
+
+
+@AGGREGATORS.register("cosplace", tiny={"dim": 256})
+@dataclasses.dataclass(frozen=True)
+class CosPlaceConfig(Aggregator):
+    """The head of CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023)."""
+
+    dim: int = 512
+    """Width of the descriptor: CosPlace's 512, EigenPlaces' 2,048."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "dim")
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of a global token."""
+        return TokenShape(self.dim, 0, self.dim)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> CosPlace:
+        """Draw parameters as the public code: an exponent of 3, torch's default linear layer."""
+        return CosPlace(random_init.full((), START), init_linear(key, backbone.dim, self.dim))
 
     def apply(
-        self, params: Gem, features: Features, grid: tuple[int, int], *, key: Keys | None
+        self, params: CosPlace, features: Features, grid: Grid, *, key: Keys | None
     ) -> Tokens:
-        """Return the mean of all patches, a global token as wide as the backbone."""
-        mean = generalised_mean(log_units(at_least_float32(features.patches)), params.p, axis=-2)
-        return Tokens.of_global(mean)
+        """Return a linear layer of the generalised mean of unit patches.
+
+        The descriptor is scaled to unit length later.
+        """
+        mean = gem(features.patches, params.p).astype(features.patches.dtype)
+        return Tokens.of_global(at_least_float32(linear(params.fc, mean)))
 
 
-def log_units(patches: Float[Array, "*batch patch dim"]) -> Float[Array, "*batch patch dim"]:
+def gem(patches: Patches, p: Float[Array, ""]) -> Float[Array, "*batch dim"]:
+    """Compute the generalised mean of all unit patches, in float32 at least."""
+    return generalised_mean(log_units(patches), p, axis=-2)
+
+
+def log_units(patches: Patches) -> Patches:
     """Compute the logarithms of unit patches, with numbers raised to the floor.
 
     Unit length and floor are those of CosPlace, CricaVPR and the benchmark of Berton et al. (CVPR
-    2022).
+    2022). The result is float32 at least.
     """
-    return jnp.log(jnp.maximum(l2_normalise(patches), GEM_FLOOR))
+    return jnp.log(jnp.maximum(l2_normalise(at_least_float32(patches)), GEM_FLOOR))
 
 
 def generalised_mean(
@@ -68,3 +139,27 @@ def generalised_mean(
     axes = (axis,) if isinstance(axis, int) else axis
     count = math.prod(logs.shape[i] for i in axes)
     return jnp.exp((jax.nn.logsumexp(p * logs, axis=axis) - math.log(count)) / p)
+
+
+def gem_pyramid(
+    patches: Patches, p: Float[Array, ""], grid: Grid
+) -> Float[Array, "*batch region dim"]:
+    """Compute generalised means (Radenovic et al. 2018) of unit patches in 2 x 2 and 3 x 3 regions.
+
+    Regions come level by level in row order. A side of n patches is cut at round(i n / level). For
+    CricaVPR's fixed 16 x 16 grid that gives its published cuts at 8, and at 5 and 11.
+    """
+    cells = log_units(patches)
+    cells = cells.reshape(*cells.shape[:-2], *grid, cells.shape[-1])
+    means = [
+        generalised_mean(cells[..., top:bottom, left:right, :], p, axis=(-3, -2))
+        for level in PYRAMID_LEVELS
+        for top, bottom in _cuts(grid[0], level)
+        for left, right in _cuts(grid[1], level)
+    ]
+    return jnp.stack(means, axis=-2)
+
+
+def _cuts(side: int, level: int) -> list[tuple[int, int]]:
+    edges = [round(i * side / level) for i in range(level + 1)]
+    return list(itertools.pairwise(edges))

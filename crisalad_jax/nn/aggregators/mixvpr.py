@@ -11,9 +11,9 @@ import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
 from crisalad_jax.nn.layers import (
     Keys,
     LayerNorm,
@@ -53,9 +53,8 @@ class MixVpr:
 class MixVprConfig(Aggregator):
     """MixVPR (Ali-bey et al., WACV 2023)."""
 
-    dimension_first: ClassVar[bool] = True
+    flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     fixed_grid: ClassVar[bool] = True
-    width_field: ClassVar[str] = "channels"
     channels: int = 1024
     """Number of channels after the projection."""
     rows: int = 4
@@ -69,33 +68,32 @@ class MixVprConfig(Aggregator):
         """Check the ranges."""
         require_positive(self, "channels", "rows", "depth")
 
-    def features(self, depth: int) -> FeatureRequest:
+    def features(self, depth: int) -> FeatureSpec:
         """Request the last patches."""
-        return FeatureRequest(norm=self.last_norm)
+        return FeatureSpec(norm=self.last_norm)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one token for each row."""
         return TokenShape(0, self.rows, self.channels)
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> MixVpr:
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> MixVpr:
         """Draw parameters as the public implementation does.
 
         Mixers have zero biases and normal weights of deviation 0.02. (The public code truncates
         them at 100 deviations, which has no effect.) Projections start as torch's linears.
         """
-        mixers, channels, rows = draw.split(key, 3)
+        mixers, channels, rows = random_init.split(key, 3)
         patches = math.prod(grid)
         return MixVpr(
             mix=tuple(
-                _init_mixer(mixer_key, patches) for mixer_key in draw.split(mixers, self.depth)
+                _init_mixer(mixer_key, patches)
+                for mixer_key in random_init.split(mixers, self.depth)
             ),
             channel_proj=init_linear(channels, backbone.dim, self.channels),
             row_proj=init_linear(rows, patches, self.rows),
         )
 
-    def apply(
-        self, params: MixVpr, features: Features, grid: tuple[int, int], *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: MixVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
         """Return a token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
         maps = features.patches.swapaxes(-2, -1)
         for mixer in params.mix:
@@ -105,8 +103,8 @@ class MixVprConfig(Aggregator):
 
 
 def _init_mixer(key: PRNGKeyArray, patches: int) -> FeatureMixer:
-    weights = draw.normal(key, (2, patches, patches), scale=0.02)
-    first, second = (Linear(weight, draw.zeros(patches)) for weight in weights)
+    weights = random_init.normal(key, (2, patches, patches), scale=0.02)
+    first, second = (Linear(weight, random_init.zeros(patches)) for weight in weights)
     return FeatureMixer(init_layer_norm(patches), first, second)
 
 

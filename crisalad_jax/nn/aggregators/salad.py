@@ -1,5 +1,6 @@
-"""SALAD: optimal-transport aggregation of patch features (Izquierdo and Civera, CVPR 2024)."""
+"""SALAD (Izquierdo and Civera, CVPR 2024) and FoL (Wang et al., AAAI 2025): optimal transport."""
 
+import abc
 import dataclasses
 import math
 from typing import Any, ClassVar
@@ -11,15 +12,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from crisalad_jax.config.checks import require, require_fraction, require_positive
 from crisalad_jax.config.fields import free_field
 from crisalad_jax.config.parts import OrName, part_field, resolve_names
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
 from crisalad_jax.nn.layers import (
+    Conv,
     Keys,
     Linear,
     at_least_float32,
     dropout,
     init_linear,
+    init_transposed_conv,
     l2_normalise,
     linear,
     split_key,
@@ -63,22 +66,75 @@ class Salad:
     """Learnt parameters of the transport's step."""
 
 
-@AGGREGATORS.register(
-    "salad",
-    tiny={"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dropout": 0.0},
-)
-@dataclasses.dataclass(frozen=True)
-class SaladConfig(Aggregator):
-    """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
+_TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dropout": 0.0}
 
-    dimension_first: ClassVar[bool] = True
-    width_field: ClassVar[str] = "cluster_dim"
+
+@dataclasses.dataclass(frozen=True)
+class TransportAggregator(Aggregator):
+    """Three networks, and a transport from patches to clusters: what SALAD and FoL share."""
+
+    flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     clusters: int = 64
     cluster_dim: int = 128
     token_dim: int = 256
     """Width of the global token."""
     hidden: int = 512
     dropout: float = free_field(0.3)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "clusters", "cluster_dim", "token_dim", "hidden")
+        require_fraction(self, "dropout")
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the tokens' shape, which does not depend on the backbone."""
+        return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
+
+    def init_networks(self, key: PRNGKeyArray, dim: int, scores: int) -> dict[str, TwoLayer]:
+        """Draw networks as the public code: torch's default linears."""
+        token_key, cluster_key, score_key = random_init.split(key, 3)
+        return {
+            "token_features": init_two_layer(token_key, dim, self.hidden, self.token_dim),
+            "cluster_features": init_two_layer(cluster_key, dim, self.hidden, self.cluster_dim),
+            "score": init_two_layer(score_key, dim, self.hidden, scores),
+        }
+
+    @abc.abstractmethod
+    def transport(self, params: Any, features: Features, *, key: Keys | None) -> SinkhornResult:
+        """Assign patches to clusters, dustbin last (SALAD's Eqs. 3 to 5), in float32.
+
+        Raises:
+            InputError: there are not more patches than clusters.
+        """
+
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
+
+        The tokens carry the transport's statistics, without a gradient. A whole batch is faster
+        than `vmap`: the transport chooses the domain once for all images.
+
+        Raises:
+            InputError: there are not more patches than clusters.
+        """
+        cluster_key, score_key = split_key(key, 2)
+        global_token = two_layer(params.token_features, features.class_token, 0.0, None)
+        local = two_layer(params.cluster_features, features.patches, self.dropout, cluster_key)
+        result = self.transport(params, features, key=score_key)
+        plan = jnp.exp(result.log_plan[..., : self.clusters])
+        sums = jnp.einsum("...nm,...nd->...md", plan, local.astype(plan.dtype))
+        statistics = jax.lax.stop_gradient(_statistics(result, self.clusters))
+        return Tokens(l2_normalise(at_least_float32(global_token)), l2_normalise(sums), statistics)
+
+    def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
+        """Return the mass that each patch sends to each cluster and to the dustbin."""
+        return jnp.exp(self.transport(params, features, key=None).log_plan)
+
+
+@AGGREGATORS.register("salad", tiny=_TINY)
+@dataclasses.dataclass(frozen=True)
+class SaladConfig(TransportAggregator):
+    """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
+
     dustbin: OrName[Dustbin] = part_field(DUSTBINS, "column")
     """Registered dustbin, or its name; it takes the patches that belong to no cluster."""
     epsilon: float = 1.0
@@ -97,8 +153,8 @@ class SaladConfig(Aggregator):
     def __post_init__(self) -> None:
         """Check the ranges."""
         resolve_names(self)
-        require_positive(self, "clusters", "cluster_dim", "token_dim", "hidden", "epsilon")
-        require_fraction(self, "dropout")
+        super().__post_init__()
+        require_positive(self, "epsilon")
         for name in ("row_tau", "column_tau"):
             value = getattr(self, name)
             require(
@@ -111,43 +167,30 @@ class SaladConfig(Aggregator):
         """Number of scores of a patch: one for each cluster, and the dustbin's."""
         return self.clusters + self.dustbin.scores
 
-    def features(self, depth: int) -> FeatureRequest:
+    def features(self, depth: int) -> FeatureSpec:
         """Request the last patches and the class token."""
-        return FeatureRequest(class_token=True)
+        return FeatureSpec(class_token=True)
 
-    def token_shape(self, dim: int) -> TokenShape:
-        """Return the tokens' shape, which does not depend on the backbone."""
-        return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
-
-    def check_grid(self, grid: tuple[int, int], patch_size: int) -> None:
+    def check_grid(self, grid: Grid, patch_size: int) -> None:
         """Require more patches than clusters, where the dustbin's mass is the difference."""
         if self.dustbin.takes_difference:
             require_more_patches(self.clusters, grid, patch_size)
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> Salad:
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Salad:
         """Draw parameters as the public code: torch's default linears, dustbin score 1."""
-        token_key, cluster_key, score_key = draw.split(key, 3)
         dim = backbone.dim
         return Salad(
-            token_features=init_two_layer(token_key, dim, self.hidden, self.token_dim),
-            cluster_features=init_two_layer(cluster_key, dim, self.hidden, self.cluster_dim),
-            score=init_two_layer(score_key, dim, self.hidden, self.scores),
+            **self.init_networks(key, dim, self.scores),
             # Start at 3: `split` may derive the keys above from 0 to 2.
-            dust_bin=self.dustbin.init(draw.fold_in(key, 3), dim),
+            dust_bin=self.dustbin.init(jax.random.fold_in(key, 3), dim),
             log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
-            step=self.sinkhorn.step.init_params(draw.fold_in(key, 4)),
+            step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
         )
 
-    def transport(
-        self, params: Salad, patches: Float[Array, "*batch patch dim"], *, key: Keys | None
-    ) -> SinkhornResult:
-        """Assign patches to clusters, dustbin last (paper Eqs. 3 to 5), in float32.
-
-        Raises:
-            InputError: no more patches than clusters.
-        """
+    def transport(self, params: Salad, features: Features, *, key: Keys | None) -> SinkhornResult:
+        """Assign patches to clusters with the configured dustbin and solver."""
+        patches, learnt = features.patches, params.log_epsilon
         scores = at_least_float32(two_layer(params.score, patches, self.dropout, key))
-        learnt = params.log_epsilon
         return assign_with_dustbin(
             scores,
             params.dust_bin,
@@ -160,29 +203,77 @@ class SaladConfig(Aggregator):
             step_params=params.step,
         )
 
-    def apply(
-        self, params: Salad, features: Features, grid: tuple[int, int], *, key: Keys | None
-    ) -> Tokens:
-        """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
 
-        The tokens carry the transport's statistics, without a gradient. A whole batch is faster
-        than `vmap`: the transport chooses the domain once for all images.
+LEAST_ATTENTION = 0.01
+"""Attention below which a patch counts as one that the class token does not see, as published."""
 
-        Raises:
-            InputError: no more patches than clusters.
+
+@pytree_dataclass
+class Fol:
+    """SALAD's three networks, and two transposed convolutions of 3 x 3 for local features."""
+
+    token_features: TwoLayer
+    cluster_features: TwoLayer
+    score: TwoLayer
+    upconv1: Conv
+    """Part of the public files, as `upconv2`; no descriptor needs it."""
+    upconv2: Conv
+
+
+@AGGREGATORS.register("fol", tiny={**_TINY, "local_hidden": 32, "local": 16})
+@dataclasses.dataclass(frozen=True)
+class FolConfig(TransportAggregator):
+    """FoL's global descriptor: SALAD's with a dustbin of attention (Wang et al., AAAI 2025).
+
+    Written from the paper, with the constants of the public model.
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig, ModelConfig
+        >>> alone = CrossImageConfig(layers=0)
+        >>> ModelConfig(aggregator="fol", cross_image=alone).descriptor_dim
+        8448
+    """
+
+    local_hidden: int = 256
+    """Number of channels between the transposed convolutions."""
+    local: int = 128
+    """Width of a local feature."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        require_positive(self, "local_hidden", "local")
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the last patches, the class token and its attention."""
+        return FeatureSpec(class_token=True, class_attention=True)
+
+    def check_grid(self, grid: Grid, patch_size: int) -> None:
+        """Require more patches than clusters: the dustbin's mass is the difference."""
+        require_more_patches(self.clusters, grid, patch_size)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Fol:
+        """Draw parameters as torch's default layers, as the public code."""
+        *_, first, second = random_init.split(key, 5)
+        return Fol(
+            **self.init_networks(key, backbone.dim, self.clusters),
+            upconv1=init_transposed_conv(first, 3, backbone.dim, self.local_hidden),
+            upconv2=init_transposed_conv(second, 3, self.local_hidden, self.local),
+        )
+
+    def transport(self, params: Fol, features: Features, *, key: Keys | None) -> SinkhornResult:
+        """Assign patches by three plain iterations; the dustbin reads the class token's attention.
+
+        A patch's dustbin score is 1 minus its attention, which counts as 0 below `LEAST_ATTENTION`.
         """
-        cluster_key, score_key = split_key(key, 2)
-        global_token = two_layer(params.token_features, features.class_token, 0.0, None)
-        local = two_layer(params.cluster_features, features.patches, self.dropout, cluster_key)
-        result = self.transport(params, features.patches, key=score_key)
-        return transported_tokens(global_token, local, result, self.clusters)
-
-    def plan(self, params: Salad, features: Features) -> Float[Array, "*batch patch column"]:
-        """Return the mass that each patch sends to each cluster and to the dustbin."""
-        return jnp.exp(self.transport(params, features.patches, key=None).log_plan)
+        attention = features.class_attention
+        assert attention is not None
+        scores = at_least_float32(two_layer(params.score, features.patches, self.dropout, key))
+        dustbin = 1 - jnp.where(attention >= LEAST_ATTENTION, attention, 0)
+        return assign_with_dustbin(scores, dustbin, "token", config=SinkhornConfig())
 
 
-def require_more_patches(clusters: int, grid: tuple[int, int], patch_size: int) -> None:
+def require_more_patches(clusters: int, grid: Grid, patch_size: int) -> None:
     """Check that there are more patches than clusters, as a dustbin of the difference needs.
 
     Raises:
@@ -201,7 +292,7 @@ def require_more_patches(clusters: int, grid: tuple[int, int], patch_size: int) 
 
 def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
     """Draw a network of one hidden layer, each layer as torch's `nn.Linear`."""
-    first, second = draw.split(key)
+    first, second = random_init.split(key)
     return TwoLayer(init_linear(first, d_in, hidden), init_linear(second, hidden, d_out))
 
 
@@ -211,29 +302,6 @@ def two_layer(
     """Apply the network, with dropout of this rate before the ReLU where there is a key."""
     hidden = dropout(linear(params.fc1, x), rate, key=key)
     return linear(params.fc2, jax.nn.relu(hidden))
-
-
-def transported_tokens(
-    global_token: Float[Array, "*batch token"],
-    local: Float[Array, "*batch patch dim"],
-    result: SinkhornResult,
-    clusters: int,
-) -> Tokens:
-    """Sum patches by the transport's plan to cluster tokens (paper Eq. 6); make all unit vectors.
-
-    Args:
-        global_token: before normalisation.
-        local: features of every patch.
-        result: the transport, whose columns after the first `clusters` are the dustbin's.
-        clusters: number of clusters.
-
-    Returns:
-        The tokens in float32 at least, with the transport's statistics, without a gradient.
-    """
-    plan = jnp.exp(result.log_plan[..., :clusters])
-    sums = jnp.einsum("...nm,...nd->...md", plan, local.astype(plan.dtype))
-    statistics = jax.lax.stop_gradient(_statistics(result, clusters))
-    return Tokens(l2_normalise(at_least_float32(global_token)), l2_normalise(sums), statistics)
 
 
 def _statistics(result: SinkhornResult, clusters: int) -> TransportStatistics:

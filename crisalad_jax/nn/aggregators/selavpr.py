@@ -1,17 +1,22 @@
 """SelaVPR: a generalised mean, and local features to re-rank by (Lu et al., ICLR 2024)."""
 
 import dataclasses
-import math
 
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
-from crisalad_jax.nn import draw
+from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.aggregators.gem import START, generalised_mean, log_units
-from crisalad_jax.nn.backbones.base import Backbone, Features
-from crisalad_jax.nn.layers import Conv, Keys, at_least_float32, l2_normalise
+from crisalad_jax.nn.aggregators.gem import START, gem
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
+from crisalad_jax.nn.layers import (
+    Conv,
+    Keys,
+    at_least_float32,
+    init_transposed_conv,
+    l2_normalise,
+)
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -51,47 +56,31 @@ class SelaVprConfig(Aggregator):
         """Return the shape of a global token as wide as the backbone."""
         return TokenShape(dim, 0, dim)
 
-    def local_grid(self, grid: tuple[int, int]) -> tuple[int, int]:
+    def local_grid(self, grid: Grid) -> tuple[int, int]:
         """Return the rows and columns of local features over those of patches."""
         rows, columns = (SCALE * (SCALE * (side - 1)) + 1 for side in grid)
         return rows, columns
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> SelaVpr:
-        """Start at an exponent of 3; draw convolutions uniform within 1 / sqrt(9 channels out).
-
-        That is torch's `nn.ConvTranspose2d`, which takes the channels out for those in.
-        """
-        first, second = draw.split(key)
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SelaVpr:
+        """Start at an exponent of 3, with convolutions as torch's."""
+        first, second = random_init.split(key)
         return SelaVpr(
-            p=draw.full((), START),
-            upconv1=init_upconv(first, backbone.dim, self.hidden),
-            upconv2=init_upconv(second, self.hidden, self.local),
+            p=random_init.full((), START),
+            upconv1=init_transposed_conv(first, 3, backbone.dim, self.hidden),
+            upconv2=init_transposed_conv(second, 3, self.hidden, self.local),
         )
 
-    def apply(
-        self, params: SelaVpr, features: Features, grid: tuple[int, int], *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: SelaVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
         """Return the mean of all patches; and in training, for its loss, the local features."""
-        mean = generalised_mean(log_units(at_least_float32(features.patches)), params.p, axis=-2)
-        tokens = Tokens.of_global(mean)
+        tokens = Tokens.of_global(gem(features.patches, params.p))
         if key is None:
             return tokens
         dense = local_features(params, features.patches, grid)
         return tokens._replace(dense=dense.reshape(*dense.shape[:-3], -1, self.local))
 
 
-def init_upconv(key: PRNGKeyArray, d_in: int, d_out: int) -> Conv:
-    """Draw a transposed convolution of 3 x 3, weight and bias uniform within 1 / sqrt(9 d_out)."""
-    weight_key, bias_key = draw.split(key)
-    bound = 1 / (3 * math.sqrt(d_out))
-    return Conv(
-        draw.uniform(weight_key, (3, 3, d_in, d_out), minval=-bound, maxval=bound),
-        draw.uniform(bias_key, (d_out,), minval=-bound, maxval=bound),
-    )
-
-
 def local_features(
-    params: SelaVpr, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
+    params: SelaVpr, patches: Patches, grid: Grid
 ) -> Float[Array, "*batch rows columns local"]:
     """Upsample the patch grid twice, with a ReLU between, to unit features in float32 at least.
 

@@ -1,19 +1,18 @@
 """TransVPR's multi-level attention (Wang et al., CVPR 2022, section 3.2), on any of our backbones.
 
-Features hold the patches of all levels side by side (`FeatureRequest.levels`).
+Features hold the patches of all levels side by side (`FeatureSpec.levels`).
 """
 
 import dataclasses
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
-from crisalad_jax.nn import draw
+from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
@@ -36,7 +35,6 @@ class TransVpr:
 class TransVprConfig(Aggregator):
     """TransVPR: patches of several layers, weighed by attention (Wang et al., CVPR 2022)."""
 
-    width_field: ClassVar[str] = "dim"
     levels: int = 3
     """Number of the backbone's layers that are used, evenly spaced, with the last one."""
     dim: int = 256
@@ -46,14 +44,14 @@ class TransVprConfig(Aggregator):
         """Check the ranges."""
         require_positive(self, "levels", "dim")
 
-    def features(self, depth: int) -> FeatureRequest:
+    def features(self, depth: int) -> FeatureSpec:
         """Request the patches after several numbers of blocks."""
         require(
             self.levels <= depth,
             f"TransVprConfig.levels: found {self.levels}, expected at most {depth}, the backbone's "
             "blocks",
         )
-        return FeatureRequest(
+        return FeatureSpec(
             tuple(depth * (level + 1) // self.levels for level in range(self.levels))
         )
 
@@ -61,16 +59,16 @@ class TransVprConfig(Aggregator):
         """Return the shape of a global token."""
         return TokenShape(self.dim, 0, self.dim)
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]) -> TransVpr:
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> TransVpr:
         """Draw parameters as torch's `nn.Linear` does."""
-        first, second = draw.split(key)
+        first, second = random_init.split(key)
         wide = self.levels * backbone.dim
         return TransVpr(
             init_linear(first, wide, self.levels, bias=False), init_linear(second, wide, self.dim)
         )
 
     def apply(
-        self, params: TransVpr, features: Features, grid: tuple[int, int], *, key: Keys | None
+        self, params: TransVpr, features: Features, grid: Grid, *, key: Keys | None
     ) -> Tokens:
         """Return the global descriptor, and no local token."""
         patches = at_least_float32(features.patches)
@@ -90,7 +88,7 @@ def attentions(
 
 def key_features(
     params: TransVpr, patches: Float[Array, "*batch patch wide"], levels: int
-) -> Float[Array, "*batch patch dim"]:
+) -> Patches:
     """Return the patch tokens of the middle level, and 0 for patches that are no key patches.
 
     Every level's attention is rescaled to 0 to 1, and so is their sum. Key patches are those above

@@ -5,8 +5,8 @@ import pkgutil
 
 from crisalad_jax.nn.backbones.base import BACKBONES as BACKBONES
 from crisalad_jax.nn.backbones.base import Backbone as Backbone
-from crisalad_jax.nn.backbones.base import FeatureRequest as FeatureRequest
 from crisalad_jax.nn.backbones.base import Features as Features
+from crisalad_jax.nn.backbones.base import FeatureSpec as FeatureSpec
 
 register_backbone = BACKBONES.register
 

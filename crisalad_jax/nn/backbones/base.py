@@ -4,12 +4,18 @@ import abc
 import dataclasses
 from typing import Any, ClassVar, Literal, NamedTuple
 
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.concise import brief, concise
 from crisalad_jax.config.parts import Part, Registry
-from crisalad_jax.nn.layers import split_statistics
+from crisalad_jax.nn.layers import Grid, Valid
+from crisalad_jax.utils.errors import InputError
+
+Pixels = Float[Array, "image height width 3"]
+"""Normalised images."""
+Patches = Float[Array, "*batch patch dim"]
+"""Features of patches, in row order."""
 
 
 @brief
@@ -18,18 +24,18 @@ class Features(NamedTuple):
 
     class_token: Float[Array, "*batch dim"]
     """One vector for the whole image; of width 0 where the backbone has none."""
-    patches: Float[Array, "*batch patch dim"]
+    patches: Patches
     """One vector for each patch, in row order."""
     inserted: Float[Array, "*batch inserted dim"] | None = None
-    """One vector for each of `FeatureRequest.inserted`; None without them."""
+    """One vector for each of `FeatureSpec.inserted`; None without them."""
     class_attention: Float[Array, "*batch patch"] | None = None
     """Share of each patch in the class token's attention, summed over the last block's heads, in
-    float32 at least; None where `FeatureRequest.class_attention` does not ask for it."""
+    float32 at least; None where `FeatureSpec.class_attention` does not ask for it."""
 
 
 @concise()
 @dataclasses.dataclass(frozen=True)
-class FeatureRequest:
+class FeatureSpec:
     """The features that an aggregator requests; by default those after the last layer."""
 
     levels: tuple[int, ...] | None = None
@@ -64,11 +70,13 @@ class Backbone(Part, abc.ABC):
     """Number of blocks, or levels."""
     patch_size: ClassVar[int] = 14
     """Side of a patch in pixels; sides of images are multiples of it."""
+    any_size: ClassVar[bool] = False
+    """Whether sides of images may be of any length."""
     class_token: ClassVar[bool] = True
     """Whether its features have a class token."""
-    inserts: ClassVar[bool] = False
+    supports_prompt_tokens: ClassVar[bool] = False
     """Whether an aggregator's own tokens can run through its blocks."""
-    attends: ClassVar[bool] = False
+    exposes_cls_attention: ClassVar[bool] = False
     """Whether its features can have the class token's attention."""
 
     @abc.abstractmethod
@@ -77,55 +85,25 @@ class Backbone(Part, abc.ABC):
 
     @abc.abstractmethod
     def apply(
-        self,
-        params: Any,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-    ) -> Features:
-        """Return the features of normalised images.
+        self, params: Any, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+    ) -> tuple[Features, Any]:
+        """Return the features of normalised images, and the parameters.
 
         Args:
             params: of `init`, or of `split_blocks`.
             images: with sides that are multiples of `patch_size`, in the type to compute in.
             request: the features to return.
             remat: `ModelConfig.remat`.
+            valid: images of a training batch, whose statistics batch norms normalise by
+                (`layers.train_batch_norm`). None takes the stored ones, which stay.
+
+        Returns:
+            (features, updated): the parameters with updated running statistics, if there are any.
+            In the place of all other leaves there may be None.
 
         Raises:
             InputError: while tracing, for a request that this backbone cannot meet.
         """
-
-    def apply_training(
-        self,
-        params: Any,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-        valid: Bool[Array, " image"],
-    ) -> tuple[Features, Any]:
-        """Return the features of a training batch, and the running statistics after it.
-
-        A backbone with batch norms overrides it, by `layers.train_batch_norm`. By default the
-        features are those of `apply`, and the statistics stay as they are.
-
-        Args:
-            params: see `apply`.
-            images: see `apply`.
-            request: see `apply`.
-            remat: see `apply`.
-            valid: which images are no padding; the statistics are taken of these.
-
-        Returns:
-            (features, statistics): a tree of the structure of `params`, which holds the running
-            statistics (`layers.split_statistics`), and None for all other leaves.
-
-        Raises:
-            InputError: as `apply`.
-        """
-        features = self.apply(params, images, request, remat=remat)
-        return features, split_statistics(params)[0]
 
     @property
     def extras(self) -> str:
@@ -140,10 +118,9 @@ class Backbone(Part, abc.ABC):
         Raises:
             InputError: this backbone has no blocks to cut.
         """
-        require(
-            False,
+        raise InputError(
             f"trainable: found backbone {self.part_name}, which cannot be cut into blocks, "
-            "expected head or all",
+            "expected head or all"
         )
 
     def join_blocks(self, params: Any) -> Any:
@@ -161,7 +138,7 @@ class Backbone(Part, abc.ABC):
         del fresh
         return config, params
 
-    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+    def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return the rows and columns of patches in an image of this height and width.
 
         Raises:
@@ -169,63 +146,13 @@ class Backbone(Part, abc.ABC):
         """
         height, width = image_size
         size = self.patch_size
+        nearest = [max(size, round(side / size) * size) for side in image_size]
         require(
             height > 0 and width > 0 and height % size == 0 and width % size == 0,
             f"image size: found {height} x {width}, expected sides that are multiples of {size} "
-            f"(nearest: {_nearest(height, size)} x {_nearest(width, size)})",
+            f"(nearest: {nearest[0]} x {nearest[1]})",
         )
         return height // size, width // size
-
-
-class BackboneWithStatistics(Backbone):
-    """A backbone with batch norms, whose one method `run` serves inference and training."""
-
-    @abc.abstractmethod
-    def run(
-        self,
-        params: Any,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-        valid: Bool[Array, " image"] | None,
-    ) -> tuple[Features, Any]:
-        """Return the features, and parameters with updated running statistics.
-
-        The arguments are those of `apply_training`; `valid` None takes the stored statistics, which
-        stay.
-
-        Raises:
-            InputError: as `apply`.
-        """
-
-    def apply(
-        self,
-        params: Any,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-    ) -> Features:
-        """Return the features of normalised images, by the stored statistics."""
-        return self.run(params, images, request, remat=remat, valid=None)[0]
-
-    def apply_training(
-        self,
-        params: Any,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-        valid: Bool[Array, " image"],
-    ) -> tuple[Features, Any]:
-        """Return the features of a training batch, and the running statistics after it."""
-        features, updated = self.run(params, images, request, remat=remat, valid=valid)
-        return features, split_statistics(updated)[0]
-
-
-def _nearest(side: int, size: int) -> int:
-    return max(size, round(side / size) * size)
 
 
 BACKBONES = Registry("backbone", Backbone)

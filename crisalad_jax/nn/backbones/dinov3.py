@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.nn.attention import Attention, Rotation, without_key_bias
-from crisalad_jax.nn.backbones.base import BACKBONES
+from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Patches
 from crisalad_jax.nn.backbones.vit import Block, VisionTransformer, ViT
 
 PERIOD_BASE = 100.0
@@ -55,12 +55,12 @@ class DinoV3Config(VisionTransformer):
         return None, None
 
     def add_positions(
-        self, params: ViT, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
-    ) -> tuple[Float[Array, " dim"], Float[Array, "*batch patch dim"]]:
+        self, params: ViT, patches: Patches, grid: Grid
+    ) -> tuple[Float[Array, " dim"], Patches]:
         """Return the class token and the patches as they are."""
         return params.cls_token, patches
 
-    def rotation(self, grid: tuple[int, int]) -> Rotation:
+    def rotation(self, grid: Grid) -> Rotation:
         """Return the patches' angles; see `rotary_angles`."""
         return _rotation(grid, self.dim // self.heads)
 
@@ -77,7 +77,7 @@ def rotary_periods(head_dim: int) -> np.ndarray:
     return PERIOD_BASE ** (np.arange(head_dim // 4) * 4 / head_dim)
 
 
-def rotary_angles(grid: tuple[int, int], head_dim: int) -> np.ndarray:
+def rotary_angles(grid: Grid, head_dim: int) -> np.ndarray:
     """Compute the angles of each patch: those of its row, and then those of its column.
 
     An angle is 2 pi x / period. A patch's centre has x from -1 to 1 along either side of the image,
@@ -104,7 +104,7 @@ def rotary_angles(grid: tuple[int, int], head_dim: int) -> np.ndarray:
 
 
 @functools.cache
-def _rotation(grid: tuple[int, int], head_dim: int) -> Rotation:
+def _rotation(grid: Grid, head_dim: int) -> Rotation:
     """Compute cosines and sines, in float64 on the host: they are constants of the program."""
     angles = rotary_angles(grid, head_dim)
     return Rotation(np.cos(angles), np.sin(angles))

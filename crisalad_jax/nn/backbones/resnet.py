@@ -8,9 +8,9 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.backbones.base import BACKBONES
-from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages, Valid
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Valid
+from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
 from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_conv_norm, max_pool
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -28,7 +28,7 @@ STEM_SIDE = 7
 
 @pytree_dataclass
 class Residual:
-    """A residual block: convolutions, and one beside them where the shape changes."""
+    """A residual block: convolutions, and a shortcut where the shape changes."""
 
     convs: tuple[ConvNorm, ...]
     """Two of 3 x 3; or 1 x 1, 3 x 3, and 1 x 1 to four times the width."""
@@ -85,14 +85,14 @@ class ResNetConfig(StagedBackbone):
         """Return the sides of the kernels of a block's convolutions."""
         return (3, 3) if self.layers == 18 else (1, 3, 1)
 
-    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+    def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return the rows and columns of features: every halving rounds up."""
         height, width = image_size
         return -(-height // self.patch_size), -(-width // self.patch_size)
 
     def init(self, key: PRNGKeyArray) -> Stages:
         """Draw parameters as torchvision does before training."""
-        stem_key, *keys = draw.split(key, 1 + self.stages)
+        stem_key, *keys = random_init.split(key, 1 + self.stages)
         return Stages(
             init_conv_norm(stem_key, STEM_SIDE, 3, self.width),
             tuple(Stage(tuple(self._init_stage(keys[i], i))) for i in range(self.stages)),
@@ -108,8 +108,8 @@ class ResNetConfig(StagedBackbone):
 
     def _init_stage(self, key: PRNGKeyArray, stage: int) -> Iterator[Residual]:
         d_in = self.widths(stage - 1)[-1] if stage else self.width
-        for block_key in draw.split(key, BLOCKS[self.layers][stage]):
-            shortcut_key, *keys = draw.split(block_key, 4)
+        for block_key in random_init.split(key, BLOCKS[self.layers][stage]):
+            shortcut_key, *keys = random_init.split(block_key, 4)
             widths = self.widths(stage)
             shapes = zip(keys, self.kernels(), (d_in, *widths), widths, strict=False)
             convs = tuple(init_conv_norm(*shape) for shape in shapes)

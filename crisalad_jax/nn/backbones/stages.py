@@ -5,19 +5,16 @@ import dataclasses
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.nn.backbones.base import BackboneWithStatistics, FeatureRequest, Features
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Pixels, Valid
 from crisalad_jax.utils.devices import parts_for_caches
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Map = Float[Array, "image _ _ _"]
 """Features in rows and columns, channels last."""
 
-
-Valid = Bool[Array, " image"] | None
 
 _PIXELS = 2**18
 """Pixels of the images that a CPU's core computes at once: of ResNet-50 the largest activation is
@@ -47,12 +44,13 @@ class Stages:
 
 
 @dataclasses.dataclass(frozen=True)
-class StagedBackbone(BackboneWithStatistics):
+class StagedBackbone(Backbone):
     """A backbone whose blocks are stages, and whose features are the last stage's positions.
 
     Its width and its number of stages follow from its other settings.
     """
 
+    any_size: ClassVar[bool] = True
     class_token: ClassVar[bool] = False
     # Annotated anew so that they are no fields: subclasses compute them.
     dim: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -69,14 +67,14 @@ class StagedBackbone(BackboneWithStatistics):
     def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
         """Return the output of the stage of this number, from 0, and the stage as `run_stem`."""
 
-    def run(
+    def apply(
         self,
         params: Stages,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
+        images: Pixels,
+        request: FeatureSpec,
         *,
         remat: str,
-        valid: Bool[Array, " image"] | None,
+        valid: Valid = None,
     ) -> tuple[Features, Stages]:
         """Return the last stage's vectors, in row order; there is no class token, and no last norm.
 
@@ -90,27 +88,16 @@ class StagedBackbone(BackboneWithStatistics):
             f"features: found a request for levels {request.levels} and facet {request.facet} of "
             f"backbone {self.part_name}, expected its last stage's",
         )
-        if valid is None:
-            return self._infer(params, images, remat), params
-        patches, updated = self._run(params, images, remat, valid)
-        return Features(patches[:, 0, :0], patches), updated
-
-    def _infer(self, params: Stages, images: Map, remat: str) -> Features:
-        """Return the features by the stored statistics, on a CPU of few images at a time."""
         count, height, width, _ = images.shape
-        parts = parts_for_caches(count, _PIXELS // (height * width))
-
-        def one(images: Map) -> Float[Array, "image patch dim"]:
-            return self._run(params, images, remat, None)[0]
-
+        parts = parts_for_caches(count, _PIXELS // (height * width)) if valid is None else 1
         if parts == 1:
-            patches = one(images)
+            patches, params = self._run(params, images, remat, valid)
         else:
             # A part takes some images of every device's: a batch's first axis is spread over them.
-            split = images.reshape(-1, parts, *images.shape[1:])
-            found = jax.lax.map(one, jnp.moveaxis(split, 1, 0))
-            patches = jnp.moveaxis(found, 0, 1).reshape(count, *found.shape[2:])
-        return Features(patches[:, 0, :0], patches)
+            split = images.reshape(-1, parts, *images.shape[1:]).swapaxes(0, 1)
+            found = jax.lax.map(lambda part: self._run(params, part, remat, None)[0], split)
+            patches = found.swapaxes(0, 1).reshape(count, *found.shape[2:])
+        return Features(patches[:, 0, :0], patches), params
 
     def _run(
         self, params: Stages, images: Map, remat: str, valid: Valid
@@ -125,8 +112,11 @@ class StagedBackbone(BackboneWithStatistics):
             with jax.named_scope("blocks"):
                 x, stage = jax.checkpoint(run)(stage, x) if remat == "full" else run(stage, x)
             updated.append(stage)
-        patches = x.reshape(x.shape[0], -1, x.shape[-1])
-        return patches, Stages(stem, _cut_as(tuple(updated), params.blocks))
+        blocks: Blocks = tuple(updated)
+        if isinstance(params.blocks[0], tuple):
+            first = len(params.blocks[0])
+            blocks = blocks[:first], blocks[first:]  # pyright: ignore[reportAssignmentType]
+        return x.reshape(x.shape[0], -1, x.shape[-1]), Stages(stem, blocks)
 
     def split_blocks(self, params: Stages, first: int) -> Stages:
         """Cut the stages in two."""
@@ -136,14 +126,6 @@ class StagedBackbone(BackboneWithStatistics):
     def join_blocks(self, params: Stages) -> Stages:
         """Join the stages into one tuple."""
         return dataclasses.replace(params, blocks=_joined(params.blocks))
-
-
-def _cut_as(stages: tuple[Stage, ...], blocks: Blocks) -> Blocks:
-    """Cut stages as `blocks` are cut."""
-    if not isinstance(blocks[0], tuple):
-        return stages
-    first = len(blocks[0])
-    return stages[:first], stages[first:]
 
 
 def _joined(blocks: Blocks) -> tuple[Stage, ...]:

@@ -9,16 +9,18 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
-from crisalad_jax.nn import draw
+from crisalad_jax.nn import random_init
 from crisalad_jax.nn.attention import Attention, attention
 from crisalad_jax.nn.backbones.base import (
     BACKBONES,
-    BackboneWithStatistics,
-    FeatureRequest,
+    Backbone,
     Features,
+    FeatureSpec,
+    Pixels,
+    Valid,
 )
 from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_he_conv, max_pool
 from crisalad_jax.nn.layers import (
@@ -67,7 +69,7 @@ class TransVprNet:
 
 @BACKBONES.register("transvpr-net", tiny={"dim": 64, "depth": 4})
 @dataclasses.dataclass(frozen=True)
-class TransVprNetConfig(BackboneWithStatistics):
+class TransVprNetConfig(Backbone):
     """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
 
     patch_size: ClassVar[int] = 16
@@ -89,11 +91,11 @@ class TransVprNetConfig(BackboneWithStatistics):
 
     def init(self, key: PRNGKeyArray) -> TransVprNet:
         """Draw parameters: convolutions as He et al., linears normal of deviation 0.02."""
-        conv_key, token_key, block_key = draw.split(key, 3)
+        conv_key, token_key, block_key = random_init.split(key, 3)
         maps = range(len(WIDTHS))
-        pairs = zip(draw.split(conv_key, len(WIDTHS)), (3, *WIDTHS), WIDTHS, strict=False)
+        pairs = zip(random_init.split(conv_key, len(WIDTHS)), (3, *WIDTHS), WIDTHS, strict=False)
         part = self.dim // len(WIDTHS)
-        token_keys = draw.split(token_key, len(WIDTHS))
+        token_keys = random_init.split(token_key, len(WIDTHS))
         return TransVprNet(
             convs=tuple(
                 ConvNorm(init_he_conv(each, 3, a, b, bias=True), init_batch_norm(b))
@@ -102,13 +104,13 @@ class TransVprNetConfig(BackboneWithStatistics):
             tokenizers=tuple(
                 init_he_conv(token_keys[i], _side(i), WIDTHS[i], part, bias=True) for i in maps
             ),
-            cls_token=draw.zeros(self.dim),
-            blocks=draw.stacked(self._init_block, draw.split(block_key, self.depth)),
+            cls_token=random_init.zeros(self.dim),
+            blocks=random_init.stacked(self._init_block, random_init.split(block_key, self.depth)),
             norm=init_layer_norm(self.dim),
         )
 
     def _init_block(self, key: PRNGKeyArray) -> TransVprBlock:
-        qkv, proj, first, second = draw.split(key, 4)
+        qkv, proj, first, second = random_init.split(key, 4)
         dim, hidden = self.dim, self.hidden
         return TransVprBlock(
             pre_norm=init_layer_norm(dim),
@@ -120,14 +122,14 @@ class TransVprNetConfig(BackboneWithStatistics):
             linear2=init_small_linear(second, hidden, dim),
         )
 
-    def run(
+    def apply(
         self,
         params: TransVprNet,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
+        images: Pixels,
+        request: FeatureSpec,
         *,
         remat: str,
-        valid: Bool[Array, " image"] | None,
+        valid: Valid = None,
     ) -> tuple[Features, TransVprNet]:
         """Return the patches of the requested levels side by side, and the last one's class token.
 
@@ -171,9 +173,7 @@ def _side(number: int) -> int:
 
 
 def embed(
-    params: TransVprNet,
-    images: Float[Array, "image height width 3"],
-    valid: Bool[Array, " image"] | None,
+    params: TransVprNet, images: Pixels, valid: Valid
 ) -> tuple[Float[Array, "image token dim"], TransVprNet]:
     """Return the class token, and for every patch a vector with a part from each map.
 
@@ -198,7 +198,7 @@ def block(
 ) -> Float[Array, "image token dim"]:
     """Add attention to the tokens, normalise them, and add the feed-forward network's output."""
     normed = layer_norm(params.pre_norm, x, epsilon=NORM_EPSILON)
-    x = x + attention(params.self_attn, normed, heads, key=None)
+    x = x + attention(params.self_attn, normed, heads)
     x = layer_norm(params.norm1, x, epsilon=NORM_EPSILON)
     update = linear(params.linear2, gelu(linear(params.linear1, x)))
     return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)

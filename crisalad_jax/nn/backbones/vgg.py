@@ -7,9 +7,9 @@ from typing import ClassVar
 import jax
 from jaxtyping import PRNGKeyArray
 
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.backbones.base import BACKBONES
-from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages, Valid
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Valid
+from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
 from crisalad_jax.nn.convolutions import init_he_conv, max_pool
 from crisalad_jax.nn.layers import conv
 
@@ -35,7 +35,7 @@ class VggConfig(StagedBackbone):
         """Width of a feature."""
         return WIDTHS[-1][-1]
 
-    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+    def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return the rows and columns of features: every halving rounds down."""
         height, width = image_size
         return height // self.patch_size, width // self.patch_size
@@ -43,7 +43,7 @@ class VggConfig(StagedBackbone):
     def init(self, key: PRNGKeyArray) -> Stages:
         """Draw parameters as torchvision does before training."""
         widths = list(itertools.chain.from_iterable(WIDTHS))
-        pairs = zip(draw.split(key, len(widths)), (3, *widths), widths, strict=False)
+        pairs = zip(random_init.split(key, len(widths)), (3, *widths), widths, strict=False)
         layers = iter([init_he_conv(each, 3, a, b, bias=True) for each, a, b in pairs])
         return Stages(None, tuple(Stage(tuple(itertools.islice(layers, len(w)))) for w in WIDTHS))
 

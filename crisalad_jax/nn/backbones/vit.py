@@ -10,18 +10,18 @@ import functools
 import itertools
 import math
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import choose, require, require_positive
 from crisalad_jax.config.fields import free_field
-from crisalad_jax.nn import draw
+from crisalad_jax.nn import random_init
 from crisalad_jax.nn.adapter import (
     Adapter,
     AdapterConfig,
@@ -29,20 +29,24 @@ from crisalad_jax.nn.adapter import (
     SideAdapter,
     adapter,
     init_adapter,
-    train_adapter,
 )
-from crisalad_jax.nn.attention import (
-    Attention,
-    Rotation,
-    attention,
-    first_token_attention,
-    padded_length,
+from crisalad_jax.nn.attention import Attention, Rotation, attention, first_token_attention
+from crisalad_jax.nn.attention_fused import padded_length
+from crisalad_jax.nn.backbones.base import (
+    BACKBONES,
+    Backbone,
+    Features,
+    FeatureSpec,
+    Grid,
+    Patches,
+    Pixels,
+    Valid,
 )
-from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import (
     LayerNorm,
     Linear,
     at_least_float32,
+    columns,
     gelu,
     init_layer_norm,
     init_small_linear,
@@ -53,6 +57,7 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 NORM_EPSILON = 1e-6
+TokenBatch = Float[Array, "image token dim"]
 _PRODUCTS = ("qkv", "attended", "hidden", "down", "mixed")
 """Results of a block's large products and the tokens between its halves, by their names."""
 _POLICIES = {
@@ -110,16 +115,12 @@ class ViT:
     norm: LayerNorm
 
 
-Carry = Float[Array, "image token dim"] | tuple[Array, Array]
-"""Tokens that run through the blocks, with those on the path of side adapters if there is one."""
-
-
 @dataclasses.dataclass(frozen=True)
 class VisionTransformer(Backbone):
     """What DINOv2's and DINOv3's transformers share: all but positions, and how a block attends."""
 
-    inserts: ClassVar[bool] = True
-    attends: ClassVar[bool] = True
+    supports_prompt_tokens: ClassVar[bool] = True
+    exposes_cls_attention: ClassVar[bool] = True
     norm_epsilon: ClassVar[float] = NORM_EPSILON
     """Added to the variance in every layer norm."""
     token_deviation: ClassVar[float] = 1e-6
@@ -173,11 +174,11 @@ class VisionTransformer(Backbone):
 
     @abc.abstractmethod
     def add_positions(
-        self, params: ViT, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
-    ) -> tuple[Float[Array, " dim"], Float[Array, "*batch patch dim"]]:
+        self, params: ViT, patches: Patches, grid: Grid
+    ) -> tuple[Float[Array, " dim"], Patches]:
         """Return the class token and the embedded patches, with their positions added if any."""
 
-    def rotation(self, grid: tuple[int, int]) -> Rotation | None:
+    def rotation(self, grid: Grid) -> Rotation | None:
         """Return the patches' angles, by which every block rotates queries and keys; or None."""
         return None
 
@@ -187,36 +188,49 @@ class VisionTransformer(Backbone):
 
     def init(self, key: PRNGKeyArray) -> ViT:
         """Draw parameters as published before training: linears of deviation 0.02, biases 0."""
-        return init_vit(key, self)
+        patch, first, register, position, block = random_init.split(key, 5)
+        deviation, normal = self.token_deviation, random_init.normal
+        pos_embed_cls, pos_embed = self.init_positions(position)
+        registers = (self.registers, self.dim)
+        return ViT(
+            patch_embed=init_small_linear(patch, 3 * self.patch_size**2, self.dim),
+            cls_token=normal(first, (self.dim,), scale=deviation),
+            register_tokens=normal(register, registers, scale=deviation)
+            if self.registers
+            else None,
+            pos_embed_cls=pos_embed_cls,
+            pos_embed=pos_embed,
+            blocks=random_init.stacked(self._init_block, random_init.split(block, self.depth)),
+            norm=init_layer_norm(self.dim),
+        )
+
+    def _init_block(self, key: PRNGKeyArray) -> Block:
+        qkv, proj, first, second, adapter_key = random_init.split(key, 5)
+        dim, hidden, swiglu = self.dim, self.hidden, self.ffn == "swiglu"
+        mlp_layers = (
+            init_small_linear(first, dim, 2 * hidden if swiglu else hidden),
+            init_small_linear(second, hidden, dim),
+        )
+        return Block(
+            norm1=init_layer_norm(dim),
+            attn=Attention(init_small_linear(qkv, dim, 3 * dim), init_small_linear(proj, dim, dim)),
+            ls1=random_init.full((dim,), self.layer_scale_init),
+            norm2=init_layer_norm(dim),
+            mlp=SwiGlu(*mlp_layers) if swiglu else Mlp(*mlp_layers),
+            ls2=random_init.full((dim,), self.layer_scale_init),
+            adapter=init_adapter(adapter_key, dim, self.adapter),
+        )
 
     def apply(
-        self,
-        params: ViT,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-    ) -> Features:
-        """Return the features of normalised images whose sides are multiples of a patch's."""
-        return vit(params, images, self, request, remat=remat)
-
-    def apply_training(
-        self,
-        params: ViT,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-        valid: Bool[Array, " image"],
+        self, params: ViT, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
     ) -> tuple[Features, ViT]:
-        """Return the features of a training batch, and the statistics of adapters' batch norms."""
-        return train_vit(params, images, self, request, remat=remat, valid=valid)
+        """Return the features, and the statistics of adapters' batch norms; see `vit`."""
+        return vit(params, images, self, request, remat=remat, valid=valid)
 
     def split_blocks(self, params: ViT, first: int) -> ViT:
         """Cut the stack of blocks in two."""
         stack = _one_stack(params)
-        halves = slice(first), slice(first, None)
-        parts = tuple(jax.tree.map(operator.itemgetter(half), stack) for half in halves)
+        parts = _cut(stack, 0, first), _cut(stack, first, self.depth)
         return dataclasses.replace(params, blocks=parts)
 
     def adapt_checkpoint(self, config: Any, params: ViT, fresh: ViT) -> tuple[Any, ViT]:
@@ -231,8 +245,7 @@ class VisionTransformer(Backbone):
         """Join the stacks of blocks into one."""
         if isinstance(params.blocks, Block):
             return params
-        stack = jax.tree.map(lambda *parts: jnp.concatenate(parts), *params.blocks)
-        return dataclasses.replace(params, blocks=stack)
+        return dataclasses.replace(params, blocks=_joined(params.blocks))
 
 
 @BACKBONES.register("vit")
@@ -265,12 +278,12 @@ class ViTConfig(VisionTransformer):
         if self.position_init == "sincos":
             positions = jax.device_put(_sincos_positions(side, self.dim).astype(np.float32))
         else:
-            positions = draw.normal(key, (side, side, self.dim), scale=0.02)
-        return draw.zeros(self.dim), positions
+            positions = random_init.normal(key, (side, side, self.dim), scale=0.02)
+        return random_init.zeros(self.dim), positions
 
     def add_positions(
-        self, params: ViT, patches: Float[Array, "*batch patch dim"], grid: tuple[int, int]
-    ) -> tuple[Float[Array, " dim"], Float[Array, "*batch patch dim"]]:
+        self, params: ViT, patches: Patches, grid: Grid
+    ) -> tuple[Float[Array, " dim"], Patches]:
         """Add the class token's position to it, and the resized grid of positions to patches."""
         assert params.pos_embed_cls is not None
         assert params.pos_embed is not None
@@ -282,46 +295,6 @@ class ViTConfig(VisionTransformer):
 def _one_stack(params: ViT) -> Block:
     assert isinstance(params.blocks, Block)  # only training cuts the stack
     return params.blocks
-
-
-def init_vit(key: PRNGKeyArray, config: VisionTransformer) -> ViT:
-    """Draw parameters as published before training: linears normal of deviation 0.02, biases 0."""
-    patch_key, class_key, register_key, position_key, block_key = draw.split(key, 5)
-    dim, deviation = config.dim, config.token_deviation
-    pos_embed_cls, pos_embed = config.init_positions(position_key)
-    return ViT(
-        patch_embed=init_small_linear(patch_key, 3 * config.patch_size**2, dim),
-        cls_token=draw.normal(class_key, (dim,), scale=deviation),
-        register_tokens=draw.normal(register_key, (config.registers, dim), scale=deviation)
-        if config.registers
-        else None,
-        pos_embed_cls=pos_embed_cls,
-        pos_embed=pos_embed,
-        blocks=draw.stacked(
-            functools.partial(_init_block, config=config), draw.split(block_key, config.depth)
-        ),
-        norm=init_layer_norm(dim),
-    )
-
-
-def _init_block(key: PRNGKeyArray, config: VisionTransformer) -> Block:
-    qkv, proj, first, second, adapter_key = draw.split(key, 5)
-    dim, hidden = config.dim, config.hidden
-    if config.ffn == "swiglu":
-        mlp = SwiGlu(
-            init_small_linear(first, dim, 2 * hidden), init_small_linear(second, hidden, dim)
-        )
-    else:
-        mlp = Mlp(init_small_linear(first, dim, hidden), init_small_linear(second, hidden, dim))
-    return Block(
-        norm1=init_layer_norm(dim),
-        attn=Attention(init_small_linear(qkv, dim, 3 * dim), init_small_linear(proj, dim, dim)),
-        ls1=draw.full((dim,), config.layer_scale_init),
-        norm2=init_layer_norm(dim),
-        mlp=mlp,
-        ls2=draw.full((dim,), config.layer_scale_init),
-        adapter=init_adapter(adapter_key, dim, config.adapter),
-    )
 
 
 def _sincos_positions(side: int, dim: int) -> np.ndarray:
@@ -336,226 +309,158 @@ def _sincos_positions(side: int, dim: int) -> np.ndarray:
 
 def vit(
     params: ViT,
-    images: Float[Array, "image height width 3"],
+    images: Pixels,
     config: VisionTransformer,
-    request: FeatureRequest = FeatureRequest(),
+    request: FeatureSpec = FeatureSpec(),
     *,
     remat: str = "dots",
-) -> Features:
+    valid: Valid = None,
+) -> tuple[Features, ViT]:
     """Compute features of a batch of normalised images whose sides are multiples of a patch's.
 
     Levels are concatenated, to a width of levels times dim. The class token is the last level's.
     With several levels the stack of blocks is cut at each, which for inference needs the memory of
     its parameters once more. Blocks after the last level are not run.
 
-    Raises:
-        InputError: while tracing, levels that are not in order or more than there are blocks,
-            several levels of a facet or without the last block, or, of adapters on a path beside
-            the blocks, other tokens than the last block's, inserted ones, or the class token's
-            attention.
-    """
-    return train_vit(params, images, config, request, remat=remat, valid=None)[0]
-
-
-def train_vit(
-    params: ViT,
-    images: Float[Array, "image height width 3"],
-    config: VisionTransformer,
-    request: FeatureRequest,
-    *,
-    remat: str,
-    valid: Bool[Array, " image"] | None,
-) -> tuple[Features, ViT]:
-    """Compute the features of a training batch, by the batch norms' statistics of the batch.
-
     Args:
-        params: see `vit`.
-        images: see `vit`.
-        config: see `vit`.
-        request: see `vit`; of a facet the stored statistics are taken, and stay.
+        params: the backbone.
+        images: normalised pixels.
+        config: the backbone's.
+        request: the features to return.
         remat: `ModelConfig.remat`.
-        valid: which images the statistics are taken of. None takes the stored ones, which stay.
+        valid: images that the statistics of adapters' batch norms are taken of, if all blocks are
+            run; None takes the stored ones, which stay.
 
     Returns:
-        (features, statistics): a tree of the structure of `params`, which holds the updated running
-        statistics, and None for all other leaves.
+        (features, updated): the second holds the running statistics, and None for all other leaves
+        where `valid` is given.
 
     Raises:
-        InputError: as `vit`.
+        InputError: while tracing, for levels that are not in order or more than there are blocks,
+            or for more than one of levels or a facet, inserted tokens, the class token's attention,
+            and adapters on a side path.
     """
+    levels = _checked_levels(request, config)
+    stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
+    depth, grid = config.depth, config.grid((images.shape[1], images.shape[2]))
+    ends = list(levels)
+    if request.facet != "token":
+        ends = [levels[0] - 1]
+    elif request.inserted is not None:
+        ends = [request.insertion or 0, depth]
+    elif request.class_attention:
+        ends = [depth - 1, depth]
+    is_whole = ends[-1] == depth
+    valid = valid if is_whole else None
+    tokens = embed(params, images, config)
+    outputs, measured, attended, front = [], [], None, 0
+    for begin, end in itertools.pairwise((0, *ends)):
+        part, count = _between(stacks, begin, end), None
+        if not is_whole and len(ends) == len(stacks) == 1:
+            part, count = stacks, end
+        tokens, statistics = run_blocks(
+            part, tokens, grid, config, remat=remat, valid=valid, count=count
+        )
+        measured += statistics
+        if end in levels:
+            outputs.append(tokens)
+        elif request.facet != "token":
+            outputs.append(_facet(_block_at(stacks, end), tokens, config, request.facet))
+        elif request.inserted is not None:
+            front = len(request.inserted)
+            first = jnp.broadcast_to(request.inserted, (tokens.shape[0], *request.inserted.shape))
+            tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
+        else:
+            attended = _class_attention(_block_at(stacks, end), tokens, grid, config)
+    if request.norm:
+        outputs = [layer_norm(params.norm, level, epsilon=config.norm_epsilon) for level in outputs]
+    patches = [level[:, front + 1 + config.registers :] for level in outputs]
+    features = Features(
+        outputs[-1][:, front],
+        patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1),
+        None if request.inserted is None else outputs[-1][:, :front],
+        attended,
+    )
+    if valid is None:
+        return features, params
+    blocks: Any = _joined(measured)
+    if isinstance(params.blocks, tuple):
+        cuts = 0, *itertools.accumulate(len(stack.ls1) for stack in stacks)
+        blocks = tuple(_cut(blocks, *pair) for pair in itertools.pairwise(cuts))
+    return features, split_statistics(dataclasses.replace(params, blocks=blocks))[0]
+
+
+def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[int, ...]:
+    """Return the numbers of blocks after which features are taken."""
     levels = (config.depth,) if request.levels is None else request.levels
     require(
         levels[0] > 0 and levels[-1] <= config.depth and list(levels) == sorted(set(levels)),
         f"levels: found {levels}, expected numbers of blocks in order, 1 to {config.depth}",
     )
     require(
-        config.adapter.kind != "side" or request.facet != "token" or levels == (config.depth,),
-        f"levels: found {levels} with adapters beside the blocks, expected the last alone, "
-        f"{config.depth}",
+        request.facet == "token" or len(levels) == 1,
+        f"levels: found {levels}, expected one for the facet {request.facet}",
     )
-    tokens = embed(params, images, config)
-    grid = config.grid((images.shape[1], images.shape[2]))
-    blocks, outputs, attended = params.blocks, [], None
-    if request.inserted is not None:
-        tokens, measured = _with_inserted(
-            params, tokens, grid, config, request, remat=remat, valid=valid
-        )
-        blocks = _as_cut(measured, params.blocks)
-        outputs.append(tokens)
-    elif request.class_attention:
-        tokens, measured, attended = _with_class_attention(
-            params, tokens, grid, config, request, remat=remat, valid=valid
-        )
-        blocks = _as_cut(measured, params.blocks)
-        outputs.append(tokens)
-    elif request.facet == "token" and levels[-1] == config.depth:
-        measured = []
-        for stack_group in _cut_at(params.blocks, levels):
-            tokens, parts = _run_stacks(stack_group, tokens, grid, config, remat=remat, valid=valid)
-            measured += parts
-            outputs.append(tokens)
-        blocks = _as_cut(measured, params.blocks)
-    else:
-        require(
-            len(levels) == 1,
-            f"levels: found {levels}, expected one of a facet, and several of tokens alone, up to "
-            f"the last block {config.depth}",
-        )
-        outputs.append(_facet(params, tokens, grid, config, levels[0], request.facet))
-    if request.norm:
-        outputs = [layer_norm(params.norm, level, epsilon=config.norm_epsilon) for level in outputs]
-    front = 0 if request.inserted is None else len(request.inserted)
-    patches = [level[:, front + 1 + config.registers :] for level in outputs]
-    joined = patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1)
-    inserted = None if request.inserted is None else outputs[-1][:, :front]
-    statistics, _ = split_statistics(dataclasses.replace(params, blocks=blocks))
-    return Features(outputs[-1][:, front], joined, inserted, attended), statistics
+    special = {
+        "levels or a facet": levels != (config.depth,) or request.facet != "token",
+        "inserted tokens": request.inserted is not None,
+        "the class token's attention": request.class_attention,
+        "adapters on a side path": config.adapter.kind == "side",
+    }
+    found = [name for name, is_asked in special.items() if is_asked]
+    require(len(found) < 2, f"features: found {' and '.join(found)}, expected one of these alone")
+    return levels
 
 
-def _with_inserted(
-    params: ViT,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
-    config: VisionTransformer,
-    request: FeatureRequest,
-    *,
-    remat: str,
-    valid: Bool[Array, " image"] | None,
-) -> tuple[Float[Array, "image all dim"], list[Block]]:
-    """Run all blocks, with the requested tokens in front after the first `request.insertion`."""
-    assert request.insertion is not None
-    assert request.inserted is not None
-    require(
-        config.adapter.kind != "side" and request.levels is None and request.facet == "token",
-        "features: found inserted tokens with levels, a facet or adapters beside the blocks, "
-        "expected none of these",
-    )
-    before, after = _cut_at(params.blocks, (request.insertion, config.depth))
-    run = functools.partial(_run_stacks, grid=grid, config=config, remat=remat, valid=valid)
-    tokens, first = run(before, tokens)
-    front = jnp.broadcast_to(request.inserted, (tokens.shape[0], *request.inserted.shape))
-    tokens, last = run(after, jnp.concatenate([front.astype(tokens.dtype), tokens], axis=1))
-    return tokens, first + last
+def _cut(stack: Block, begin: int, end: int) -> Block:
+    return jax.tree.map(operator.itemgetter(slice(begin, end)), stack)
 
 
-def _with_class_attention(
-    params: ViT,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
-    config: VisionTransformer,
-    request: FeatureRequest,
-    *,
-    remat: str,
-    valid: Bool[Array, " image"] | None,
-) -> tuple[Float[Array, "image token dim"], list[Block], Float[Array, "image patch"]]:
-    """Run all blocks, and return how much of each patch the last one's class token takes.
+def _joined(stacks: Sequence[Block]) -> Block:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *stacks)
 
-    The shares are summed over heads. The blocks' own attention does not keep its weights, so that
-    one row of them is computed a second time.
+
+def _between(stacks: Sequence[Block], begin: int, end: int) -> Sequence[Block]:
+    """Return the blocks from number `begin` to before `end`, from 0."""
+    parts, start = [], 0
+    for stack in stacks:
+        size = len(stack.ls1)
+        first, last = max(begin - start, 0), min(max(end - start, 0), size)
+        if (first, last) == (0, size):
+            parts.append(stack)
+        elif first < last:
+            parts.append(_cut(stack, first, last))
+        start += size
+    return parts
+
+
+def _block_at(stacks: Sequence[Block], number: int) -> Block:
+    (one,) = _between(stacks, number, number + 1)
+    return jax.tree.map(operator.itemgetter(0), one)
+
+
+def _facet(layer: Block, tokens: TokenBatch, config: VisionTransformer, name: str) -> TokenBatch:
+    """Compute queries, keys or values of a block's attention (AnyLoc: Keetha et al. 2023).
+
+    Heads are side by side, and not rotated.
     """
-    require(
-        config.adapter.kind != "side" and request.levels is None and request.facet == "token",
-        "features: found the class token's attention with levels, a facet or adapters beside the "
-        "blocks, expected none of these",
-    )
-    before, after = _cut_at(params.blocks, (config.depth - 1, config.depth))
-    run = functools.partial(_run_stacks, grid=grid, config=config, remat=remat, valid=valid)
-    tokens, first = run(before, tokens)
+    here = ("query", "key", "value").index(name) * config.dim
+    part = columns(config.attention_of(layer).qkv, here, here + config.dim)
+    return linear(part, layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon))
+
+
+def _class_attention(
+    layer: Block, tokens: TokenBatch, grid: Grid, config: VisionTransformer
+) -> Float[Array, "image patch"]:
+    """Return how much of each patch a block's class token takes, summed over heads.
+
+    The block's own attention does not keep its weights: one row of them is computed a second time.
+    """
     with jax.named_scope("blocks"):
-        last = jax.tree.map(operator.itemgetter(-1), after[-1])
-        normed = layer_norm(last.norm1, tokens, epsilon=config.norm_epsilon)
-        attn, rotation = config.attention_of(last), config.rotation(grid)
+        normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
+        attn, rotation = config.attention_of(layer), config.rotation(grid)
         shares = first_token_attention(attn, normed, config.heads, rotation=rotation).sum(axis=-2)
-    tokens, final = run(after, tokens)
-    return tokens, first + final, shares[:, 1 + config.registers :]
-
-
-def _cut_at(
-    blocks: Block | tuple[Block, ...], depths: Sequence[int]
-) -> Iterator[tuple[Block, ...]]:
-    """Yield the stacks of blocks between each of `depths` and the one before."""
-    stacks = blocks if isinstance(blocks, tuple) else (blocks,)
-    if len(depths) == 1:
-        yield stacks
-        return
-    for begin, end in itertools.pairwise((0, *depths)):
-        parts, start = [], 0
-        for stack in stacks:
-            chosen = slice(max(begin - start, 0), max(end - start, 0))
-            parts.append(jax.tree.map(operator.itemgetter(chosen), stack))
-            start += len(stack.ls1)
-        yield tuple(part for part in parts if len(part.ls1))
-
-
-def _as_cut(parts: Sequence[Block], blocks: Block | tuple[Block, ...]) -> Any:
-    """Join parts of a stack of blocks in order, and cut the whole as `blocks` are cut."""
-    whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    if isinstance(blocks, Block):
-        return whole
-    ends = itertools.accumulate(len(stack.ls1) for stack in blocks)
-    return tuple(
-        jax.tree.map(operator.itemgetter(slice(begin, end)), whole)
-        for begin, end in itertools.pairwise((0, *ends))
-    )
-
-
-def _facet(
-    params: ViT,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
-    config: VisionTransformer,
-    level: int,
-    name: str,
-) -> Float[Array, "image token dim"]:
-    """Compute a facet of the last of `level` blocks; the blocks after it are not run.
-
-    The facets are queries, keys and values of the block's attention, with heads side by side and
-    not rotated, or its output tokens (AnyLoc: Keetha et al. 2023).
-    """
-    stack = _one_stack(params)
-
-    def numbered(number: Int[Array, ""] | int) -> Block:
-        # Index the stack: a slice of it to scan over would copy its weights.
-        return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
-
-    tokens, length = _padded(tokens, config)
-
-    def body(
-        carry: Float[Array, "image token dim"], number: Int[Array, ""]
-    ) -> tuple[Float[Array, "image token dim"], None]:
-        return block(numbered(number), carry, grid, config, length=length), None
-
-    whole = level if name == "token" else level - 1
-    with jax.named_scope("blocks"):
-        tokens, _ = jax.lax.scan(body, tokens, jnp.arange(whole))
-        tokens = tokens[:, :length]
-        if name == "token":
-            return tokens
-        last = numbered(level - 1)
-        here = ("query", "key", "value").index(name) * config.dim
-        qkv = config.attention_of(last).qkv
-        part = jax.tree.map(lambda x: x[..., here : here + config.dim], qkv)
-        return linear(part, layer_norm(last.norm1, tokens, epsilon=config.norm_epsilon))
+    return shares[:, 1 + config.registers :]
 
 
 def embed(
@@ -563,11 +468,10 @@ def embed(
 ) -> Float[Array, "*batch token dim"]:
     """Embed images: class token, registers and patches, with their positions added if any."""
     *batch, height, width, _ = images.shape
-    rows, columns = config.grid((height, width))
-    size = config.patch_size
-    pixels = images.reshape(*batch, rows, size, columns, size, 3).swapaxes(-4, -3)
-    patches = linear(params.patch_embed, pixels.reshape(*batch, rows * columns, 3 * size**2))
-    class_token, placed = config.add_positions(params, patches, (rows, columns))
+    grid, size = config.grid((height, width)), config.patch_size
+    pixels = images.reshape(*batch, grid[0], size, grid[1], size, 3).swapaxes(-4, -3)
+    patches = linear(params.patch_embed, pixels.reshape(*batch, math.prod(grid), 3 * size**2))
+    class_token, placed = config.add_positions(params, patches, grid)
     first = class_token[None]
     if params.register_tokens is not None:
         first = jnp.concatenate([first, params.register_tokens])
@@ -576,140 +480,128 @@ def embed(
 
 
 def run_blocks(
-    params: ViT,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
+    stacks: Sequence[Block],
+    tokens: TokenBatch,
+    grid: Grid,
     config: VisionTransformer,
     *,
     remat: str = "dots",
-) -> Float[Array, "image token dim"]:
-    """Run all blocks in turn with one compiled body; `remat` is `ModelConfig.remat`."""
-    stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
-    return _run_stacks(stacks, tokens, grid, config, remat=remat, valid=None)[0]
+    valid: Valid = None,
+    count: int | None = None,
+) -> tuple[TokenBatch, list[Block]]:
+    """Run stacks of blocks in turn, each with one compiled body.
 
-
-def _run_stacks(
-    stacks: Sequence[Block],
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
-    config: VisionTransformer,
-    *,
-    remat: str,
-    valid: Bool[Array, " image"] | None,
-) -> tuple[Float[Array, "image token dim"], list[Block]]:
-    """Run stacks of blocks in turn; return the tokens and each stack's running statistics.
-
-    Side adapters have a path beside the blocks, from which the tokens come. After every block its
+    Side adapters have a path of their own, from which the tokens come. After every block its
     adapter takes the sum of both paths. Between the first and the last block the tokens are padded
     as `attention` needs them on this platform.
-    """
-    tokens, length = _padded(tokens, config)
 
-    def body(carry: Carry, layer: Block) -> tuple[Carry, Block]:
-        if isinstance(carry, jax.Array):
-            return train_block(layer, carry, grid, config, valid, length=length)
-        tokens, beside = carry
-        layer_alone = dataclasses.replace(layer, adapter=None)
-        tokens = block(layer_alone, tokens, grid, config, length=length)
-        carry = tokens, _beside(layer, tokens + beside, grid, config, length)
-        return carry, split_statistics(layer)[0]
+    Args:
+        stacks: blocks whose leaves have a leading depth axis.
+        tokens: of a batch of images.
+        grid: rows and columns of patches.
+        config: the backbone's.
+        remat: `ModelConfig.remat`.
+        valid: see `vit`.
+        count: number of first blocks of a single stack that are run; None is all. They are indexed,
+            because a slice of the stack would copy its weights.
+
+    Returns:
+        (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
+    """
+    real = tokens.shape[1]
+    padding = padded_length(real, tokens.dtype, config.dim, config.heads) - real
+    length = real if padding else None
+    tokens = jnp.pad(tokens, ((0, 0), (0, padding), (0, 0))) if padding else tokens
+
+    def body(carry: tuple[Array, Array | None], layer: Block) -> tuple[Any, Block]:
+        tokens, side = carry
+        tokens, statistics = block(layer, tokens, grid, config, length=length, valid=valid)
+        if side is not None:
+            side = side_path(layer, tokens + side, grid, config, length)
+        return (tokens, side), statistics
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=choose("remat", remat, _POLICIES))
+    carry = tokens, tokens if config.adapter.kind == "side" else None
     statistics = []
-    carry: Carry = (tokens, tokens) if config.adapter.kind == "side" else tokens
     with jax.named_scope("blocks"):
         for stack in stacks:
-            carry, measured = jax.lax.scan(body, carry, stack)
-            statistics.append(measured)
-    tokens = carry if isinstance(carry, jax.Array) else carry[1]
-    return tokens[:, :length], statistics
+            if count is None:
+                carry, measured = jax.lax.scan(body, carry, stack)
+                statistics.append(measured)
+            else:
+                carry, _ = jax.lax.scan(
+                    lambda carry, number, stack=stack: body(carry, _layer_at(stack, number)),
+                    carry,
+                    jnp.arange(count),
+                )
+    tokens, side = carry
+    return (tokens if side is None else side)[:, :length], statistics
 
 
-def _padded(
-    tokens: Float[Array, "image token dim"], config: VisionTransformer
-) -> tuple[Float[Array, "image padded dim"], int | None]:
-    """Return tokens with padding after them, and their number; None where none is needed."""
-    count = tokens.shape[1]
-    more = padded_length(count, tokens.dtype, config.dim, config.heads) - count
-    if not more:
-        return tokens, None
-    return jnp.pad(tokens, ((0, 0), (0, more), (0, 0))), count
+def _layer_at(stack: Block, number: Int[Array, ""]) -> Block:
+    return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
 
 
-def _beside(
-    layer: Block,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
-    config: VisionTransformer,
-    length: int | None,
-) -> Float[Array, "image token dim"]:
+def side_path(
+    layer: Block, tokens: TokenBatch, grid: Grid, config: VisionTransformer, length: int | None
+) -> TokenBatch:
     """Apply a block's side adapter, with its skip."""
     assert isinstance(layer.adapter, SideAdapter)
     with jax.named_scope("adapter"):
-        adapted = adapter(layer.adapter, tokens, grid, length=length)
-        update = config.adapter.alpha * at_least_float32(adapted)
-        return (at_least_float32(tokens) + update).astype(tokens.dtype)
+        adapted, _ = adapter(layer.adapter, tokens, grid, length=length)
+        return _residual(tokens, config.adapter.alpha, adapted)
 
 
 def block(
     params: Block,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
+    tokens: TokenBatch,
+    grid: Grid,
     config: VisionTransformer,
     *,
     length: int | None = None,
-) -> Float[Array, "image token dim"]:
-    """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR."""
-    return train_block(params, tokens, grid, config, None, length=length)[0]
-
-
-def train_block(
-    params: Block,
-    tokens: Float[Array, "image token dim"],
-    grid: tuple[int, int],
-    config: VisionTransformer,
-    valid: Bool[Array, " image"] | None,
-    *,
-    length: int | None = None,
-) -> tuple[Float[Array, "image token dim"], Block]:
-    """Run one block on a training batch.
+    valid: Valid = None,
+) -> tuple[TokenBatch, Block]:
+    """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR.
 
     Args:
-        params: the block.
+        params: the block, without its side adapter if it has one.
         tokens: of a batch of images.
         grid: rows and columns of patches.
-        config: the backbone.
-        valid: which images the batch norms' statistics are taken of; None takes the stored ones.
-        length: number of first tokens that are no padding; None is all.
+        config: the backbone's.
+        length: number of first tokens that are not padding; None is all.
+        valid: images that the batch norms' statistics are taken of; None takes the stored ones.
 
     Returns:
-        (tokens, statistics): the second as `train_vit` returns it.
+        (tokens, statistics): the second has the running statistics, and None for all else.
     """
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
     attn, rotation = config.attention_of(params), config.rotation(grid)
-    attended = attention(attn, normed, config.heads, length=length, rotation=rotation, key=None)
-    beside = params.adapter
-    if isinstance(beside, SerialParallelAdapter):
+    attended = attention(attn, normed, config.heads, length=length, rotation=rotation)
+    parallel = params.adapter
+    if isinstance(parallel, SerialParallelAdapter):
         with jax.named_scope("adapter"):
-            attended = attended + adapter(beside.serial, attended, grid, length=length)
-        beside = beside.parallel
-    tokens = (at_least_float32(tokens) + params.ls1 * at_least_float32(attended)).astype(
-        tokens.dtype
-    )
-    tokens = checkpoint_name(tokens, "attended")
+            attended = attended + adapter(parallel.serial, attended, grid, length=length)[0]
+        parallel = parallel.parallel
+    tokens = checkpoint_name(_residual(tokens, params.ls1, attended), "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
     update = feed_forward(params.mlp, normed)
-    if beside is not None:
+    if parallel is not None and not isinstance(parallel, SideAdapter):
         with jax.named_scope("adapter"):
-            if valid is None or isinstance(params.adapter, SerialParallelAdapter):
-                adapted = adapter(beside, normed, grid, length=length)
-            else:
-                adapted, trained = train_adapter(beside, normed, grid, valid, length=length)
-                params = dataclasses.replace(params, adapter=trained)
+            adapted, updated = adapter(parallel, normed, grid, length=length, valid=valid)
             update = update + config.adapter.alpha * adapted
-    tokens = (at_least_float32(tokens) + params.ls2 * at_least_float32(update)).astype(tokens.dtype)
-    return tokens, split_statistics(params)[0]
+        if updated is not parallel:
+            params = dataclasses.replace(params, adapter=updated)
+    return _residual(tokens, params.ls2, update), split_statistics(params)[0]
+
+
+def _residual(
+    tokens: Float[Array, "*batch dim"],
+    gain: float | Float[Array, " dim"],
+    update: Float[Array, "*batch dim"],
+) -> Float[Array, "*batch dim"]:
+    total = at_least_float32(tokens) + gain * at_least_float32(update)
+    return total.astype(tokens.dtype)
 
 
 def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
@@ -727,7 +619,7 @@ def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[A
 
 
 def interpolate_positions(
-    positions: Float[Array, "grid grid dim"], grid: tuple[int, int], config: ViTConfig
+    positions: Float[Array, "grid grid dim"], grid: Grid, config: ViTConfig
 ) -> Float[Array, "rows columns dim"]:
     """Resize the stored grid of position embeddings as the public models do.
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from crisalad_jax.nn.aggregators.netvlad import NetVlad, shares
+from crisalad_jax.nn.aggregators.vlad import NetVlad, shares
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.layers import at_least_float32, l2_normalise
 from crisalad_jax.nn.model import Crisalad, Images, unit_features

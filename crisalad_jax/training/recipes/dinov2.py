@@ -10,7 +10,7 @@ from typing import Any
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.selavpr import SelaVprLoss
+from crisalad_jax.losses.pairwise import SelaVprLoss
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig

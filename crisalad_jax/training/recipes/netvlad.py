@@ -4,7 +4,7 @@ import dataclasses
 
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.triplet import TripletConfig
+from crisalad_jax.losses.pairwise import TripletConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig

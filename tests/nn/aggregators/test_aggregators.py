@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
-from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
-from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid, GemPyramidConfig, gem_pyramid
+from crisalad_jax.nn.aggregators.gem import Gem, GemPyramidConfig, gem_pyramid
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -32,14 +32,12 @@ DIMENSION_FIRST = {"boq", "conv-ap", "edtformer", "fol", "mixvpr", "salad"}
 
 
 @pytest.mark.parametrize("name", REGISTRIES["aggregator"])
-def test_a_batch_has_each_images_order(name: str) -> None:
-    """`local.T` of a batch swapped its images with its dimensions."""
+def test_descriptors_have_the_published_order(name: str) -> None:
     aggregator = REGISTRIES["aggregator"].make(name)
-    batch = np.arange(24.0).reshape(2, 3, 4)
-    expected = np.stack([aggregator.order(jnp.asarray(tokens)) for tokens in batch])
-    np.testing.assert_array_equal(aggregator.order(jnp.asarray(batch)), expected)
-    first = [0, 4, 8, 1] if name in DIMENSION_FIRST else [0, 1, 2, 3]
-    assert expected[0].ravel()[:4].tolist() == first
+    tokens = Tokens.of_local(jnp.arange(12.0).reshape(3, 4))
+    first = np.array([0, 4, 8, 1] if name in DIMENSION_FIRST else [0, 1, 2, 3])
+    # Divided by the root of 0 + 1 + 4 ... + 121.
+    np.testing.assert_allclose(to_descriptor(tokens, aggregator)[:4], first / 506**0.5, rtol=1e-6)
 
 
 def test_a_pyramids_descriptor_is_region_after_region() -> None:
@@ -59,7 +57,7 @@ def test_a_pyramids_descriptor_is_region_after_region() -> None:
 @pytest.mark.parametrize("exponent", [3.0, 1.7])
 def test_the_pyramid_is_torchs_pooling_of_its_regions(grid, cuts, exponent: float) -> None:
     patches = np.random.default_rng(0).normal(size=(grid[0] * grid[1], 20)).astype(np.float32)
-    found = gem_pyramid(GemPyramid(jnp.asarray(exponent)), jnp.asarray(patches), grid)
+    found = gem_pyramid(jnp.asarray(patches), jnp.asarray(exponent), grid)
     maps = torch.nn.functional.normalize(torch.tensor(patches).T.reshape(1, 20, *grid), dim=1)
     regions = [
         torch.nn.functional.lp_pool2d(
@@ -80,7 +78,7 @@ def test_the_pyramid_is_torchs_pooling_of_its_regions(grid, cuts, exponent: floa
 
 def test_the_pyramid_starts_at_the_published_exponent() -> None:
     pyramid = GemPyramidConfig().init(KEY, VIT, (16, 16))
-    assert isinstance(pyramid, GemPyramid)
+    assert isinstance(pyramid, Gem)
     assert (pyramid.p.shape, float(pyramid.p)) == ((), 3.0)  # CricaVPR's GeM(p=3)
 
 

@@ -8,7 +8,7 @@ import torch
 from torch.nn import functional as F
 
 from crisalad_jax.nn.aggregators.base import to_descriptor
-from crisalad_jax.nn.aggregators.cosplace import CosPlace, CosPlaceConfig
+from crisalad_jax.nn.aggregators.gem import CosPlace, CosPlaceConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.layers import Linear

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.fol import FolConfig, dustbin_scores
-from crisalad_jax.nn.backbones import Backbone
+from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -33,8 +32,16 @@ IMAGES = np.random.default_rng(0).integers(0, 256, (2, 42, 56, 3), np.uint8)
 
 
 def test_attention_is_cut_at_the_published_threshold() -> None:
-    found = dustbin_scores(jnp.array([0.0, 0.00999, 0.01, 0.3, 2.5]))
-    np.testing.assert_allclose(found, [1, 1, 0.99, 0.7, -1.5], atol=1e-6)  # float32's roundings
+    params = random_params(CONFIG)
+    features = extract_features(params, IMAGES, CONFIG)
+    aggregator: Any = CONFIG.aggregator
+
+    def plan(share: float) -> jax.Array:
+        attention = jnp.zeros((2, 12)).at[:, 3].set(share)
+        return aggregator.plan(params.aggregator, features._replace(class_attention=attention))
+
+    np.testing.assert_array_equal(plan(0.00999), plan(0.0))
+    assert (plan(0.01)[:, 3, -1] < plan(0.0)[:, 3, -1]).all()
 
 
 def test_a_patch_that_is_looked_at_keeps_more_of_its_mass() -> None:
@@ -77,17 +84,21 @@ def test_the_descriptors_gradient_reaches_the_attention() -> None:
 
 
 def test_backbones_without_that_attention_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match="found resnet, which has no class token"):
+    with pytest.raises(
+        InputError, match="found resnet for aggregator fol, expected one with a class token"
+    ):
         dataclasses.replace(CONFIG, backbone=ResNetConfig())
-    monkeypatch.setattr(type(CONFIG.backbone), "attends", Backbone.attends)
-    with pytest.raises(InputError, match="found vit for aggregator fol, expected one whose class"):
+    monkeypatch.setattr(type(CONFIG.backbone), "exposes_cls_attention", False)
+    with pytest.raises(
+        InputError, match="found vit for aggregator fol, expected one with a class token that"
+    ):
         dataclasses.replace(CONFIG)
 
 
 def test_not_beside_side_adapters() -> None:
     backbone = dataclasses.replace(CONFIG.backbone, adapter=AdapterConfig(kind="side"))
     config = dataclasses.replace(CONFIG, backbone=backbone)
-    with pytest.raises(InputError, match=r"found the class token's attention with .* adapters"):
+    with pytest.raises(InputError, match="found the class token's attention and adapters"):
         jax.eval_shape(lambda p: describe(p, IMAGES, config), parameter_shapes(config))
 
 

@@ -113,11 +113,12 @@ def test_the_published_dustbin_is_dead_and_others_live(dustbin: str, live: bool)
     sinkhorn = SinkhornConfig(domain="log")
     config = dataclasses.replace(CONFIG, dustbin=dustbin, sinkhorn=sinkhorn)
     params = init_salad(config)
-    patches = 20 * features(30).patches
+    sharp = features(30)
+    sharp = sharp._replace(patches=20 * sharp.patches)
 
     def lost(dust_bin: jax.Array) -> jax.Array:
         replaced = dataclasses.replace(params, dust_bin=dust_bin)
-        log_plan = config.transport(replaced, patches, key=None).log_plan
+        log_plan = config.transport(replaced, sharp, key=None).log_plan
         return jnp.sin(3 * jnp.exp(log_plan)).sum()
 
     gradient = abs(float(jax.grad(lost)(jnp.float32(1))))
@@ -130,12 +131,12 @@ def test_a_dustbin_score_a_patch_is_the_networks_own_column() -> None:
     params = init_salad(config)
     assert params.dust_bin is None
     assert params.score.fc2.weight.shape == (16, 4)
-    patches = features(10).patches
+    given = features(10)
 
     def plan(weight: jax.Array) -> jax.Array:
         second = dataclasses.replace(params.score.fc2, weight=weight)
         whole = dataclasses.replace(params, score=dataclasses.replace(params.score, fc2=second))
-        return jnp.exp(config.transport(whole, patches, key=None).log_plan)
+        return jnp.exp(config.transport(whole, given, key=None).log_plan)
 
     weight = params.score.fc2.weight
     np.testing.assert_allclose(plan(weight).sum(axis=1), 1, atol=1e-5)  # rows are met last
@@ -159,15 +160,16 @@ def test_statistics_are_those_of_the_plan(fields) -> None:
 
     @jax.jit
     def both(patches: jax.Array):
-        log_plan = config.transport(params, patches, key=None).log_plan
-        return salad(params, Features(patches[:, 0], patches), config, key=None).transport, log_plan
+        given = Features(patches[:, 0], patches)
+        log_plan = config.transport(params, given, key=None).log_plan
+        return salad(params, given, config, key=None).transport, log_plan
 
     found, log_plan = both(patches)
     plan = np.exp(np.asarray(log_plan, np.float64))
     # Three clusters of mass 1, and the dustbin has what is left of ten patches.
     errors = np.abs(plan.sum(axis=1) / np.array([1, 1, 1, 7]) - 1).max(axis=1)
     # float32 rounding of sums of ten masses, relative to 1; the errors themselves are some 0.1.
-    np.testing.assert_allclose(found.column_error, errors, atol=3e-6)
+    np.testing.assert_allclose(found.marginal_error, errors, atol=3e-6)
     # The same rounding, of ratios and logarithms of order 1.
     binned = plan[..., 3].sum(axis=1) / plan.sum(axis=(1, 2))
     np.testing.assert_allclose(found.dustbin_share, binned, rtol=1e-5)

@@ -49,7 +49,7 @@ def test_a_models_last_level_is_its_backbones_last_layer() -> None:
     features = extract_features(params, images, CONFIG)
     assert features.patches.shape == (2, 12, 3 * 16)
     # The same sums, compiled twice, of numbers of order 1.
-    last = vit(params.backbone, images, CONFIG.backbone)
+    last, _ = vit(params.backbone, images, CONFIG.backbone)
     np.testing.assert_allclose(features.patches[..., -16:], last.patches, atol=1e-5)
     np.testing.assert_allclose(features.class_token, last.class_token, atol=1e-5)
     descriptors = describe(params, images, CONFIG)

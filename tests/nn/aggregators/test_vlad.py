@@ -9,17 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
-from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig, hard_vlad
-from crisalad_jax.nn.aggregators.netvlad import (
+from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
+from crisalad_jax.nn.aggregators.vlad import (
+    AnyLoc,
+    AnyLocConfig,
     NetVlad,
     NetVladConfig,
+    SuperVladConfig,
+    VladBuffConfig,
+    hard_vlad,
     netvlad,
     scores_from_centroids,
 )
-from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
-from crisalad_jax.nn.aggregators.vlad_buff import VladBuffConfig
-from crisalad_jax.nn.backbones.base import FeatureRequest, Features
+from crisalad_jax.nn.backbones.base import Features, FeatureSpec
 from crisalad_jax.nn.backbones.vit import ViTConfig, vit
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -190,9 +192,9 @@ def test_a_facet_looks_at_no_block_after_its_own() -> None:
 
     @functools.partial(jax.jit, static_argnums=2)
     def run(params: Any, images: jax.Array, name: Any) -> Features:
-        return vit(params, images, VIT, AnyLocConfig(layer=1, facet=name).features(VIT.depth))
+        return vit(params, images, VIT, AnyLocConfig(layer=1, facet=name).features(VIT.depth))[0]
 
-    assert AnyLocConfig(layer=1).features(3) == FeatureRequest((2,), "value", norm=False)
+    assert AnyLocConfig(layer=1).features(3) == FeatureSpec((2,), "value", norm=False)
     for name, blocks in (("value", beyond), ("token", spoilt)):
         found = run(dataclasses.replace(params, blocks=blocks), images, name)
         expected = run(params, images, name)

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.aggregators.netvlad import NetVlad, netvlad
-from crisalad_jax.nn.aggregators.vlad_buff import (
+from crisalad_jax.nn.aggregators.vlad import (
     BURST,
+    NetVlad,
     VladBuff,
     VladBuffConfig,
     burst_weights,
+    netvlad,
     vlad_buff,
 )
 from crisalad_jax.nn.layers import init_linear, l2_normalise

@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from crisalad_jax.nn.aggregators.anyloc import AnyLocConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones import stages
-from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest
+from crisalad_jax.nn.backbones.base import Backbone, FeatureSpec
 from crisalad_jax.nn.backbones.resnet import Layers, ResNetConfig
 from crisalad_jax.nn.backbones.stages import StagedBackbone
 from crisalad_jax.nn.backbones.vgg import VggConfig
@@ -46,7 +46,7 @@ def macs(backbone: StagedBackbone) -> int:
     """Multiply-accumulates of one image of 224 x 224."""
     params = jax.eval_shape(backbone.init, jax.random.key(0))
     image = jax.ShapeDtypeStruct((1, 224, 224, 3), jnp.float32)
-    apply = lambda p, x: backbone.apply(p, x, FeatureRequest(), remat="none").patches  # noqa: E731
+    apply = lambda p, x: backbone.apply(p, x, FeatureSpec(), remat="none")[0].patches  # noqa: E731
     return count_macs(apply, params, image)
 
 
@@ -90,7 +90,7 @@ def test_vgg_16_has_the_published_parameters_and_work() -> None:
 def test_the_grid_is_that_of_the_features(backbone: StagedBackbone, size: tuple[int, int]) -> None:
     params = jax.eval_shape(backbone.init, jax.random.key(0))
     images = jax.ShapeDtypeStruct((2, *size, 3), jnp.float32)
-    apply = lambda p, x: backbone.apply(p, x, FeatureRequest(), remat="none")  # noqa: E731
+    apply = lambda p, x: backbone.apply(p, x, FeatureSpec(), remat="none")[0]  # noqa: E731
     features = jax.eval_shape(apply, params, images)
     assert features.patches.shape == (2, math.prod(backbone.grid(size)), backbone.dim)
     assert features.class_token.shape == (2, 0)
@@ -198,7 +198,8 @@ def test_parts_add_up() -> None:
 
 
 def test_what_needs_a_class_token_refuses_them() -> None:
-    with pytest.raises(InputError, match=r"found resnet, which has no class token.*aggregator sal"):
+    words = "found resnet for aggregator salad, expected one with a class token"
+    with pytest.raises(InputError, match=words):
         ModelConfig(backbone="resnet", cross_image=BARE)
 
 
@@ -224,7 +225,7 @@ def test_a_batch_in_parts_is_the_whole_batch(monkeypatch: pytest.MonkeyPatch) ->
     found = {}
     for parts in (1, 3, 6):
         monkeypatch.setattr(stages, "parts_for_caches", lambda images, at_once, n=parts: n)
-        apply = jax.jit(lambda p, x: SMALL.backbone.apply(p, x, FeatureRequest(), remat="none"))
+        apply = jax.jit(lambda p, x: SMALL.backbone.apply(p, x, FeatureSpec(), remat="none")[0])
         assert apply.trace(params.backbone, images).jaxpr.pretty_print().count(" scan[") == (
             parts > 1
         )

@@ -10,11 +10,11 @@ import pytest
 
 from crisalad_jax.checkpoints.formats import check_holds, infer, public_shapes, to_params, to_state
 from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
+from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import rotate
-from crisalad_jax.nn.backbones import FeatureRequest, Features
+from crisalad_jax.nn.backbones import Features, FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config, rotary_angles
 from crisalad_jax.nn.backbones.vit import ViT, vit
 from crisalad_jax.nn.config import ModelConfig
@@ -108,12 +108,12 @@ def with_key_bias(params: ViT, value: jax.Array) -> ViT:
 
 def test_keys_have_no_bias() -> None:
     """Whatever the parameters hold, of features and of facets."""
-    requests = FeatureRequest(), FeatureRequest((2,), "key")
+    requests = FeatureSpec(), FeatureSpec((2,), "key")
 
     @jax.jit
     def features(value: Any) -> list[Features]:
         params = with_key_bias(PARAMS.backbone, value)
-        return [vit(params, images(), CONFIG, request) for request in requests]
+        return [vit(params, images(), CONFIG, request)[0] for request in requests]
 
     jax.tree.map(np.testing.assert_array_equal, features(0.0), features(5.0))
 
@@ -123,7 +123,7 @@ def test_inserted_tokens_have_no_place() -> None:
     tokens = jax.random.normal(jax.random.key(1), (4, 32))
     order = jnp.array([2, 0, 3, 1])
     first, second = (
-        vit(PARAMS.backbone, images(), CONFIG, FeatureRequest(insertion=1, inserted=each))
+        vit(PARAMS.backbone, images(), CONFIG, FeatureSpec(insertion=1, inserted=each))[0]
         for each in (tokens, tokens[order])
     )
     # The same sums in another order, through two blocks.

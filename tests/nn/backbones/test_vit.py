@@ -12,10 +12,11 @@ import torch
 from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.adapter import AdapterConfig, MlpAdapter
 from crisalad_jax.nn.attention import attention
-from crisalad_jax.nn.backbones.base import FeatureRequest
+from crisalad_jax.nn.backbones.base import FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import (
     NORM_EPSILON,
+    Block,
     SwiGlu,
     VisionTransformer,
     ViT,
@@ -23,7 +24,6 @@ from crisalad_jax.nn.backbones.vit import (
     block,
     embed,
     feed_forward,
-    init_vit,
     interpolate_positions,
     run_blocks,
     vit,
@@ -64,7 +64,7 @@ def test_positions_equal_torch_interpolate(
 def test_swiglu_equals_torch() -> None:
     config = ViTConfig(dim=12, depth=1, heads=2, ffn="swiglu", position_grid=2)
     assert config.hidden == 32  # two thirds of 48, a multiple of 8
-    params = jax.tree.map(lambda leaf: leaf[0], init_vit(jax.random.key(0), config).blocks)
+    params = jax.tree.map(lambda leaf: leaf[0], config.init(jax.random.key(0)).blocks)
     assert isinstance(params.mlp, SwiGlu)
     x = 10 * jax.random.normal(jax.random.key(1), (5, 12))
     t = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf)), params.mlp)
@@ -81,7 +81,7 @@ def test_the_published_hidden_width_of_vit_g() -> None:
 
 def test_patches_are_read_in_row_order() -> None:
     """One bright pixel changes only the patch it lies in."""
-    params = init_vit(jax.random.key(0), CONFIG)
+    params = CONFIG.init(jax.random.key(0))
     dark = jnp.zeros((42, 56, 3))
     lit = dark.at[15, 29, 1].set(1.0)  # second row of patches, third column
     change = jnp.abs(embed(params, lit, CONFIG) - embed(params, dark, CONFIG)).max(axis=1)
@@ -95,30 +95,31 @@ def test_patches_are_read_in_row_order() -> None:
 
 
 def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
-    params = init_vit(jax.random.key(0), CONFIG)
+    params = CONFIG.init(jax.random.key(0))
     parts = (
         jax.tree.map(lambda leaf: leaf[:1], params.blocks),
         jax.tree.map(lambda leaf: leaf[1:], params.blocks),
     )
     cut = dataclasses.replace(params, blocks=parts)
-    ours, theirs = vit(cut, images(1, 28, 42), CONFIG), vit(params, images(1, 28, 42), CONFIG)
+    ours, theirs = (vit(each, images(1, 28, 42), CONFIG)[0] for each in (cut, params))
     for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
 
 
 def test_an_untrained_adapter_leaves_the_backbone_unchanged() -> None:
-    params = init_vit(jax.random.key(0), CONFIG)
+    params = CONFIG.init(jax.random.key(0))
     bare_blocks = dataclasses.replace(params.blocks, adapter=None)
     bare = dataclasses.replace(params, blocks=bare_blocks)
     config = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="none"))
-    ours, theirs = vit(params, images(1, 28, 42), CONFIG), vit(bare, images(1, 28, 42), config)
+    ours, _ = vit(params, images(1, 28, 42), CONFIG)
+    theirs, _ = vit(bare, images(1, 28, 42), config)
     for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
 def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
     """x + ls2 * (MLP + alpha * adapter): tripling alpha triples the adapter's share."""
-    params = init_vit(jax.random.key(0), dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5))
+    params = dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5).init(jax.random.key(0))
     up = jax.random.normal(jax.random.key(1), params.blocks.adapter.up.weight.shape)
     blocks = dataclasses.replace(
         params.blocks,
@@ -126,21 +127,16 @@ def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
             params.blocks.adapter, up=dataclasses.replace(params.blocks.adapter.up, weight=up)
         ),
     )
-    params = dataclasses.replace(params, blocks=blocks)
     tokens = jax.random.normal(jax.random.key(2), (1, 1 + 6, 16))
-    out = [
-        run_blocks(
-            params, tokens, (2, 3), dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=alpha))
-        )
-        for alpha in (0.0, 0.2, 0.6)
-    ]
+
+    def run(blocks: Block, alpha: float) -> jax.Array:
+        config = dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=alpha))
+        return run_blocks([blocks], tokens, (2, 3), config)[0]
+
+    out = [run(blocks, alpha) for alpha in (0.0, 0.2, 0.6)]
     np.testing.assert_allclose(out[2] - out[0], 3 * (out[1] - out[0]), atol=1e-5)
     doubled = dataclasses.replace(blocks, ls2=2 * blocks.ls2)
-    config = dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=0.2))
-    more = [
-        run_blocks(dataclasses.replace(params, blocks=doubled), tokens, (2, 3), c)
-        for c in (dataclasses.replace(CONFIG, adapter=AdapterConfig(alpha=0.0)), config)
-    ]
+    more = [run(doubled, alpha) for alpha in (0.0, 0.2)]
     np.testing.assert_allclose(more[1] - more[0], 2 * (out[1] - out[0]), atol=1e-5)
 
 
@@ -148,7 +144,7 @@ def test_serial_and_parallel_adapters_by_hand() -> None:
     """x' = x + ls1 * (a + S(a)) of attention a; x' + ls2 * (MLP + 0.2 P) of the normed x'."""
     kind = AdapterConfig(kind="serial-parallel")
     config = dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5, adapter=kind)
-    layer = jax.tree.map(lambda leaf: leaf[0], init_vit(jax.random.key(0), config).blocks)
+    layer = jax.tree.map(lambda leaf: leaf[0], config.init(jax.random.key(0)).blocks)
     key = jax.random.key(1)
     adapters = jax.tree.map(lambda leaf: jax.random.normal(key, leaf.shape), layer.adapter)
     tokens = jax.random.normal(jax.random.key(2), (1, 7, 16))
@@ -160,11 +156,11 @@ def test_serial_and_parallel_adapters_by_hand() -> None:
     def normed(norm: LayerNorm, x: jax.Array) -> jax.Array:
         return layer_norm(norm, x, epsilon=NORM_EPSILON)
 
-    a = attention(layer.attn, normed(layer.norm1, tokens), 2, key=None)
+    a = attention(layer.attn, normed(layer.norm1, tokens), 2)
     middle = tokens + 0.5 * (a + mlp(adapters.serial, a))
     y = normed(layer.norm2, middle)
     expected = middle + 0.5 * (feed_forward(layer.mlp, y) + 0.2 * mlp(adapters.parallel, y))
-    found = block(dataclasses.replace(layer, adapter=adapters), tokens, (2, 3), config)
+    found, _ = block(dataclasses.replace(layer, adapter=adapters), tokens, (2, 3), config)
     # Sums of at most 16 products of order 10.
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
 
@@ -174,7 +170,7 @@ SIDE = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="side", alpha=0.5)
 
 def test_side_adapters_take_the_sum_of_both_paths() -> None:
     """The trunk is that of no adapters; y = z + alpha A(z) of z = x + y, a block at a time."""
-    params = init_vit(jax.random.key(0), SIDE)
+    params = SIDE.init(jax.random.key(0))
     up = params.blocks.adapter.up
     up = dataclasses.replace(up, weight=jax.random.normal(jax.random.key(1), up.weight.shape))
     changed = dataclasses.replace(params.blocks.adapter, up=up)
@@ -183,32 +179,47 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
     trunk, beside = tokens, tokens
     for i in range(CONFIG.depth):
         layer = jax.tree.map(lambda leaf, i=i: leaf[i], params.blocks)
-        trunk = block(dataclasses.replace(layer, adapter=None), trunk, (2, 3), CONFIG)
+        trunk, _ = block(dataclasses.replace(layer, adapter=None), trunk, (2, 3), CONFIG)
         t = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf)), layer.adapter)
         z = torch.tensor(np.asarray(trunk + beside))
         hidden = torch.nn.functional.gelu(z @ t.down.weight + t.down.bias)
         beside = (z + 0.5 * (hidden @ t.up.weight + t.up.bias)).numpy()
-    found = run_blocks(params, tokens, (2, 3), SIDE)
+    found, _ = run_blocks([params.blocks], tokens, (2, 3), SIDE)
     # Sums of up to 16 numbers of order 10, three blocks deep.
     np.testing.assert_allclose(found, beside, rtol=1e-5, atol=2e-5)
-    cut = SIDE.split_blocks(params, 1)
-    np.testing.assert_array_equal(run_blocks(cut, tokens, (2, 3), SIDE), found)
+    cut = SIDE.split_blocks(params, 1).blocks
+    np.testing.assert_array_equal(run_blocks(cut, tokens, (2, 3), SIDE)[0], found)
 
 
-def test_side_adapters_have_tokens_after_the_last_block_alone() -> None:
-    params = jax.eval_shape(lambda: init_vit(jax.random.key(0), SIDE))
-    for levels in ((1,), (2, 3)):
-        with pytest.raises(InputError, match="beside the blocks, expected the last alone, 3"):
-            jax.eval_shape(
-                lambda p, x, levels=levels: vit(p, x, SIDE, FeatureRequest(levels)),
-                params,
-                images(1, 28, 42),
-            )
+@pytest.mark.parametrize(
+    ("config", "request_", "words"),
+    [
+        (SIDE, FeatureSpec((1,)), "levels or a facet and adapters on a side path, expected one"),
+        (SIDE, FeatureSpec((2, 3)), "levels or a facet and adapters on a side path, expected one"),
+        (
+            CONFIG,
+            FeatureSpec((2,), class_attention=True),
+            "levels or a facet and the class token's",
+        ),
+        (CONFIG, FeatureSpec((1, 2), "key"), r"found \(1, 2\), expected one for the facet key"),
+        (
+            CONFIG,
+            FeatureSpec((2, 1)),
+            r"found \(2, 1\), expected numbers of blocks in order, 1 to 3",
+        ),
+    ],
+)
+def test_requests_that_cannot_be_met_are_refused(
+    config: ViTConfig, request_: FeatureSpec, words: str
+) -> None:
+    params = jax.eval_shape(config.init, jax.random.key(0))
+    with pytest.raises(InputError, match=words):
+        jax.eval_shape(lambda p, x: vit(p, x, config, request_), params, images(1, 28, 42))
 
 
 def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None:
     config = dataclasses.replace(CONFIG, position_init="sincos", dim=64)
-    code = init_vit(jax.random.key(0), config).pos_embed.reshape(25, 64)
+    code = config.init(jax.random.key(0)).pos_embed.reshape(25, 64)
     similarity = np.asarray(code @ code.T)
     # sin^2 + cos^2 = 1 for each of 64 / 4 frequencies, of rows and of columns.
     np.testing.assert_allclose(np.diag(similarity), 32, rtol=1e-5)
@@ -218,13 +229,13 @@ def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None
 
 @pytest.mark.parametrize("depths", [(1, 2, 3), (2, 3), (3,)])
 def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, ...]) -> None:
-    params = init_vit(jax.random.key(0), CONFIG)
+    params = CONFIG.init(jax.random.key(0))
     expected = [
         vit(
             dataclasses.replace(params, blocks=jax.tree.map(lambda x, d=d: x[:d], params.blocks)),
             images(1, 28, 42),
             CONFIG,
-        )
+        )[0]
         for d in depths
     ]
     two = tuple(
@@ -232,7 +243,7 @@ def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, 
     )
     for blocks in (params.blocks, two):  # as it stands, and as training cuts it
         whole = dataclasses.replace(params, blocks=blocks)
-        found = vit(whole, images(1, 28, 42), CONFIG, FeatureRequest(depths))
+        found, _ = vit(whole, images(1, 28, 42), CONFIG, FeatureSpec(depths))
         # The same sums, compiled twice.
         np.testing.assert_allclose(found.class_token, expected[-1].class_token, atol=1e-6)
         patches = np.concatenate([features.patches for features in expected], axis=-1)
@@ -243,12 +254,12 @@ HALF = ViTConfig(dim=32, depth=2, heads=2, position_grid=3)
 """Of heads of 16, which cuDNN takes; 3 x 4 patches and a class token are padded to 16 tokens."""
 INSERTED = jax.random.normal(jax.random.key(9), (2, 32))
 REQUESTS = {
-    "the last tokens": FeatureRequest(),
-    "two levels": FeatureRequest((1, 2)),
-    "a level before the last": FeatureRequest((1,)),
-    "keys": FeatureRequest((2,), "key", norm=False),
-    "class attention": FeatureRequest(class_attention=True),
-    "inserted tokens": FeatureRequest(insertion=1, inserted=INSERTED),
+    "the last tokens": FeatureSpec(),
+    "two levels": FeatureSpec((1, 2)),
+    "a level before the last": FeatureSpec((1,)),
+    "keys": FeatureSpec((2,), "key", norm=False),
+    "class attention": FeatureSpec(class_attention=True),
+    "inserted tokens": FeatureSpec(insertion=1, inserted=INSERTED),
 }
 KINDS = ("depthwise", "multi-resolution", "serial-parallel", "side", "none")
 
@@ -296,7 +307,7 @@ def test_padding_for_cudnn_changes_no_feature(
 
     def features(chosen: Target) -> list[np.ndarray]:
         with lowering_for(chosen):
-            found = vit(params, pixels, config, REQUESTS[name])
+            found, _ = vit(params, pixels, config, REQUESTS[name])
         return [np.asarray(leaf, np.float32) for leaf in jax.tree.leaves(found)]
 
     expected, found = features(CPU), features(GPU)
@@ -325,9 +336,9 @@ def test_a_tpus_kernel_changes_no_feature(monkeypatch: pytest.MonkeyPatch, name:
         REQUESTS[name], inserted=None if REQUESTS[name].inserted is None else inserted
     )
     params, pixels = fresh(config), images(2, 42, 56)
-    expected = vit(params, pixels, config, request)
+    expected, _ = vit(params, pixels, config, request)
     with lowering_for(TPU), jax.default_matmul_precision("highest"):
-        found = vit(params, pixels, config, request)
+        found, _ = vit(params, pixels, config, request)
     assert called
     assert {shape.shape for shape in called} == {(2, 16, 128)}
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):

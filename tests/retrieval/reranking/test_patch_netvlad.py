@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.aggregators.netvlad import NetVlad, NetVladConfig
+from crisalad_jax.nn.aggregators.vlad import NetVlad, NetVladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig

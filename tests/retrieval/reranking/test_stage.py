@@ -11,9 +11,9 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
+from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.projection import ProjectionConfig

@@ -1,4 +1,4 @@
-"""ImAge: learnt tokens that the backbone's last blocks aggregate into (Lu et al., 2025)."""
+"""Tokens that the backbone itself makes: its class token, or learnt ones that run through it."""
 
 import dataclasses
 from typing import ClassVar
@@ -6,13 +6,37 @@ from typing import ClassVar
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_positive
-from crisalad_jax.nn import draw
-from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
-from crisalad_jax.nn.aggregators.netvlad import scores_from_centroids
-from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import (
+    AGGREGATORS,
+    Aggregator,
+    Centroids,
+    FeatureRows,
+    TokenShape,
+)
+from crisalad_jax.nn.aggregators.vlad import scores_from_centroids
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
 from crisalad_jax.nn.layers import Keys, at_least_float32
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@AGGREGATORS.register("class-token")
+@dataclasses.dataclass(frozen=True)
+class ClassTokenConfig(Aggregator):
+    """The backbone's class token, by itself (Oquab et al. 2023)."""
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the class token."""
+        return FeatureSpec(class_token=True)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of a global token as wide as the backbone."""
+        return TokenShape(dim, 0, dim)
+
+    def apply(self, params: None, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the class token as it is."""
+        return Tokens.of_global(at_least_float32(features.class_token))
 
 
 @pytree_dataclass
@@ -46,7 +70,7 @@ class AggregationTokensConfig(Aggregator):
         """Check the ranges."""
         require_positive(self, "tokens")
 
-    def features(self, depth: int) -> FeatureRequest:
+    def features(self, depth: int) -> FeatureSpec:
         """Request that the tokens run through the blocks from `insertion`.
 
         Raises:
@@ -57,21 +81,17 @@ class AggregationTokensConfig(Aggregator):
             f"AggregationTokensConfig.insertion: found {self.insertion}, expected {-depth} to "
             f"{depth - 1} for a backbone of {depth} blocks",
         )
-        return FeatureRequest(insertion=self.insertion % depth)
+        return FeatureSpec(insertion=self.insertion % depth)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of the tokens."""
         return TokenShape(0, self.tokens, dim)
 
-    def init(
-        self, key: PRNGKeyArray, backbone: Backbone, grid: tuple[int, int]
-    ) -> AggregationTokens:
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> AggregationTokens:
         """Draw tokens of deviation 1e-6, as published; `from_centroids` replaces them."""
-        return AggregationTokens(draw.normal(key, (self.tokens, backbone.dim), scale=1e-6))
+        return AggregationTokens(random_init.normal(key, (self.tokens, backbone.dim), scale=1e-6))
 
-    def from_centroids(
-        self, centroids: Float[Array, "cluster dim"], features: Float[Array, "feature dim"]
-    ) -> AggregationTokens:
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> AggregationTokens:
         """Make tokens as the authors do: centroids of the length of NetVLAD's first scores."""
         return AggregationTokens(scores_from_centroids(centroids, features).weight.T)
 
@@ -80,12 +100,7 @@ class AggregationTokensConfig(Aggregator):
         return params.tokens
 
     def apply(
-        self,
-        params: AggregationTokens,
-        features: Features,
-        grid: tuple[int, int],
-        *,
-        key: Keys | None,
+        self, params: AggregationTokens, features: Features, grid: Grid, *, key: Keys | None
     ) -> Tokens:
         """Return the tokens as the backbone's last layer norm leaves them."""
         assert features.inserted is not None

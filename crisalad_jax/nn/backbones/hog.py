@@ -4,10 +4,18 @@ import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.nn.backbones.base import BACKBONES, Backbone, FeatureRequest, Features
+from crisalad_jax.nn.backbones.base import (
+    BACKBONES,
+    Backbone,
+    Features,
+    FeatureSpec,
+    Grid,
+    Pixels,
+    Valid,
+)
 
 _SIDE = 128
 _CELL = 8
@@ -40,7 +48,7 @@ class HogConfig(Backbone):
             f"HogConfig: found dim {self.dim} and depth {self.depth}, expected {_DIM} and 1",
         )
 
-    def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
+    def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return 1 x 1: the whole image is one patch."""
         height, width = image_size
         require(
@@ -53,13 +61,8 @@ class HogConfig(Backbone):
         """Return no parameters."""
 
     def apply(
-        self,
-        params: None,
-        images: Float[Array, "image height width 3"],
-        request: FeatureRequest,
-        *,
-        remat: str,
-    ) -> Features:
+        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+    ) -> tuple[Features, None]:
         """Return the descriptor as the class token, and as the only patch."""
         pixels = jnp.round(images.astype(jnp.float32)).astype(jnp.int32)
         grey = (pixels * jnp.array(_GREY, jnp.int32)).sum(axis=-1) + (1 << 14) >> 15
@@ -82,4 +85,4 @@ class HogConfig(Backbone):
         descriptors = blocks.reshape(-1, _DIM)
         is_flat = ~descriptors.any(axis=-1, keepdims=True)
         descriptors = jnp.where(is_flat, 1, descriptors)
-        return Features(descriptors, descriptors[:, None])
+        return Features(descriptors, descriptors[:, None]), None

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.aggregation_tokens import AggregationTokensConfig
-from crisalad_jax.nn.backbones import Backbone
+from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.backbones.vit import NORM_EPSILON, ViTConfig, block, embed
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -38,7 +37,7 @@ def test_the_tokens_run_through_the_last_blocks_by_hand() -> None:
         if i == 1:
             tokens = jnp.concatenate([params.aggregator.tokens[None], tokens], axis=1)
         layer = jax.tree.map(lambda leaf, i=i: leaf[i], params.backbone.blocks)
-        tokens = block(layer, tokens, (2, 3), backbone)
+        tokens, _ = block(layer, tokens, (2, 3), backbone)
     normed = layer_norm(params.backbone.norm, tokens[:, :3], epsilon=NORM_EPSILON)
     found = describe(params, image[None], CONFIG)
     # The same sums, compiled twice.
@@ -59,7 +58,7 @@ def test_there_is_such_a_block(insertion: int) -> None:
 def test_other_backbones_say_that_they_have_no_place_for_tokens(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(type(CONFIG.backbone), "inserts", Backbone.inserts)
+    monkeypatch.setattr(type(CONFIG.backbone), "supports_prompt_tokens", False)
     with pytest.raises(InputError, match="found vit for aggregator aggregation-tokens, expected"):
         dataclasses.replace(CONFIG)
 
@@ -68,5 +67,5 @@ def test_not_beside_side_adapters() -> None:
     backbone = dataclasses.replace(CONFIG.backbone, adapter=AdapterConfig(kind="side"))
     config = dataclasses.replace(CONFIG, backbone=backbone)
     images = jax.ShapeDtypeStruct((1, 28, 42, 3), jnp.float32)
-    with pytest.raises(InputError, match=r"found inserted tokens with .* adapters beside the"):
+    with pytest.raises(InputError, match="found inserted tokens and adapters on a side path"):
         jax.eval_shape(lambda p, x: describe(p, x, config), parameter_shapes(config), images)

@@ -16,7 +16,7 @@ from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.data import benchmarks
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.nn.hog import HogConfig
+from crisalad_jax.nn.backbones.hog import HogConfig
 from crisalad_jax.training.loop import check_learns
 from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import Capture, fails, succeeds

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from crisalad_jax.checkpoints.formats import public_shapes, to_state
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
-from crisalad_jax.nn.aggregators.boq import Boq, BoqConfig
+from crisalad_jax.nn.aggregators.queries import Boq, BoqConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig

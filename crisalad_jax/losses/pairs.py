@@ -1,0 +1,112 @@
+"""Pairs of images: of places, chosen by a miner, or of mined tuples."""
+
+import enum
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from crisalad_jax.losses.base import Pairs, Similarities
+
+
+def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None) -> Pairs:
+    """Find all pairs of two images of one place, and of two places; none of images not `valid`.
+
+    Args:
+        labels: the place of each image.
+        valid: images that take part; None means all.
+
+    Returns:
+        The positive and the negative pairs.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> all_pairs(jnp.array([0, 0, 1])).positives.tolist()
+        [[False, True, False], [True, False, False], [False, False, False]]
+    """
+    same = labels[:, None] == labels[None, :]
+    usable = jnp.ones_like(same) if valid is None else valid[:, None] & valid[None, :]
+    return Pairs(same & usable & ~jnp.eye(len(labels), dtype=bool), ~same & usable)
+
+
+def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
+    """Choose the pairs that violate the order within their row by less than `margin`.
+
+    The miner of the multi-similarity loss (Wang et al., CVPR 2019). A positive is kept if it is
+    less similar than the hardest negative plus the margin, a negative if it is more similar than
+    the hardest positive minus the margin, strictly. An anchor without positives or without
+    negatives mines nothing.
+
+    Args:
+        similarities: of all images.
+        pairs: to choose from.
+        margin: epsilon of the paper.
+
+    Returns:
+        The chosen pairs.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> pairs = all_pairs(jnp.array([0, 0, 1]))
+        >>> similarities = jnp.array([[1.0, 0.9, 0.1], [0.9, 1.0, 0.85], [0.1, 0.85, 1.0]])
+        >>> mine(similarities, pairs, margin=0.1).positives.any(axis=1).tolist()
+        [False, True, False]
+    """
+    positives, negatives = pairs
+    hardest_negative = jnp.where(negatives, similarities, -jnp.inf).max(axis=1, keepdims=True)
+    hardest_positive = jnp.where(positives, similarities, jnp.inf).min(axis=1, keepdims=True)
+    return Pairs(
+        positives & (similarities - margin < hardest_negative),
+        negatives & (similarities + margin > hardest_positive),
+    )
+
+
+class Role(enum.IntEnum):
+    """What an image is in its tuple."""
+
+    QUERY = 0
+    POSITIVE = 1
+    NEGATIVE = 2
+    SPARE = 3
+    """Of no pair: it fills a tuple whose query has too few hard negatives."""
+
+
+def tuple_labels(roles: Int[np.ndarray, "tuple image"]) -> Int[np.ndarray, "tuple image"]:
+    """Make the labels that `tuple_pairs` reads: the tuple's number and the image's role in one.
+
+    Args:
+        roles: a `Role` for each image of each tuple.
+
+    Returns:
+        The labels.
+
+    Example:
+        >>> import numpy as np
+        >>> tuple_labels(np.array([[0, 1, 2], [0, 1, 3]])).tolist()
+        [[0, 1, 2], [4, 5, 7]]
+    """
+    return (np.arange(len(roles))[:, None] * len(Role) + roles).astype(np.int32)
+
+
+def tuple_pairs(
+    labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None
+) -> Pairs:
+    """Find the pairs of each tuple, whose anchor is its query.
+
+    Args:
+        labels: those of `tuple_labels`.
+        valid: images that take part; None means all.
+
+    Returns:
+        The positive and the negative pairs; their rows are those of queries alone.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> tuple_pairs(jnp.array([0, 1, 2])).negatives.tolist()
+        [[False, False, True], [False, False, False], [False, False, False]]
+    """
+    number, role = jnp.divmod(labels, len(Role))
+    usable = (number[:, None] == number) & (role == Role.QUERY)[:, None]
+    if valid is not None:
+        usable &= valid[:, None] & valid
+    return Pairs(usable & (role == Role.POSITIVE), usable & (role == Role.NEGATIVE))

@@ -1,0 +1,267 @@
+"""Learnt queries that ask transformer layers: BoQ and EDTformer.
+
+Attentions and encoder layers are torch's: `nn.MultiheadAttention` and, with ReLU, post-norm and a
+feed-forward network of four times the width, `nn.TransformerEncoderLayer`.
+"""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
+from crisalad_jax.nn.attention import Attention, attention, cross_attention, init_torch_attention
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
+from crisalad_jax.nn.layers import (
+    Conv,
+    Keys,
+    LayerNorm,
+    Linear,
+    at_least_float32,
+    conv,
+    init_conv,
+    init_layer_norm,
+    init_linear,
+    layer_norm,
+    linear,
+)
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.torch_layers import (
+    NORM_EPSILON,
+    EncoderLayer,
+    encoder_layer,
+    init_encoder_layer,
+)
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class BoqBlock:
+    """An encoder layer over the patches, and queries that attend to each other, then to patches."""
+
+    encoder: EncoderLayer
+    queries: Float[Array, "query channel"]
+    self_attn: Attention
+    norm_q: LayerNorm
+    cross_attn: Attention
+    norm_out: LayerNorm
+
+
+@pytree_dataclass
+class Boq:
+    """The channel reduction, the blocks in order, and the linear layer from answers to rows."""
+
+    proj_c: Conv
+    norm_input: LayerNorm
+    boqs: tuple[BoqBlock, ...]
+    fc: Linear
+
+
+@AGGREGATORS.register("boq", tiny={"channels": 64, "queries": 16, "rows": 8})
+@dataclasses.dataclass(frozen=True)
+class BoqConfig(Aggregator):
+    """Bag of queries (Ali-bey et al., CVPR 2024)."""
+
+    flatten_order: ClassVar[FlattenOrder] = "dimension-first"
+    channels: int = 384
+    """Number of channels after the 3 x 3 convolution."""
+    queries: int = 64
+    """Number of learnt queries of a block."""
+    layers: int = 2
+    """Number of blocks, each an encoder layer and its queries."""
+    rows: int = 32
+    """Number of rows that a linear layer makes of all blocks' answers."""
+    last_norm: bool = False
+    """Whether patches go through the backbone's last layer norm. In the public code they do not."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "channels", "queries", "layers", "rows")
+        require(
+            self.channels % self.heads == 0,
+            f"BoqConfig.channels: found {self.channels}, expected a multiple of its heads, "
+            f"{self.heads}: one for every 64 channels",
+        )
+
+    @property
+    def heads(self) -> int:
+        """Number of heads of every attention, as the public code has them."""
+        return max(1, self.channels // 64)
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the last patches, by default as the last block leaves them."""
+        return FeatureSpec(norm=self.last_norm)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one token for each row."""
+        return TokenShape(0, self.rows, self.channels)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Boq:
+        """Draw parameters as the public code: standard normal queries, the rest as torch's."""
+        conv_key, blocks_key, rows_key = random_init.split(key, 3)
+        keys = random_init.split(blocks_key, self.layers)
+        return Boq(
+            proj_c=init_conv(conv_key, 3, backbone.dim, self.channels),
+            norm_input=init_layer_norm(self.channels),
+            boqs=tuple(_init_block(block_key, self.channels, self.queries) for block_key in keys),
+            fc=init_linear(rows_key, self.layers * self.queries, self.rows),
+        )
+
+    def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return a token of `channels` numbers for each row."""
+        patches = features.patches
+        maps = patches.reshape(-1, *grid, patches.shape[-1])
+        maps = conv(params.proj_c, maps)
+        x = maps.reshape(*patches.shape[:-1], maps.shape[-1])
+        x = layer_norm(params.norm_input, x, epsilon=NORM_EPSILON)
+        answers = []
+        for block in params.boqs:
+            attended = attention(block.encoder.attn, x, self.heads)
+            x = encoder_layer(block.encoder, x, attended, jax.nn.relu)
+            answers.append(ask(block, x, self.heads))
+        rows = linear(params.fc, jnp.concatenate(answers, axis=-2).swapaxes(-2, -1))
+        return Tokens.of_local(at_least_float32(rows).swapaxes(-2, -1))
+
+
+def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
+    layer_key, queries_key, *keys = random_init.split(key, 6)
+    return BoqBlock(
+        encoder=init_encoder_layer(layer_key, channels, 4 * channels),
+        queries=random_init.normal(queries_key, (queries, channels)),
+        self_attn=init_torch_attention(keys[0], keys[1], channels),
+        norm_q=init_layer_norm(channels),
+        cross_attn=init_torch_attention(keys[2], keys[3], channels),
+        norm_out=init_layer_norm(channels),
+    )
+
+
+def ask(
+    params: BoqBlock, x: Float[Array, "*batch patch channel"], heads: int
+) -> Float[Array, "*batch query channel"]:
+    """Attend from the queries to the patches, and normalise the answers.
+
+    The queries' self-attention does not depend on the image: it runs once for a whole batch.
+    """
+    queries = params.queries.astype(x.dtype)
+    queries = queries + attention(params.self_attn, queries, heads)
+    queries = layer_norm(params.norm_q, queries, epsilon=NORM_EPSILON)
+    answers = cross_attention(params.cross_attn, queries, x, heads)
+    return layer_norm(params.norm_out, answers, epsilon=NORM_EPSILON)
+
+
+@pytree_dataclass
+class DecoderLayer:
+    """Attention of the queries to each other, then to the backbone's tokens."""
+
+    self_attn: Attention
+    multihead_attn: Attention
+    norm1: LayerNorm
+    norm2: LayerNorm
+
+
+@pytree_dataclass
+class EdtFormer:
+    """Queries, the layer that the backbone's tokens go through, the decoder, two projections."""
+
+    queries: Float[Array, "query width"]
+    fc: Linear
+    layers: tuple[DecoderLayer, ...]
+    channel_proj: Linear
+    row_proj: Linear
+
+
+@AGGREGATORS.register("edtformer", tiny={"width": 64, "heads": 4, "queries": 16, "channels": 64})
+@dataclasses.dataclass(frozen=True)
+class EdtFormerConfig(Aggregator):
+    """EDTformer's decoder (Jin et al., 2025).
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig, ModelConfig
+        >>> alone = CrossImageConfig(layers=0)
+        >>> ModelConfig(aggregator="edtformer", cross_image=alone).descriptor_dim
+        4096
+    """
+
+    flatten_order: ClassVar[FlattenOrder] = "dimension-first"
+    width: int = 768
+    """Width of the decoder."""
+    heads: int = 16
+    """Number of heads of every attention."""
+    layers: int = 2
+    queries: int = 64
+    """Number of learnt queries."""
+    channels: int = 256
+    """Number of channels of an answer after its projection."""
+    rows: int = 16
+    """Number of rows that a linear layer makes of all answers."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "width", "heads", "layers", "queries", "channels", "rows")
+        require(
+            self.width % self.heads == 0,
+            f"EdtFormerConfig.width: found {self.width}, expected a multiple of the {self.heads} "
+            "heads",
+        )
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the last patches and the class token."""
+        return FeatureSpec(class_token=True)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one token for each row."""
+        return TokenShape(0, self.rows, self.channels)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> EdtFormer:
+        """Draw queries of deviation 1e-6, as published, and the rest as torch's.
+
+        All layers start equal: torch's `nn.TransformerDecoder` copies the layer that it is given.
+        """
+        queries, fc, layer_key, channels, rows = random_init.split(key, 5)
+        layer = _init_decoder_layer(layer_key, self.width)
+        return EdtFormer(
+            queries=random_init.normal(queries, (self.queries, self.width), scale=1e-6),
+            fc=init_linear(fc, backbone.dim, self.width),
+            # Copies: a training step that donates its buffers must not find one twice.
+            layers=tuple(jax.tree.map(jnp.copy, layer) for _ in range(self.layers)),
+            channel_proj=init_linear(channels, self.width, self.channels),
+            row_proj=init_linear(rows, self.queries, self.rows),
+        )
+
+    def apply(
+        self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys | None
+    ) -> Tokens:
+        """Return a token of `channels` numbers for each row."""
+        answers = decode(params, features, self.heads)
+        channels = linear(params.channel_proj, answers).swapaxes(-2, -1)
+        return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
+
+
+def _init_decoder_layer(key: PRNGKeyArray, width: int) -> DecoderLayer:
+    keys = random_init.split(key, 4)
+    return DecoderLayer(
+        self_attn=init_torch_attention(keys[0], keys[1], width),
+        multihead_attn=init_torch_attention(keys[2], keys[3], width),
+        norm1=init_layer_norm(width),
+        norm2=init_layer_norm(width),
+    )
+
+
+def decode(params: EdtFormer, features: Features, heads: int) -> Float[Array, "*batch query width"]:
+    """Ask the class token and all patches.
+
+    The first layer's self-attention does not depend on the image: it runs once for a whole batch.
+    """
+    whole = jnp.concatenate([features.class_token[..., None, :], features.patches], axis=-2)
+    memory = linear(params.fc, whole)
+    queries = params.queries.astype(memory.dtype)
+    for layer in params.layers:
+        queries = queries + attention(layer.self_attn, queries, heads)
+        queries = layer_norm(layer.norm1, queries, epsilon=NORM_EPSILON)
+        queries = queries + cross_attention(layer.multihead_attn, queries, memory, heads)
+        queries = layer_norm(layer.norm2, queries, epsilon=NORM_EPSILON)
+    return queries

@@ -1,0 +1,464 @@
+"""Sums of patches, or of their residuals, by cluster: NetVLAD, SuperVLAD, VLAD-BuFF and AnyLoc.
+
+All compute in float32 at least, at the highest precision.
+"""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import (
+    AGGREGATORS,
+    Aggregator,
+    Centroids,
+    FeatureRows,
+    TokenShape,
+)
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves, pytree_dataclass, static_field
+
+RATIO = 100
+"""Initial ratio of a patch's largest share to its second largest, as in public implementations."""
+BURST = (8.0, 7.0, 1.0)
+"""Initial slope, offset and power of VLAD-BuFF's burst weights, as published."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VladConfig(Aggregator):
+    """What these aggregators share: a local token for each cluster, as wide as the backbone."""
+
+    clusters: int = 64
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "clusters")
+        require(
+            self.count_centroids(0) > 1,
+            f"{type(self).__name__}.clusters: found {self.clusters}, expected at least 2 to choose "
+            "from",
+        )
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one sum for each cluster."""
+        return TokenShape(0, self.clusters, dim)
+
+
+@pytree_dataclass
+class NetVlad:
+    """The paper's decoupled parameters: the soft assignment of patches, and the centroids.
+
+    The linear layer has no bias. The authors' code starts from unit centroids, so the paper's bias,
+    -alpha |c|^2, is the same for all clusters and cancels in the softmax.
+    """
+
+    conv: Linear
+    """Linear layer from a patch to one score for each cluster."""
+    centroids: Centroids
+
+
+@AGGREGATORS.register("netvlad", tiny={"clusters": 16})
+@dataclasses.dataclass(frozen=True)
+class NetVladConfig(VladConfig):
+    """NetVLAD (Arandjelovic et al., CVPR 2016)."""
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> NetVlad:
+        """Draw unit vectors as centroids. `training.vocabulary` makes centroids from images."""
+        conv_key, centroid_key = random_init.split(key)
+        dim = backbone.dim
+        return NetVlad(
+            conv=init_linear(conv_key, dim, self.clusters, bias=False),
+            centroids=l2_normalise(random_init.normal(centroid_key, (self.clusters, dim))),
+        )
+
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> NetVlad:
+        """Make parameters as the authors do; see `scores_from_centroids`."""
+        return NetVlad(scores_from_centroids(centroids, features), centroids)
+
+    def apply(self, params: NetVlad, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return a sum of residuals for each cluster, of length 1; no global token."""
+        return Tokens.of_local(netvlad(params, features.patches))
+
+
+@pytree_dataclass
+class SuperVlad:
+    """The soft assignment of patches."""
+
+    conv: Linear
+    """Linear layer without bias from a patch to a score for each cluster, ghosts last."""
+
+
+@AGGREGATORS.register("supervlad")
+@dataclasses.dataclass(frozen=True)
+class SuperVladConfig(VladConfig):
+    """SuperVLAD (Lu et al., NeurIPS 2024).
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig, ModelConfig
+        >>> one = SuperVladConfig(clusters=1, ghosts=2)
+        >>> ModelConfig(aggregator=one, cross_image=CrossImageConfig(layers=0)).descriptor_dim
+        768
+    """
+
+    centroid_images: ClassVar[int] = 5000
+    clusters: int = 4
+    ghosts: int = 1
+    """Number of clusters that take part in the softmax, and are dropped after it."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        require(
+            self.ghosts >= 0, f"SuperVladConfig.ghosts: found {self.ghosts}, expected at least 0"
+        )
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SuperVlad:
+        """Draw the scores' layer as torch's convolution."""
+        return SuperVlad(init_linear(key, backbone.dim, self.clusters + self.ghosts, bias=False))
+
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> SuperVlad:
+        """Make the scores as NetVLAD's; the centroids themselves are not kept."""
+        return SuperVlad(scores_from_centroids(centroids, features))
+
+    def count_centroids(self, dim: int) -> int:
+        """Return the number of all clusters, ghosts included."""
+        return self.clusters + self.ghosts
+
+    def apply(
+        self, params: SuperVlad, features: Features, grid: Grid, *, key: Keys | None
+    ) -> Tokens:
+        """Return a sum of patches for each cluster, of the same length; together of length 1."""
+        return Tokens.of_local(supervlad(params, features.patches, self.clusters))
+
+
+@pytree_dataclass
+class Reduction:
+    """Fewer dimensions of a unit patch: `(patch - mean) @ rotation`."""
+
+    mean: Float[Array, " dim"]
+    rotation: Float[Array, "dim reduced"]
+
+
+@pytree_dataclass
+class VladBuff:
+    """NetVLAD's parameters, those of the burst weights, and the reduction before them."""
+
+    reduction: Reduction | None
+    conv: Linear
+    """Linear layer without bias from a patch to one score for each cluster."""
+    centroids: Float[Array, "cluster reduced"]
+    burst: Float[Array, "3"]
+    """Slope, offset and power."""
+
+
+@AGGREGATORS.register("vlad-buff", tiny={"clusters": 16, "reduced": 32})
+@dataclasses.dataclass(frozen=True)
+class VladBuffConfig(VladConfig):
+    """VLAD-BuFF (Khaliq et al., ECCV 2024).
+
+    Example:
+        >>> from crisalad_jax import CrossImageConfig, ModelConfig
+        >>> alone = CrossImageConfig(layers=0)
+        >>> ModelConfig(aggregator="vlad-buff", cross_image=alone).descriptor_dim
+        12288
+    """
+
+    reduced: int = 192
+    """Width of a patch after the reduction; 0 leaves the reduction out."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        require(
+            self.reduced >= 0, f"VladBuffConfig.reduced: found {self.reduced}, expected at least 0"
+        )
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of one sum of residuals for each cluster."""
+        return TokenShape(0, self.clusters, self.reduced or dim)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> VladBuff:
+        """Draw an orthogonal reduction and unit centroids; `from_centroids` replaces them."""
+        rotation_key, conv_key, centroid_key = random_init.split(key, 3)
+        dim = self.reduced or backbone.dim
+        rotation = jax.nn.initializers.orthogonal()(rotation_key, (backbone.dim, dim))
+        return VladBuff(
+            reduction=Reduction(random_init.zeros(backbone.dim), rotation)
+            if self.reduced
+            else None,
+            conv=init_linear(conv_key, dim, self.clusters, bias=False),
+            centroids=l2_normalise(random_init.normal(centroid_key, (self.clusters, dim))),
+            burst=jnp.asarray(BURST),
+        )
+
+    def centroid_features(self, features: FeatureRows) -> Float[Array, "feature reduced"]:
+        """Return the features reduced by their principal components, at their own lengths.
+
+        Raises:
+            InputError: there are fewer features than components.
+        """
+        if not self.reduced:
+            return features
+        return reduce_features(fit_reduction(features, self.reduced), features)
+
+    def from_centroids(
+        self, centroids: Float[Array, "cluster reduced"], features: FeatureRows
+    ) -> VladBuff:
+        """Make the reduction of principal components, and NetVLAD's start of reduced features."""
+        reduction = fit_reduction(features, self.reduced) if self.reduced else None
+        conv = scores_from_centroids(centroids, self.centroid_features(features))
+        return VladBuff(reduction, conv, centroids, jnp.asarray(BURST))
+
+    def apply(
+        self, params: VladBuff, features: Features, grid: Grid, *, key: Keys | None
+    ) -> Tokens:
+        """Return a sum of residuals for each cluster, of length 1; no global token."""
+        return Tokens.of_local(vlad_buff(params, features.patches))
+
+
+@pytree_dataclass
+class AnyLoc:
+    """The visual words, and the backbone that they belong to."""
+
+    words: Centroids
+    """k-means centroids of unit features."""
+    backbone: str | None = static_field(default=None)
+    """Digest of the words' backbone; None before a vocabulary is built."""
+
+
+@AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
+@dataclasses.dataclass(frozen=True)
+class AnyLocConfig(VladConfig):
+    """AnyLoc: hard VLAD of a facet of one layer, nothing learnt (Keetha et al., RA-L 2023)."""
+
+    trainable: ClassVar[bool] = False
+    clusters: int = 32
+    """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
+    layer: int = -9
+    """Block of the facet, from 0, or from the end where negative: -9 is block 31 of ViT-g's 40,
+    AnyLoc's choice."""
+    facet: Literal["query", "key", "value", "token"] = "value"
+    """Facet of the block: queries, keys or values of its attention, or its output tokens."""
+    assignment: Literal["cosine", "euclidean"] = "cosine"
+    """What the nearest word of a patch is nearest by. The public code takes the angle; so does the
+    k-means that builds a vocabulary."""
+
+    def block(self, depth: int) -> int:
+        """Return the number of the facet's block among `depth` blocks, from 0.
+
+        Raises:
+            InputError: there is no such block.
+        """
+        require(
+            -depth <= self.layer < depth,
+            f"AnyLocConfig.layer: found {self.layer}, expected {-depth} to {depth - 1} for a "
+            f"backbone of {depth} blocks",
+        )
+        return self.layer % depth
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the facet, without the last layer norm."""
+        return FeatureSpec((self.block(depth) + 1,), self.facet, norm=False)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> AnyLoc:
+        """Draw random unit vectors as words, until a vocabulary is built."""
+        return AnyLoc(l2_normalise(random_init.normal(key, (self.clusters, backbone.dim))))
+
+    @property
+    def spherical_centroids(self) -> bool:
+        """Whether k-means compares features with centroids by the angle."""
+        return self.assignment == "cosine"
+
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> AnyLoc:
+        """Use the centroids as words."""
+        return AnyLoc(centroids)
+
+    def bind(self, params: AnyLoc, backbone: Any) -> AnyLoc:
+        """Return the vocabulary with its backbone's digest."""
+        return AnyLoc(params.words, _digest(backbone))
+
+    def check_backbone(self, params: AnyLoc, backbone: Any, source: str) -> None:
+        """Raise InputError where a vocabulary, if one was built, is of another backbone."""
+        require(
+            params.backbone is None or params.backbone == _digest(backbone),
+            f"{source}: found a vocabulary of another backbone, expected one of these weights' "
+            "(`crisalad vocabulary` builds it)",
+        )
+
+    def metadata(self, params: AnyLoc) -> dict[str, str]:
+        """Return the backbone's digest, where a vocabulary was built."""
+        return {} if params.backbone is None else {"backbone": params.backbone}
+
+    def with_metadata(self, params: AnyLoc, metadata: Mapping[str, str]) -> AnyLoc:
+        """Return the words with the backbone's digest."""
+        return AnyLoc(params.words, metadata.get("backbone"))
+
+    def apply(self, params: AnyLoc, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return a sum of residuals for each word, of length 1, or 0 where no patch is near."""
+        vlad = hard_vlad(params.words, features.patches, assignment=self.assignment)
+        return Tokens.of_local(vlad)
+
+
+def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear:
+    """Make the scores' layer as the authors do: alpha times cosines to the k-means centroids.
+
+    alpha is chosen so that a feature's largest share is `RATIO` times its second largest, in the
+    geometric mean over these features.
+
+    Args:
+        centroids: of the features, two or more.
+        features: unit vectors, or what the centroids are of.
+
+    Raises:
+        InputError: all features are as near to two centroids, as where all are alike.
+    """
+    directions = l2_normalise(centroids)
+    cosines = jnp.matmul(features, directions.T, precision="highest")
+    best = jax.lax.top_k(cosines, 2)[0]
+    gap = float((best[:, 0] - best[:, 1]).mean())
+    # Below this the two differ by rounding alone.
+    if not gap > 1e-6:
+        raise InputError(
+            f"features: found {len(features)} that are as near to two of {len(centroids)} "
+            "centroids, expected features that differ"
+        )
+    return Linear(math.log(RATIO) / gap * directions.T, None)
+
+
+def netvlad(params: NetVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+    """Aggregate unit patches by Eq. 4, then intra-normalise (Arandjelovic, Zisserman 2013).
+
+    It computes in float32 at least, at the highest precision, because alpha multiplies the scores'
+    rounding error.
+    """
+    patches = l2_normalise(at_least_float32(patches))
+    return l2_normalise(residual_sums(shares(params.conv, patches), patches, params.centroids))
+
+
+def shares(conv: Linear, patches: Patches) -> Float[Array, "*batch patch cluster"]:
+    """Assign unit patches softly: compute a softmax over the clusters (the paper's Eq. 3)."""
+    scores = jnp.matmul(patches, conv.weight, precision="highest")
+    return jax.nn.softmax(scores, axis=-1)
+
+
+def residual_sums(
+    shares: Float[Array, "*batch patch cluster"], patches: Patches, centroids: Centroids
+) -> Float[Array, "*batch cluster dim"]:
+    """Sum, for each cluster, all patches' residuals from it, weighted by their shares.
+
+    This is the weighted sum of the patches minus the centroid times the sum of the shares.
+    """
+    sums = jnp.einsum("...pk,...pd->...kd", shares, patches, precision="highest")
+    return sums - shares.sum(axis=-2)[..., None] * centroids
+
+
+def supervlad(
+    params: SuperVlad, patches: Patches, clusters: int
+) -> Float[Array, "*batch cluster dim"]:
+    """Sum unit patches by their shares in the clusters, then normalise each sum, then all.
+
+    It computes in float32 at least, at the highest precision, as `netvlad` does.
+    """
+    patches = l2_normalise(at_least_float32(patches))
+    parts = shares(params.conv, patches)[..., :clusters]
+    sums = l2_normalise(jnp.einsum("...pk,...pd->...kd", parts, patches, precision="highest"))
+    flat = l2_normalise(sums.reshape(*sums.shape[:-2], -1))
+    return flat.reshape(sums.shape)
+
+
+def fit_reduction(features: FeatureRows, reduced: int) -> Reduction:
+    """Fit the mean and the first principal components of features, without whitening.
+
+    Args:
+        features: at least `reduced` of them, and at least so wide.
+        reduced: number of components.
+
+    Raises:
+        InputError: there are fewer features, or they are narrower.
+    """
+    require(
+        min(features.shape) >= reduced,
+        f"features: found {features.shape[0]} of width {features.shape[1]}, expected at least "
+        f"{reduced} of each, one for each component that VLAD-BuFF keeps",
+    )
+    mean = features.mean(axis=0)
+    centred = features - mean
+    scatter = jnp.matmul(centred.T, centred, precision="highest")
+    # Eigenvalues rise.
+    return Reduction(mean, jnp.linalg.eigh(scatter)[1][:, ::-1][:, :reduced])
+
+
+def reduce_features(
+    reduction: Reduction, features: Float[Array, "*batch feature dim"]
+) -> Float[Array, "*batch feature reduced"]:
+    """Reduce features to fewer dimensions, in which they are no unit vectors."""
+    return jnp.matmul(features - reduction.mean, reduction.rotation, precision="highest")
+
+
+def vlad_buff(params: VladBuff, patches: Patches) -> Float[Array, "*batch cluster reduced"]:
+    """Reduce unit patches to shorter ones, and sum their residuals by shares over burst weights.
+
+    It computes in float32 at least, at the highest precision, as `netvlad` does.
+    """
+    patches = l2_normalise(at_least_float32(patches))
+    if params.reduction is not None:
+        patches = l2_normalise(reduce_features(params.reduction, patches))
+    weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]
+    return l2_normalise(residual_sums(weighed, patches, params.centroids))
+
+
+def burst_weights(burst: Float[Array, "3"], patches: Patches) -> Float[Array, "*batch patch"]:
+    """Count, softly, the patches that are like each: sigmoids of squared distances, summed.
+
+    Args:
+        burst: slope a, offset b and power p of (sum over j of sigmoid(b - a |x_i - x_j|^2))^p.
+        patches: unit vectors.
+    """
+    slope, offset, power = burst
+    cosines = jnp.einsum("...id,...jd->...ij", patches, patches, precision="highest")
+    alike = jax.nn.sigmoid(slope * (2 * cosines - 2) + offset)
+    return alike.sum(axis=-1) ** power
+
+
+def _digest(backbone: Any) -> str:
+    digest = hashlib.sha256()
+    for name, leaf in named_leaves(backbone).items():
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(leaf).data)
+    return digest.hexdigest()
+
+
+def hard_vlad(
+    words: Centroids, patches: Patches, *, assignment: Literal["cosine", "euclidean"]
+) -> Float[Array, "*batch cluster dim"]:
+    """Compute VLAD (Jegou et al. 2010) of unit patches, each at its nearest word, intra-normalised.
+
+    Residuals are from the words as they are, whatever their lengths. It computes in float32 at
+    least, at the highest precision: rounding would change words.
+    """
+    patches = l2_normalise(at_least_float32(patches))
+    nearest = nearest_words(words, patches, assignment)
+    shares = jax.nn.one_hot(nearest, len(words), dtype=patches.dtype)
+    return l2_normalise(residual_sums(shares, patches, words))
+
+
+def nearest_words(
+    words: Centroids, patches: Patches, assignment: Literal["cosine", "euclidean"]
+) -> Int[Array, "*batch patch"]:
+    """Find the word nearest to every unit patch, by the angle or the distance."""
+    if assignment == "cosine":
+        return jnp.argmax(jnp.matmul(patches, l2_normalise(words).T, precision="highest"), axis=-1)
+    products = jnp.matmul(patches, words.T, precision="highest")
+    # |p - w|^2 = 1 - 2 p w + |w|^2.
+    return jnp.argmax(products - 0.5 * jnp.square(words).sum(axis=-1), axis=-1)

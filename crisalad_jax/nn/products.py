@@ -1,0 +1,132 @@
+"""Products of matrices and convolutions, in the types that are fastest on each platform."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from crisalad_jax.utils.target import target
+
+
+def product_precision(dtype: Any) -> jax.lax.Precision | None:
+    """Return the precision of a product of matrices of `dtype`; None is what JAX is set to.
+
+    A pass takes numbers of 8 bits as they are, so that bfloat16 needs one.
+    """
+    single = dtype == jnp.bfloat16 and target().platform != "cpu"
+    return jax.lax.Precision.DEFAULT if single else None
+
+
+def rule_precision(dtype: Any) -> str | None:
+    """Return the precision of products, for rules whose backward half is traced outside of it."""
+    if product_precision(dtype) is not None:
+        return "default"
+    return None if target().platform == "cpu" else jax.config.jax_default_matmul_precision  # pyright: ignore
+
+
+def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
+    """Multiply rows by a weight, which is cast to their type."""
+    return _with_wide_gradient(_matmul, _matmul_weight_gradient, rows, weight)
+
+
+def _matmul(rows: Array, weight: Array) -> Array:
+    dtype = rows.dtype
+    return jnp.matmul(
+        rows,
+        weight.astype(dtype),
+        precision=product_precision(dtype),
+        preferred_element_type=target().product_dtype(dtype),
+    )
+
+
+def _matmul_weight_gradient(rows: Array, change: Array, weight: Array) -> Array:
+    return jnp.matmul(
+        rows.T,
+        change,
+        precision=product_precision(rows.dtype),
+        preferred_element_type=weight.dtype,
+    )
+
+
+def convolve(
+    images: Float[Array, "image height width d_in"],
+    weight: Float[Array, "k k d_in d_out"],
+    *,
+    stride: int,
+    margin: int,
+) -> Float[Array, "image rows columns d_out"]:
+    """Convolve images, with zeros around them, by a weight that is cast to their type."""
+    sizes = {"stride": stride, "margin": margin}
+    return _with_wide_gradient(
+        functools.partial(_convolve, **sizes),
+        functools.partial(_convolve_weight_gradient, **sizes),
+        images,
+        weight,
+    )
+
+
+def _convolve(images: Array, weight: Array, *, stride: int, margin: int) -> Array:
+    return jax.lax.conv_general_dilated(
+        images,
+        weight.astype(images.dtype),
+        window_strides=(stride, stride),
+        # Not "SAME", which pads less before the image than after it where the stride is 2.
+        padding=((margin, margin), (margin, margin)),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=product_precision(images.dtype),
+    )
+
+
+def _convolve_weight_gradient(
+    images: Array, change: Array, weight: Array, *, stride: int, margin: int
+) -> Array:
+    """Convolve the images by the cotangent, whose pixels are `stride` apart.
+
+    Images are its channels. What no window reached is cut off at the end.
+    """
+    ends = [
+        size + stride * (side - 1) - length - margin
+        for size, side, length in zip(
+            weight.shape[:2], change.shape[1:3], images.shape[1:3], strict=True
+        )
+    ]
+    return jax.lax.conv_general_dilated(
+        images,
+        change,
+        window_strides=(1, 1),
+        padding=[(margin, end) for end in ends],
+        rhs_dilation=(stride, stride),
+        dimension_numbers=("CHWN", "IHWO", "HWNC"),
+        precision=product_precision(images.dtype),
+        preferred_element_type=weight.dtype,
+    )
+
+
+def _with_wide_gradient(
+    product: Callable[[Array, Array], Array],
+    weight_gradient: Callable[[Array, Array, Array], Array],
+    x: Array,
+    weight: Array,
+) -> Array:
+    """Compute product(x, weight); on accelerators sum the gradient of a wider weight in its type.
+
+    JAX's rule rounds it to bfloat16 before the sum over devices. A CPU's devices, which are
+    virtual, do without: its program stays as it is.
+    """
+    if x.dtype != jnp.bfloat16 or weight.dtype == x.dtype or target().platform == "cpu":
+        return product(x, weight)
+
+    def forward(x: Array, weight: Array) -> tuple[Array, tuple[Array, Array]]:
+        return product(x, weight), (x, weight)
+
+    def backward(kept: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
+        x, weight = kept
+        (to_x,) = jax.linear_transpose(lambda x: product(x, weight), x)(change)
+        return to_x, weight_gradient(x, change.astype(x.dtype), weight)
+
+    multiply = jax.custom_vjp(product)
+    multiply.defvjp(forward, backward)
+    return multiply(x, weight)
